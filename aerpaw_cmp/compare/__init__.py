@@ -1,0 +1,1 @@
+"""Offsets, RSS and rank comparison, statistics: pure functions of arrays."""

@@ -1,0 +1,89 @@
+"""Whose fault is it? One class per answer, each with its exit code.
+
+======================  =========  =====================================
+class                   exit code  meaning
+======================  =========  =====================================
+:class:`CheckError`     1          the job ran, a stated check failed
+:class:`UsageError`     2          wrong usage or configuration
+:class:`InputError`     3          an input could not be read
+======================  =========  =====================================
+
+A message says what was found, what was expected, the likely cause and the place.
+Any other exception that reaches a user is a bug of ours.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class AerpawCmpError(Exception):
+    """A message for the user; never shown with a traceback.
+
+    Parameters
+    ----------
+    found : str
+        What was found, as a sentence without a full stop.
+    expected : str, optional
+        What was expected instead.
+    cause : str, optional
+        The likely cause, or the line that mends it.
+    path : str or Path, optional
+        The file.
+    line : int, optional
+        1-based line of the file.
+
+    Examples
+    --------
+    >>> print(InputError("the file is empty", expected="log lines", path="a.txt"))
+    a.txt: the file is empty; expected log lines
+    >>> print(UsageError("unknown key 'sight'", cause="did you mean 'site'?", path="f.yaml", line=3))
+    f.yaml, line 3: unknown key 'sight'. Likely cause: did you mean 'site'?
+    """
+
+    exit_code = 1
+
+    def __init__(
+        self,
+        found: str,
+        *,
+        expected: str | None = None,
+        cause: str | None = None,
+        path: str | Path | None = None,
+        line: int | None = None,
+    ) -> None:
+        self.found = found
+        self.expected = expected
+        self.cause = cause
+        self.path = None if path is None else str(path)
+        self.line = line
+        super().__init__(str(self))
+
+    def __str__(self) -> str:
+        place = self.path or ""
+        if self.line is not None:
+            place += f", line {self.line}" if place else f"line {self.line}"
+        text = f"{place}: {self.found}" if place else self.found
+        if self.expected:
+            text += f"; expected {self.expected}"
+        if self.cause:
+            text += f". Likely cause: {self.cause}"
+        return text
+
+
+class CheckError(AerpawCmpError):
+    """The job ran, but a check that the user asked for did not hold."""
+
+    exit_code = 1
+
+
+class UsageError(AerpawCmpError):
+    """The command line or a configuration file is wrong."""
+
+    exit_code = 2
+
+
+class InputError(AerpawCmpError):
+    """An input file or device could not be read."""
+
+    exit_code = 3

@@ -1,0 +1,60 @@
+"""WGS84 to and from the site frame (east, north, up; metres).
+
+East and north come from an azimuthal equidistant projection centred on the site origin. Up is a height
+difference, not the third axis of a tangent frame: the flat ground plane of the scene follows the ellipsoid,
+so that 100 m above ground stays 100 m above ground 2 km from the origin (a tangent plane would give 99.7 m).
+Horizontal distances within 3 km differ from the geodesic by less than 1 mm.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .units import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class SiteFrame:
+    """Local frame of a site.
+
+    Parameters
+    ----------
+    latitude_deg, longitude_deg : float
+        WGS84 position of the origin.
+
+    Examples
+    --------
+    >>> frame = SiteFrame(35.72750947, -78.69595819)
+    >>> east, north = frame.to_local(35.72750947, -78.69595819)
+    >>> float(abs(east)) < 1e-6 and float(abs(north)) < 1e-6
+    True
+    """
+
+    latitude_deg: float
+    longitude_deg: float
+    _projection: Any = field(init=False, repr=False, compare=False)
+
+    def __post_init__(self) -> None:
+        from pyproj import Proj
+
+        projection = Proj(proj="aeqd", lat_0=self.latitude_deg, lon_0=self.longitude_deg, ellps="WGS84")
+        object.__setattr__(self, "_projection", projection)
+
+    def to_local(self, latitude_deg: ArrayLike, longitude_deg: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """East and north [m] of WGS84 positions [deg]; NaN stays NaN."""
+        latitude = np.asarray(latitude_deg, dtype=np.float64)
+        longitude = np.asarray(longitude_deg, dtype=np.float64)
+        east, north = self._projection(longitude, latitude)
+        bad = ~(np.isfinite(latitude) & np.isfinite(longitude))
+        return np.where(bad, np.nan, east), np.where(bad, np.nan, north)
+
+    def to_geographic(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """WGS84 latitude and longitude [deg] of local positions [m]."""
+        longitude, latitude = self._projection(
+            np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64), inverse=True
+        )
+        return np.asarray(latitude), np.asarray(longitude)

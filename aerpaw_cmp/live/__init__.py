@@ -1,0 +1,1 @@
+"""The live tap of a modem: framing, commands, durable log."""

@@ -1,0 +1,1 @@
+"""Grids, spatial correlation, Kriging and its baselines."""

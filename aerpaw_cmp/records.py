@@ -1,0 +1,132 @@
+"""The record model: what every reader returns, whatever the format.
+
+A log file becomes a :class:`ReadResult`: streams of records, the account of its lines, and every
+rejected line with its reason. The accounting law, checked when the result is built::
+
+    lines == accepted + rejected + blank
+
+Columns (UTC ``time`` as naive ``datetime64[ns]``; units in names). Every frame has ``time``, ``line``
+(1-based line, or row of a binary file) and ``flag`` (empty, or reasons joined by ``;``).
+
+telemetry
+    ``latitude_deg longitude_deg altitude_m`` (above take-off) ``roll_deg pitch_deg yaw_deg`` (nose up +,
+    right wing down +, yaw clockwise from north) ``velocity_north_mps velocity_east_mps velocity_down_mps
+    fix satellites``. What a log does not have is NaN (``fix`` and ``satellites``: -1).
+rss
+    ``rss_db``; NaN where out of coverage. Attributes: ``node``, ``channel``, ``unit``
+    (``"dBm"`` or ``"dB re full scale"``), ``frequency_hz``.
+rank
+    ``rank`` (float; NaN = no CSI, never 0), ``ri_raw``, and where the log has them ``rsrp_dbm sinr_db cqi mcs
+    latitude_deg longitude_deg altitude_m``. Attributes: ``ri_base`` (``"one"`` or ``"zero"``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+Kind = Literal["telemetry", "rss", "rank"]
+Attribute = str | float | int | bool
+
+COLUMNS: dict[str, tuple[str, ...]] = {
+    "telemetry": (
+        "latitude_deg",
+        "longitude_deg",
+        "altitude_m",
+        "roll_deg",
+        "pitch_deg",
+        "yaw_deg",
+        "velocity_north_mps",
+        "velocity_east_mps",
+        "velocity_down_mps",
+        "fix",
+        "satellites",
+    ),
+    "rss": ("rss_db",),
+    "rank": ("rank", "ri_raw"),
+}
+"""Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``."""
+
+
+@dataclass(frozen=True, slots=True)
+class Stream:
+    """One sequence of records of one kind.
+
+    Parameters
+    ----------
+    kind : {"telemetry", "rss", "rank"}
+        Decides the columns, see the module text.
+    name : str
+        Unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.
+    frame : pandas.DataFrame
+        The records in file order, default integer index.
+    attributes : mapping
+        What holds for the whole stream: node, channel, unit, frequency_hz, ri_base, clock.
+
+    Raises
+    ------
+    ValueError
+        If a column of the kind is missing (a bug of the reader, not of the user).
+    """
+
+    kind: Kind
+    name: str
+    frame: pd.DataFrame
+    attributes: Mapping[str, Attribute] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        missing = [c for c in ("time", "line", "flag", *COLUMNS[self.kind]) if c not in self.frame.columns]
+        if missing:
+            raise ValueError(f"stream {self.name!r} of kind {self.kind!r} lacks columns {missing}")
+
+
+@dataclass(frozen=True, slots=True)
+class RejectedLine:
+    """A line that is no record: its 1-based number, the reason, and its text (at most 500 characters)."""
+
+    number: int
+    reason: str
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class ReadResult:
+    """What a reader made of one file.
+
+    Parameters
+    ----------
+    reader : str
+        Name of the reader.
+    streams : tuple of Stream
+        May be empty.
+    lines, accepted, blank : int
+        ``blank`` counts blank lines, headers and comments.
+    rejected : tuple of RejectedLine
+        Every line that is neither.
+    warnings : tuple of str
+        What the user should know, one sentence each.
+
+    Raises
+    ------
+    ValueError
+        If the accounting law does not hold.
+    """
+
+    reader: str
+    streams: tuple[Stream, ...]
+    lines: int
+    accepted: int
+    blank: int
+    rejected: tuple[RejectedLine, ...] = ()
+    warnings: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if self.lines != self.accepted + len(self.rejected) + self.blank:
+            raise ValueError(
+                f"accounting law broken by reader {self.reader!r}: {self.lines} lines are not "
+                f"{self.accepted} accepted + {len(self.rejected)} rejected + {self.blank} blank"
+            )

@@ -1,0 +1,1 @@
+"""From a site, a link and poses to paths and channel matrices."""

@@ -1,0 +1,1 @@
+"""Finished numbers in, figures and files out."""

@@ -1,0 +1,150 @@
+"""The site model: plain, frozen records in the site frame (east, north, up; metres).
+
+``up`` is height above the ground at the site origin. The traced ground is the plane ``up = 0`` unless a
+tower's own ground height says otherwise (one reflecting plane per tower).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+from shapely.geometry import Polygon
+
+from ..geodesy import SiteFrame
+from ..units import FloatArray
+
+
+@dataclass(frozen=True, slots=True)
+class Tower:
+    """A fixed node.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"LW1"``.
+    latitude_deg, longitude_deg : float
+        WGS84.
+    east_m, north_m : float
+        The same in the site frame.
+    antenna_height_m : float
+        Height of the array centre above the ground at the tower.
+    ground_m : float
+        Height of the ground at the tower above the ground at the origin.
+    source : str
+        Where the coordinates come from.
+    """
+
+    name: str
+    latitude_deg: float
+    longitude_deg: float
+    east_m: float
+    north_m: float
+    antenna_height_m: float = 10.0
+    ground_m: float = 0.0
+    source: str = ""
+
+    @property
+    def position_m(self) -> FloatArray:
+        """Array centre (3,) in the site frame [m]."""
+        return np.array([self.east_m, self.north_m, self.ground_m + self.antenna_height_m])
+
+
+@dataclass(frozen=True, slots=True)
+class Building:
+    """A prism: footprint (east, north) [m], flat roof at ``base_m + height_m``."""
+
+    name: str
+    footprint: Polygon
+    height_m: float
+    base_m: float = 0.0
+    material: str = "concrete"
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Forest:
+    """A wooded area (east, north) [m] in which trees are placed at random.
+
+    ``trees_per_hectare`` and ``minimum_spacing_m`` rule the placement.
+    """
+
+    name: str
+    area: Polygon
+    trees_per_hectare: float = 100.0
+    minimum_spacing_m: float = 4.0
+    source: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Trees:
+    """All single trees as columns, each of shape (trees,) [m].
+
+    A tree is a trunk (cylinder from the ground to ``crown_base_m``) and a crown (cone from ``crown_base_m`` up
+    to ``height_m``, widest at its base). Heights are above ``ground_m``.
+    """
+
+    east_m: FloatArray
+    north_m: FloatArray
+    ground_m: FloatArray
+    height_m: FloatArray
+    crown_diameter_m: FloatArray
+    crown_base_m: FloatArray
+    trunk_diameter_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.east_m)
+
+    @classmethod
+    def none(cls) -> Trees:
+        """No tree."""
+        empty = np.zeros(0)
+        return cls(empty, empty, empty, empty, empty, empty, empty)
+
+
+@dataclass(frozen=True, slots=True)
+class Geofence:
+    """An area to draw (east, north) [m]; it does not take part in the replay."""
+
+    name: str
+    area: Polygon
+
+
+@dataclass(frozen=True, slots=True)
+class Site:
+    """Everything the replay and the maps know about a place.
+
+    Parameters
+    ----------
+    name : str
+        Title of the site.
+    frame : SiteFrame
+        Where the origin lies.
+    towers : mapping of str to Tower
+        In drawing order.
+    buildings, forests, geofences : tuples
+        May be empty.
+    trees : Trees
+        Placed trees (from forests and single points).
+    ground_material : str
+        Name in ``site.materials``.
+    area_m : (east_min, east_max, north_min, north_max)
+        Extent for maps.
+    illustrative : bool
+        True when buildings and forests are invented for demonstration; shown wherever they are drawn.
+    notes : tuple of str
+        For the report.
+    """
+
+    name: str
+    frame: SiteFrame
+    towers: Mapping[str, Tower]
+    buildings: tuple[Building, ...] = ()
+    forests: tuple[Forest, ...] = ()
+    trees: Trees = field(default_factory=Trees.none)
+    geofences: tuple[Geofence, ...] = ()
+    ground_material: str = "medium_dry_ground"
+    area_m: tuple[float, float, float, float] = (-540.0, 540.0, -1065.0, 1065.0)
+    illustrative: bool = False
+    notes: tuple[str, ...] = ()

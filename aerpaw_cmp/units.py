@@ -1,0 +1,47 @@
+"""Constants and conversions used by more than one room.
+
+Logarithmic and angular units are part of every name: ``_db`` is a ratio, ``_dbm`` a power.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+FloatArray = NDArray[np.float64]
+ComplexArray = NDArray[np.complex128]
+IntArray = NDArray[np.int64]
+BoolArray = NDArray[np.bool_]
+AnyArray = NDArray[Any]
+
+SPEED_OF_LIGHT_MPS = 299_792_458.0
+"""Speed of light in vacuum (SI, exact)."""
+
+VACUUM_PERMITTIVITY_F_PER_M = 8.854_187_8128e-12
+"""CODATA 2018."""
+
+MINIMUM_HEIGHT_M = 0.5
+"""Poses below this height above ground are raised to it (arXiv 2502.10324, section V)."""
+
+
+def wavelength_m(frequency_hz: float) -> float:
+    """Free-space wavelength [m] of a frequency [Hz]."""
+    return SPEED_OF_LIGHT_MPS / frequency_hz
+
+
+def db_from_power(power: ArrayLike) -> FloatArray:
+    """10 log10 of a power ratio; zero gives -inf without a warning."""
+    with np.errstate(divide="ignore"):
+        return np.asarray(10.0 * np.log10(np.asarray(power, dtype=np.float64)))
+
+
+def power_from_db(level_db: ArrayLike) -> FloatArray:
+    """Power ratio of a level in dB."""
+    return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 10.0))
+
+
+def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
+    """Angle wrapped to [-180, 180) degrees."""
+    return np.asarray((np.asarray(angle_deg, dtype=np.float64) + 180.0) % 360.0 - 180.0)

@@ -1,0 +1,233 @@
+"""Arguments, exit codes, progress: the only module that prints."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .commands import COMMANDS
+from .errors import AerpawCmpError, UsageError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(site_app, name="site", help=COMMANDS["site"])
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
+Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
+LogsRoot = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
+]
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line and give its exit code; a user never sees a traceback."""
+    debug = os.environ.get("AERPAW_CMP_DEBUG") == "1"
+    try:
+        result = app(args=arguments, standalone_mode=False)
+        return result if isinstance(result, int) else 0
+    except AerpawCmpError as error:
+        if debug:
+            raise
+        print(f"aerpaw-cmp: {error}", file=sys.stderr)
+        return error.exit_code
+    except (KeyboardInterrupt, typer.Abort):
+        print("aerpaw-cmp: interrupted", file=sys.stderr)
+        return 130
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 0
+    except Exception as error:
+        return _usage_or_bug(error, debug)
+
+
+def _usage_or_bug(error: Exception, debug: bool) -> int:
+    # typer >= 0.16 vendors click: what counts is the shape of the exception, not its module
+    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+        message = error.format_message()
+        if message:  # empty when the help was shown instead
+            print(f"aerpaw-cmp: {message}", file=sys.stderr)
+        return 2
+    if debug:
+        raise error
+    print(
+        f"aerpaw-cmp: internal error: {type(error).__name__}: {error}. This is a bug of ours; "
+        "AERPAW_CMP_DEBUG=1 shows where, please report it with that text",
+        file=sys.stderr,
+    )
+    return 1
+
+
+def _say(text: str) -> None:
+    """Progress goes to standard error, so that standard output stays clean."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _table(columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*[cell.replace("[", r"\[") for cell in row])
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+@app.command(help=COMMANDS["ingest"])
+def ingest(
+    paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
+    out: Out = None,
+    reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
+    timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
+    time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
+    ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    as_json: Json = False,
+) -> None:
+    """Read logs, account for every line, write the flight file."""
+    from . import run
+
+    if ri_base not in (None, "zero", "one"):
+        raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
+    summary = run.run_ingest(
+        paths, out=out, reader=reader, timezone=timezone, time_origin=time_origin, ri_base=ri_base
+    )
+    if as_json:
+        _print_json(summary)
+        return
+    rows = []
+    for file in summary["files"]:
+        streams = ", ".join(f"{s['name']} ({s['kind']}) {s['rows']}" for s in file["streams"]) or "-"
+        rates = ", ".join("-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in file["streams"]) or "-"
+        spans = "\n".join(f"{s['start']} .. {s['end']}" for s in file["streams"][:1]) or "-"
+        rows.append(
+            [
+                str(file["path"]),
+                file["reader"],
+                streams,
+                str(file["lines"]),
+                str(file["accepted"]),
+                str(file["rejected"]),
+                str(file["blank"]),
+                rates,
+                spans,
+                "\n".join(file["warnings"]) or "-",
+            ]
+        )
+    header = ["file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "span UTC", "warnings"]
+    _table(header, rows)
+    for skipped in summary.get("skipped", []):
+        _say(f"skipped: {skipped}")
+    if out is not None:
+        print(f"wrote {out}")
+
+
+@app.command(help=COMMANDS["formats"])
+def formats(as_json: Json = False) -> None:
+    """List the readers with a sample line each."""
+    from .readers import catalogue
+
+    readers = sorted(catalogue(), key=lambda r: r.name)
+    if as_json:
+        _print_json({"readers": [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]})
+        return
+    _table(
+        ["reader", "what", "streams", "a line of it"], [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers]
+    )
+
+
+@app.command(help=COMMANDS["report"])
+def report(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
+    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Replay a flight, calibrate, compare, report."""
+    from . import run
+
+    outcome = run.run_report(flight, out=out, logs_root=logs_root, engine=engine, audit=audit, progress=_say)
+    if as_json:
+        _print_json(outcome.metrics)
+    else:
+        _print_report_summary(outcome)
+    failed = outcome.failed_checks
+    for check in failed:
+        _say(f"check failed: {check}")
+    return 1 if strict and failed else 0
+
+
+def _print_report_summary(outcome: Any) -> None:
+    rows = []
+    for tower, channels in outcome.metrics["rss"].items():
+        for channel, m in channels.items():
+            ci = m.get("rmse_ci95_db") or [None, None]
+            rows.append(
+                [
+                    tower,
+                    channel,
+                    _number(m["offset_db"], "{:.1f}"),
+                    _number(m["rmse_db"], "{:.2f}"),
+                    f"{_number(ci[0], '{:.2f}')} .. {_number(ci[1], '{:.2f}')}",
+                    _number(m["baselines"]["free_space"]["rmse_db"], "{:.2f}"),
+                    _number(m["baselines"]["two_ray"]["rmse_db"], "{:.2f}"),
+                    _number(m["correlation"], "{:.2f}"),
+                    str(m["n"]),
+                    str(m["n_out_of_coverage"]),
+                ]
+            )
+    if rows:
+        _table(
+            ["tower", "channel", "offset dB", "RMSE dB", "95 %", "free space", "two-ray", "corr.", "n", "out of cov."],
+            rows,
+            "RSS, measured against replayed",
+        )
+    rows = []
+    for tower, m in outcome.metrics["rank"].items():
+        for k, s in m["simulated"].items():
+            rows.append([tower, k, _number(s["agreement"], "{:.3f}"), _number(s["total_variation"], "{:.3f}"), str(m["n"])])
+    if rows:
+        _table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    print(f"report: {outcome.folder / 'report.html'}")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+@app.command(help=COMMANDS["simulate"])
+def simulate(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
+    out: Out = None,
+) -> None:
+    """Forward-simulate a planned flight into logs of the real formats."""
+    from . import run
+
+    for path in run.run_simulate(flight, out=out, progress=_say):
+        print(path)
+
+
+@app.command(help=COMMANDS["doctor"])
+def doctor(as_json: Json = False) -> int:
+    """Is this machine ready?"""
+    from . import doctor as doctor_room
+
+    checks = doctor_room.checks()
+    if as_json:
+        _print_json(doctor_room.as_dict(checks))
+    else:
+        _table(["check", "status", "found", "remedy"], [[c.name, c.status, c.found, c.remedy or "-"] for c in checks])
+    return 1 if any(c.status == "fail" for c in checks) else 0

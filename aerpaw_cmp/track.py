@@ -1,0 +1,363 @@
+"""Where the UAV was and how it was turned at any instant, and whether two clocks agree.
+
+Attitude is interpolated as rotation (slerp), never as angles. Telemetry gaps longer than a stated limit are not
+bridged; poses in them are invalid, with a reason. What a log does not say (attitude) is replaced by level flight
+along the course and flagged. Nothing is dropped silently: :class:`TrackAccount` counts every row left out.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from .geodesy import SiteFrame
+from .units import MINIMUM_HEIGHT_M, AnyArray, BoolArray, FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAXIMUM_GAP_S = 3.0
+"""Telemetry gaps longer than this are not bridged [s]; vehicleOut rows come every 1.0 s."""
+
+COURSE_SPEED_MPS = 1.0
+"""Below this ground speed the course says nothing about the heading [m/s]."""
+
+REASONS = ("", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time")
+"""Why a pose is not valid; index 0 is a valid pose."""
+
+
+@dataclass(frozen=True, slots=True)
+class TrackAccount:
+    """What became of the telemetry rows.
+
+    Parameters
+    ----------
+    rows : int
+        Rows of the telemetry frame.
+    no_time, duplicate_time, backward_time, bad_position : int
+        Rows not used for position: no time stamp; the stamp of the row before; a stamp earlier than one before it
+        (or, where fewer rows are lost that way, later than one after it); NaN, -999 or impossible coordinates.
+    unknown_attitude : int
+        Used rows without attitude (NaN, or exactly 0, 0, 0: written by converters for "unknown").
+    gaps : int
+        Intervals between used rows that are longer than the limit.
+    longest_gap_s : float
+        The longest interval [s].
+    """
+
+    rows: int
+    no_time: int
+    duplicate_time: int
+    backward_time: int
+    bad_position: int
+    unknown_attitude: int
+    gaps: int
+    longest_gap_s: float
+
+
+@dataclass(frozen=True, slots=True)
+class TrackPoses:
+    """Poses at asked instants.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        East, north, up in the site frame [m]; NaN where not valid.
+    rotation : (n, 3, 3)
+        Aircraft body (forward-left-up) to east-north-up; NaN where not valid.
+    valid : (n,) bool
+        False before, after and inside gaps of the telemetry.
+    reason : (n,) str
+        Empty where valid, else one of :data:`REASONS`.
+    attitude_known : (n,) bool
+        False where level flight along the course stands in for the attitude.
+    raised : (n,) bool
+        The height was below the minimum and was raised to it.
+    velocity_mps : (n, 3)
+        East, north, up [m/s]; NaN where not valid.
+    """
+
+    position_m: FloatArray
+    rotation: FloatArray
+    valid: BoolArray
+    reason: AnyArray
+    attitude_known: BoolArray
+    raised: BoolArray
+    velocity_mps: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.valid)
+
+    @property
+    def heading_deg(self) -> FloatArray:
+        """Heading of the nose, clockwise from north, [0, 360) deg."""
+        return np.asarray(np.degrees(np.arctan2(self.rotation[:, 0, 0], self.rotation[:, 1, 0])) % 360.0)
+
+
+def _nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
+    """UTC instants as int64 ns since 1970; NaT becomes the smallest integer. Floats are epoch seconds."""
+    array = np.asarray(times)
+    if array.dtype.kind == "M":
+        return array.astype("datetime64[ns]").astype(np.int64)
+    if array.dtype.kind == "O":
+        import pandas as pd
+
+        stamps = pd.DatetimeIndex(pd.to_datetime(array, utc=True)).tz_localize(None)
+        return stamps.to_numpy().astype("datetime64[ns]").astype(np.int64)
+    seconds = array.astype(np.float64)
+    good = np.isfinite(seconds)
+    return np.where(good, np.round(np.where(good, seconds, 0.0) * 1e9), np.iinfo(np.int64).min).astype(np.int64)
+
+
+_NAT = np.iinfo(np.int64).min
+
+
+def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
+    """Rows of a strictly increasing clock, and how many are duplicates and backward.
+
+    A stamp is backward when an earlier row is later. One wild stamp in the future would then condemn all rows
+    after it, so the mirrored rule (a stamp later than a later row's is wrong) is used where it loses fewer rows.
+    """
+    if not len(stamp):
+        return np.zeros(0, dtype=bool), 0, 0
+    before = np.concatenate([[_NAT], np.maximum.accumulate(stamp)[:-1]])
+    after = np.concatenate([np.minimum.accumulate(stamp[::-1])[::-1][1:], [np.iinfo(np.int64).max]])
+    onward, mirrored = stamp >= before, stamp <= after
+    ordered = onward if onward.sum() >= mirrored.sum() else mirrored
+    keep = ordered.copy()
+    kept = np.flatnonzero(ordered)
+    repeated = np.concatenate([[False], np.diff(stamp[kept]) == 0])
+    keep[kept[repeated]] = False
+    return keep, int(repeated.sum()), int((~ordered).sum())
+
+
+def _good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
+    """Coordinates that can be: finite, in range, not (0, 0) and not the -999 that loggers write without a fix."""
+    finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
+    with np.errstate(invalid="ignore"):
+        possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & (altitude > -900.0)
+    return finite & possible & ~((latitude == 0.0) & (longitude == 0.0))
+
+
+def body_rotation(roll_deg: ArrayLike, pitch_deg: ArrayLike, yaw_deg: ArrayLike) -> FloatArray:
+    """Rotations from the aircraft body (forward-left-up) to east-north-up.
+
+    Parameters
+    ----------
+    roll_deg, pitch_deg, yaw_deg : array_like, (n,)
+        Right wing down +, nose up +, heading clockwise from north.
+
+    Returns
+    -------
+    ndarray, (n, 3, 3)
+    """
+    from scipy.spatial.transform import Rotation
+
+    angles = np.stack(
+        [
+            90.0 - np.asarray(yaw_deg, dtype=np.float64),  # counter-clockwise from east
+            -np.asarray(pitch_deg, dtype=np.float64),  # turning about "left": nose up is negative
+            np.asarray(roll_deg, dtype=np.float64),
+        ],
+        axis=-1,
+    )
+    return np.asarray(Rotation.from_euler("ZYX", angles, degrees=True).as_matrix())
+
+
+class Track:
+    """The flight path of one telemetry stream in a site frame.
+
+    Parameters
+    ----------
+    telemetry : pandas.DataFrame
+        Records of kind telemetry (see :mod:`aerpaw_cmp.records`), file order.
+    frame : SiteFrame
+        The site's frame.
+    maximum_gap_s : float
+        Longer gaps are not bridged [s].
+    minimum_height_m : float
+        Lower poses are raised to this height above the take-off ground [m].
+    ground_m : float
+        Height of the take-off point above the site origin [m], added to ``altitude_m``.
+    method : {"linear", "pchip"}
+        Interpolation of positions.
+
+    Attributes
+    ----------
+    account : TrackAccount
+        What became of the rows.
+    start_ns, end_ns : int
+        First and last used instant [ns since 1970, UTC]; both 0 without a row.
+    """
+
+    def __init__(
+        self,
+        telemetry: pd.DataFrame,
+        frame: SiteFrame,
+        *,
+        maximum_gap_s: float = MAXIMUM_GAP_S,
+        minimum_height_m: float = MINIMUM_HEIGHT_M,
+        ground_m: float = 0.0,
+        method: Literal["linear", "pchip"] = "linear",
+    ) -> None:
+        if not maximum_gap_s > 0:
+            raise ValueError(f"maximum_gap_s must be positive, found {maximum_gap_s}")
+        self.frame = frame
+        self.maximum_gap_s = maximum_gap_s
+        self.minimum_height_m = minimum_height_m
+        self.ground_m = ground_m
+        self.method = method
+        self._load(telemetry)
+
+    def _load(self, telemetry: pd.DataFrame) -> None:
+        def column(name: str) -> FloatArray:
+            return telemetry[name].to_numpy(dtype=np.float64)
+
+        stamp = _nanoseconds(telemetry["time"])
+        latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
+        timed = stamp != _NAT
+        placed = timed & _good_positions(latitude, longitude, altitude)
+        rows = np.flatnonzero(placed)
+        forward, duplicates, backward = _forward_rows(stamp[rows])
+        rows = rows[forward]
+
+        self.start_ns = int(stamp[rows[0]]) if len(rows) else 0
+        self.end_ns = int(stamp[rows[-1]]) if len(rows) else 0
+        self._time_s = (stamp[rows] - self.start_ns) * 1e-9
+        east, north = self.frame.to_local(latitude[rows], longitude[rows])
+        self._position = np.column_stack([east, north, altitude[rows] + self.ground_m])
+        velocity = [column("velocity_east_mps"), column("velocity_north_mps"), -column("velocity_down_mps")]
+        self._velocity = _velocities(self._time_s, self._position, np.column_stack(velocity)[rows])
+        self._course_deg = _courses(self._velocity)
+        self._attitude = np.column_stack([column("roll_deg"), column("pitch_deg"), column("yaw_deg")])[rows]
+        known = np.isfinite(self._attitude).all(axis=1) & np.any(self._attitude != 0.0, axis=1)
+        self._known = known
+        interval = np.diff(self._time_s)
+        self.account = TrackAccount(
+            rows=len(stamp),
+            no_time=int((~timed).sum()),
+            duplicate_time=duplicates,
+            backward_time=backward,
+            bad_position=int((timed & ~placed).sum()),
+            unknown_attitude=int((~known).sum()),
+            gaps=int((interval > self.maximum_gap_s).sum()),
+            longest_gap_s=float(interval.max()) if len(interval) else 0.0,
+        )
+
+    def __len__(self) -> int:
+        return len(self._time_s)
+
+    def pose_at(self, times: ArrayLike | pd.Series) -> TrackPoses:
+        """Poses at instants.
+
+        Parameters
+        ----------
+        times : array_like, (n,)
+            datetime64 (UTC) or epoch seconds; any order.
+
+        Returns
+        -------
+        TrackPoses
+        """
+        instant = _nanoseconds(times).ravel()
+        timed = instant != _NAT
+        t = np.where(timed, instant - self.start_ns, 0) * 1e-9
+        code = self._codes(t)
+        code[~timed] = REASONS.index("no time")
+        valid = code == 0
+        n = len(t)
+        position = np.full((n, 3), np.nan)
+        rotation = np.full((n, 3, 3), np.nan)
+        velocity = np.full((n, 3), np.nan)
+        known, raised = np.zeros(n, dtype=bool), np.zeros(n, dtype=bool)
+        if valid.any():
+            position[valid] = self._positions(t[valid])
+            velocity[valid] = _interpolate(t[valid], self._time_s, self._velocity)
+            rotation[valid], known[valid] = self._rotations(t[valid])
+            floor = self.ground_m + self.minimum_height_m
+            raised[valid] = position[valid, 2] < floor
+            position[raised, 2] = floor
+        reason = np.asarray(REASONS)[code]
+        return TrackPoses(position, rotation, valid, reason, known, raised, velocity)
+
+    def _codes(self, t: FloatArray) -> AnyArray:
+        """Index into :data:`REASONS` for every instant."""
+        code = np.zeros(len(t), dtype=np.int64)
+        if not len(self):
+            code[:] = REASONS.index("no telemetry")
+            return code
+        code[_in_gap(t, self._time_s, self.maximum_gap_s)] = REASONS.index("telemetry gap")
+        code[t < self._time_s[0]] = REASONS.index("before telemetry")
+        code[t > self._time_s[-1]] = REASONS.index("after telemetry")
+        return code
+
+    def _positions(self, t: FloatArray) -> FloatArray:
+        if self.method == "pchip" and len(self) > 1:
+            from scipy.interpolate import PchipInterpolator
+
+            return np.asarray(PchipInterpolator(self._time_s, self._position, axis=0)(t))
+        return _interpolate(t, self._time_s, self._position)
+
+    def _rotations(self, t: FloatArray) -> tuple[FloatArray, BoolArray]:
+        """Rotation at every instant (n, 3, 3) and whether it comes from logged attitude."""
+        course = body_rotation(0.0 * t, 0.0 * t, self._course_at(t))
+        at = self._time_s[self._known]
+        if not len(at):
+            return course, np.zeros(len(t), dtype=bool)
+        near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, self.maximum_gap_s)
+        if near.any():
+            course[near] = _slerp(t[near], at, self._attitude[self._known])
+        return course, near
+
+    def _course_at(self, t: FloatArray) -> FloatArray:
+        """Course over ground [deg], interpolated as a direction."""
+        angle = np.radians(self._course_deg)
+        mixed = _interpolate(t, self._time_s, np.column_stack([np.sin(angle), np.cos(angle)]))
+        return np.asarray(np.degrees(np.arctan2(mixed[:, 0], mixed[:, 1])))
+
+
+def _interpolate(t: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
+    """Linear interpolation of columns (rows, m) at t (n,)."""
+    return np.column_stack([np.interp(t, at, values[:, i]) for i in range(values.shape[1])])
+
+
+def _in_gap(t: FloatArray, at: FloatArray, limit_s: float) -> BoolArray:
+    """Whether an instant lies strictly inside an interval longer than the limit."""
+    right = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
+    left = np.maximum(right - 1, 0)
+    exact = at[right] == t
+    return np.asarray((at[right] - at[left] > limit_s) & ~exact)
+
+
+def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArray:
+    """Rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
+    from scipy.spatial.transform import Rotation, Slerp
+
+    matrices = body_rotation(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
+    if len(at) == 1:
+        return np.broadcast_to(matrices, (len(t), 3, 3))
+    return np.asarray(Slerp(at, Rotation.from_matrix(matrices))(t).as_matrix())
+
+
+def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
+    """Logged velocities (east, north, up); where missing or never moving, differences of position."""
+    if len(t) < 2:
+        return np.where(np.isfinite(logged), logged, 0.0)
+    derived = np.gradient(position, t, axis=0)
+    missing = ~np.isfinite(logged).all(axis=1)
+    if not np.any(logged[~missing]):  # converters write (0, 0, 0) for "unknown"
+        missing[:] = True
+    return np.where(missing[:, None], derived, logged)
+
+
+def _courses(velocity: FloatArray) -> FloatArray:
+    """Course over ground [deg clockwise from north]; at rest the last one holds (before the first: the first)."""
+    course = np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1]))
+    moving = np.flatnonzero(np.hypot(velocity[:, 0], velocity[:, 1]) >= COURSE_SPEED_MPS)
+    if not len(moving):
+        return np.zeros(len(velocity))
+    last = np.searchsorted(moving, np.arange(len(velocity)), side="right") - 1
+    return np.asarray(course[moving[np.maximum(last, 0)]])

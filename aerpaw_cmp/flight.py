@@ -144,7 +144,7 @@ def gather(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) ->
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (
-        Track.from_telemetry(telemetry[0][1].frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s)
+        Track(telemetry[0][1].frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s)
         if telemetry
         else None
     )
@@ -212,7 +212,7 @@ def _check_overlap(data: FlightData) -> None:
         )
     for kind, tower, time in needs_track:
         assert data.track is not None
-        start, end = data.track.span
+        start, end = np.datetime64(data.track.start_ns, "ns"), np.datetime64(data.track.end_ns, "ns")
         if len(time) == 0 or time.min() > end or time.max() < start:
             shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
             raise InputError(

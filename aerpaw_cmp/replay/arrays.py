@@ -23,7 +23,10 @@ class Pattern(Protocol):
     ``|E_theta|^2 + |E_phi|^2`` is the gain (linear, over isotropic).
     """
 
-    name: str
+    @property
+    def name(self) -> str:
+        """For reports."""
+        ...
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Complex field components (theta, phi)."""
@@ -203,7 +206,7 @@ def uav_comparison_array(
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
     """Horizontal line of vertical elements; the paper's maps use 4 at half a wavelength along the y axis."""
-    along = np.arange(elements) * spacing_m
+    along = np.arange(elements, dtype=np.float64) * spacing_m
     return Array(
         _centred_line(along),
         np.zeros(elements),

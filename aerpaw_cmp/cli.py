@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Annotated, Any, Optional
@@ -11,7 +10,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from .commands import COMMANDS
-from .errors import AerpawCmpError, UsageError
+from .errors import UsageError
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -25,42 +24,18 @@ LogsRoot = Annotated[
 ]
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line and give its exit code; a user never sees a traceback."""
-    debug = os.environ.get("AERPAW_CMP_DEBUG") == "1"
+def main(arguments: list[str]) -> int:
+    """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
     try:
-        result = app(args=arguments, standalone_mode=False)
-        return result if isinstance(result, int) else 0
-    except AerpawCmpError as error:
-        if debug:
-            raise
-        print(f"aerpaw-cmp: {error}", file=sys.stderr)
-        return error.exit_code
-    except (KeyboardInterrupt, typer.Abort):
-        print("aerpaw-cmp: interrupted", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return 0
+        result = app(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
     except Exception as error:
-        return _usage_or_bug(error, debug)
-
-
-def _usage_or_bug(error: Exception, debug: bool) -> int:
-    # typer >= 0.16 vendors click: what counts is the shape of the exception, not its module
-    if hasattr(error, "format_message") and hasattr(error, "exit_code"):
-        message = error.format_message()
-        if message:  # empty when the help was shown instead
-            print(f"aerpaw-cmp: {message}", file=sys.stderr)
-        return 2
-    if debug:
-        raise error
-    print(
-        f"aerpaw-cmp: internal error: {type(error).__name__}: {error}. This is a bug of ours; "
-        "AERPAW_CMP_DEBUG=1 shows where, please report it with that text",
-        file=sys.stderr,
-    )
-    return 1
+        # typer may vendor click: what counts is the shape of a usage error, not its module
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+            raise UsageError(error.format_message()) from error
+        raise
+    return result if isinstance(result, int) else 0
 
 
 def _say(text: str) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -15,7 +16,8 @@ from .compare import offset as offsets
 from .compare import rank as ranks
 from .flight import FlightData, RankSeries, RssSeries, rank_positions
 from .replay.arrays import Link, Poses
-from .replay.baselines import free_space_rss_dbm, two_ray_rss_dbm
+from .replay.baselines import free_space_dbm, two_ray_dbm
+from .replay.paths import PathSet
 from .replay.replay import Replay, replay
 from .report import data as report
 from .track import TrackPoses
@@ -69,9 +71,32 @@ def replay_rss(data: FlightData, progress: Progress) -> list[Replayed]:
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
             stop = start + len(part)
-            out[index] = Replayed(link, part, track.valid, whole.part(start, stop), track)
+            out[index] = Replayed(link, part, track.valid, part_of(whole, start, stop), track)
             start = stop
     return [out[i] for i in range(len(data.rss))]
+
+
+def part_of(whole: Replay, start: int, stop: int) -> Replay:
+    """The replay of poses ``start`` to ``stop``."""
+    paths = whole.paths
+    chosen = (paths.pose >= start) & (paths.pose < stop)
+    share = (stop - start) / max(len(whole.rss_dbm), 1)
+    return dataclasses.replace(
+        whole,
+        rss_dbm=whole.rss_dbm[start:stop],
+        rss_power_dbm=whole.rss_power_dbm[start:stop],
+        h=whole.h[start:stop],
+        has_path=whole.has_path[start:stop],
+        paths=PathSet(
+            paths.pose[chosen] - start,
+            paths.tower[chosen],
+            paths.depth[chosen],
+            paths.faces[chosen],
+            paths.vertices_m[chosen],
+        ),
+        seconds=whole.seconds * share,
+        search_seconds=whole.search_seconds * share,
+    )
 
 
 def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
@@ -126,6 +151,15 @@ def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
     )
 
 
+def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
+    """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
+    place, link = data.site.towers[tower], replayed.link
+    source, target = place.position_m[None, :], replayed.poses.position_m
+    ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
+    ground = {"ground_material": data.site.ground_material, "ground_m": place.ground_m}
+    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray_dbm(*ends, **ground)[:, 0]}
+
+
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> Compared:
     """Offset, RMSE, correlation and baselines of one tower and channel."""
     settings = data.settings.rss
@@ -139,8 +173,8 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     used = np.where(compared, measured, np.nan)
     fit = offsets.grid_offset(used, simulated, step_db=settings.step_db, span_db=settings.span_db)
     baselines = []
-    for name, function in (("free_space", free_space_rss_dbm), ("two_ray", two_ray_rss_dbm)):
-        level = replayed.spread(function(data.site, replayed.link, replayed.poses)[:, 0])
+    for name, level_dbm in baseline_levels(data, series.tower, replayed).items():
+        level = replayed.spread(level_dbm)
         base = offsets.grid_offset(used, level, step_db=settings.step_db, span_db=settings.span_db)
         baselines.append(report.Baseline(name=name, level_dbm=level, offset_db=base.offset_db, rmse_db=base.rmse_db))
     pairs = np.isfinite(used) & np.isfinite(simulated)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from .config import FlightFile, LinkSettings, LogSettings, SiteChoice
 from .errors import InputError, UsageError
-from .ingest import IngestedFile, ingest
-from .readers import HEAD_BYTES, by_name, catalogue
+from .ingest import IngestedFile, ingest, read_bytes
+from .readers import HEAD_BYTES, Reader, by_name, catalogue
 from .records import Stream
 from .site.site import Site
 from .site.siteyaml import load_site
@@ -97,9 +97,9 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
                 "there is no such log", expected=f"the file below {root}", cause="a wrong path, or --logs-root", path=path
             )
         reader = None if log.reader is None else by_name(log.reader)
+        if reader is not None:
+            _refuse_other_kind(path, reader)
         (file,) = ingest([path], options=log.options(settings.timezone), reader=log.reader)
-        if reader is not None and file.result.accepted == 0:
-            _refuse_other_kind(path, reader.name)
         if not file.result.streams:
             raise InputError(
                 "no record could be read",
@@ -111,13 +111,15 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     return tuple(files)
 
 
-def _refuse_other_kind(path: Path, expected: str) -> None:
-    with path.open("rb") as stream:
-        head = stream.read(HEAD_BYTES)
+def _refuse_other_kind(path: Path, reader: Reader) -> None:
+    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    head = read_bytes(path)[0][:HEAD_BYTES]
     others = [r.name for r in catalogue() if r.sniff(head)]
+    if not others or reader.name in others:
+        return
     raise InputError(
-        f"the content is {'that of ' + ' or '.join(others) if others else 'of no known kind'}",
-        expected=f"a log of reader {expected!r}, as flight.yaml says",
+        f"the content is that of {' or '.join(others)}",
+        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
         cause="the wrong file, or the wrong 'reader:'",
         path=path,
     )
@@ -144,7 +146,7 @@ def gather(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) ->
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (
-        Track(telemetry[0][1].frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s)
+        Track(telemetry[0][1].frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m)
         if telemetry
         else None
     )

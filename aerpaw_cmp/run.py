@@ -109,12 +109,13 @@ def run_report(
     with stages("audit"):
         engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
     with stages("report"):
-        from .report.export import build_metrics, write_report
+        from .report.export import metrics as metrics_of
+        from .report.export import write_report
 
         record = _report_data(data, rss, rank, engine_record, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
-        metrics = build_metrics(record)
+        metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
 

@@ -213,20 +213,22 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             keep &= position[:, 2] >= settings.minimum_height_m
     h = replayed.replay.h[:, 0]
     measured = np.where(keep, series.rank, np.nan)
+    measured_share = ranks.histogram(measured)
     at_k = []
     for k in settings.k:
         simulated = np.zeros(len(series.rank), dtype=np.int64)
         simulated[replayed.valid] = ranks.channel_rank(h, k)
         both = np.isfinite(measured)
+        share = ranks.histogram(np.where(both, simulated, np.nan))
         at_k.append(
             report.RankAtK(
                 k=k,
                 rank=simulated,
-                histogram=report.Histogram(share=ranks.histogram(np.where(both, simulated, np.nan))),
+                histogram=report.Histogram(share=share),
                 n_out_of_coverage=int((both & (simulated == 0)).sum()),
                 agreement=ranks.agreement(measured, simulated),
-                total_variation=ranks.total_variation(measured, np.where(both, simulated, np.nan)),
-                wasserstein=ranks.wasserstein(measured, np.where(both, simulated, np.nan)),
+                total_variation=ranks.total_variation(measured_share, share),
+                wasserstein=ranks.wasserstein(measured_share, share),
             )
         )
     panel = report.RankPanel(
@@ -236,7 +238,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         north_m=position[:, 1],
         up_m=position[:, 2],
         measured=measured,
-        histogram=report.Histogram(share=ranks.histogram(measured)),
+        histogram=report.Histogram(share=measured_share),
         simulated=tuple(at_k),
         sinr_db=series.sinr_db,
         extra={"n": int(np.isfinite(measured).sum())},

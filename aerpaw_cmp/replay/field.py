@@ -96,7 +96,8 @@ def channel_matrices(
         key = paths.pose[rows] * len(arrays) + tower
         first = np.flatnonzero(np.diff(key, prepend=-1))
         h[key[first]] += np.add.reduceat(one, first, axis=0)
-    power = np.bincount(paths.pose * len(arrays) + paths.tower, weights=path_power, minlength=len(poses) * len(arrays))
+    link_of = paths.pose * len(arrays) + paths.tower
+    power = np.asarray(np.bincount(link_of, weights=path_power, minlength=len(poses) * len(arrays)), dtype=np.float64)
     if link.uav_transmits:
         h = h.swapaxes(1, 2)
     return Fields(
@@ -288,7 +289,7 @@ def reflection_coefficients(
         echo = np.where(slab, np.exp(-4j * np.pi / wavelength * depth * root), 0.0)
         te = te * (1.0 - echo) / (1.0 - te**2 * echo)
         tm = tm * (1.0 - echo) / (1.0 - tm**2 * echo)
-    return te, tm
+    return np.asarray(te, dtype=np.complex128), np.asarray(tm, dtype=np.complex128)
 
 
 @dataclass(frozen=True, slots=True)

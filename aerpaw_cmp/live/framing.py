@@ -14,7 +14,7 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
-from typing import Literal, Union
+from typing import Literal
 
 MAX_LINE_BYTES = 65_536
 MAX_LINES = 256
@@ -76,7 +76,7 @@ class Late:
     code: str | None = None
 
 
-Event = Union[Answer, Unsolicited, Late]
+Event = Answer | Unsolicited | Late
 
 _UNSOLICITED = re.compile(
     r"(RDY|APP RDY|RING|POWERED DOWN|NORMAL POWER DOWN|NO CARRIER|SMS DONE|PB DONE)$"
@@ -131,7 +131,7 @@ def unglue(text: str) -> tuple[str, ...]:
             quoted = not quoted
         elif not quoted and match.start() > 0:
             cuts.append(match.start())
-    pieces = [text[a:b] for a, b in zip(cuts, [*cuts[1:], len(text)])]
+    pieces = [text[a:b] for a, b in zip(cuts, [*cuts[1:], len(text)], strict=True)]
     last = pieces[-1]
     if not quoted and _GLUED_OK.search(last):
         pieces[-1:] = [last[:-2], "OK"]
@@ -209,7 +209,7 @@ def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
 
 
 class Framer:
-    """Answers to known commands, one in flight at a time.
+    r"""Answers to known commands, one in flight at a time.
 
     A command that timed out still owes an answer. What comes for it later is a :class:`Late` event, told from the
     next command's answer by its prefix, or by the echo where the modem echoes.
@@ -223,7 +223,7 @@ class Framer:
     --------
     >>> framer = Framer()
     >>> framer.send('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
-    >>> framer.feed(b'\\r\\n+QNWCFG: "nr5g_csi",13,2,8,896\\r\\n\\r\\nOK\\r\\n')[0].lines
+    >>> framer.feed(b'\r\n+QNWCFG: "nr5g_csi",13,2,8,896\r\n\r\nOK\r\n')[0].lines
     ('+QNWCFG: "nr5g_csi",13,2,8,896',)
     """
 
@@ -370,12 +370,12 @@ class Framer:
 
 
 class TranscriptFramer:
-    """Answers in captured text: an echoed command opens one, a final result or the next echo ends it.
+    r"""Answers in captured text: an echoed command opens one, a final result or the next echo ends it.
 
     Examples
     --------
     >>> framer = TranscriptFramer()
-    >>> [a.command for a in framer.feed(b"ATI\\nQuectel\\nOK\\nAT\\nOK\\n")]
+    >>> [a.command for a in framer.feed(b"ATI\nQuectel\nOK\nAT\nOK\n")]
     ['ATI', 'AT']
     """
 

@@ -40,12 +40,12 @@ class Clock:
 
 
 def encode_record(record: Record) -> bytes:
-    """One line, with its checksum and line end.
+    r"""One line, with its checksum and line end.
 
     Examples
     --------
     >>> encode_record({"kind": "end", "n": 3})
-    b'{"kind":"end","n":3,"crc":"21785fb9"}\\n'
+    b'{"kind":"end","n":3,"crc":"a5ccacec"}\n'
     """
     body = json.dumps(record, separators=(",", ":"), ensure_ascii=True, allow_nan=False).encode("ascii")[:-1]
     return body + _CRC + b'%08x"}\n' % zlib.crc32(body)
@@ -190,7 +190,7 @@ class SegmentLog:
     header: Callable[[], Record]
     settings: LogSettings = field(default_factory=LogSettings)
     clock: Clock = field(default_factory=Clock)
-    on_fault: Callable[[str], None] = lambda text: None
+    on_fault: Callable[[str], None] = lambda _text: None
     path: Path | None = None
     paths: list[Path] = field(default_factory=list)
     bytes_written: int = 0

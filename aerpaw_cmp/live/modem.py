@@ -218,7 +218,7 @@ def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
     # 'sinr_raw': dB or 5 X - 20 by firmware, the manual does not decide; so no unit
     renamed = ["bandwidth_code" if name == "uplink_bandwidth_code" else name for name in _LTE]
     values: Values = {}
-    for index, (key, name) in enumerate(zip(_LTE, renamed)):
+    for index, (key, name) in enumerate(zip(_LTE, renamed, strict=True)):
         text = fields[index] if index < len(fields) else None
         values[key] = text if name in _WORDS else number(name, text, flags, prefix="lte.")
     if len(fields) > len(_LTE):
@@ -286,7 +286,7 @@ def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Seq
             flags.append("foreign_line")
             continue
         fields = split_fields(payload)
-        row: Values = dict(zip(names, fields))
+        row: Values = dict(zip(names, fields, strict=False))
         if len(fields) > len(names):
             row["extra"] = fields[len(names) :]
         rows.append(row)
@@ -314,7 +314,7 @@ def decode_identity(lines: Sequence[str], flags: list[str]) -> Values:
     return values
 
 
-def decode_nothing(lines: Sequence[str], flags: list[str]) -> Values:
+def decode_nothing(_lines: Sequence[str], _flags: list[str]) -> Values:
     """For commands without information lines."""
     return {}
 
@@ -324,7 +324,7 @@ QUERIES: Mapping[str, Query] = {
     for query in (
         Query("sync", "AT", (), decode_nothing),
         Query("identity", "ATI", None, decode_identity),
-        Query("firmware", "AT+CGMR", None, lambda lines, flags: {"text": list(lines)}),
+        Query("firmware", "AT+CGMR", None, lambda lines, _flags: {"text": list(lines)}),
         Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), decode_csi_ctrl),
         Query(
             "nr5g_csi",
@@ -378,7 +378,7 @@ def csi_write(lte: int, nr5g: int) -> str:
 
 
 def encode(command: str, *, allow_csi: bool = False) -> bytes:
-    """Bytes of an allowed command.
+    r"""Bytes of an allowed command.
 
     Raises
     ------
@@ -388,13 +388,13 @@ def encode(command: str, *, allow_csi: bool = False) -> bytes:
     Examples
     --------
     >>> encode("AT+QRSRP")
-    b'AT+QRSRP\\r'
+    b'AT+QRSRP\r'
     """
     if command in _BY_TEXT or (allow_csi and _CSI_WRITE.fullmatch(command)):
         return command.encode("ascii") + b"\r"
     writes = _CSI_WRITE.fullmatch(command) is not None
     raise UsageError(
-        f"command {ascii(command[:60])} is not allowed",
+        f"command {command[:60]!a} is not allowed",
         expected="one of " + ", ".join(_BY_TEXT),
         cause="switching CSI reporting needs --enable-csi" if writes else "the tap sends read-only queries only",
     )
@@ -404,7 +404,7 @@ def query_of(name: str) -> Query:
     """The query of that name, or ``UsageError`` naming the known ones."""
     if name in QUERIES:
         return QUERIES[name]
-    raise UsageError(f"unknown query {ascii(name[:40])}", expected="one of " + ", ".join(QUERIES))
+    raise UsageError(f"unknown query {name[:40]!a}", expected="one of " + ", ".join(QUERIES))
 
 
 def decode(name: str, lines: Sequence[str]) -> Decoded:

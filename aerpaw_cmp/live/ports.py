@@ -2,7 +2,7 @@
 
 The port is opened with ``termios`` directly. pyserial empties the input queue when it opens (answers that wait
 there would be lost), insists on a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
-unrelated exceptions (its issues 401 and 417); here it is always :class:`PortGone`.
+unrelated exceptions (its issues 401 and 417); here it is always :class:`PortGoneError`.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ AT_INTERFACES = ("02", "03")
 _GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
 
 
-class PortGone(Exception):
+class PortGoneError(Exception):
     """The port is not there (any more); it may come back."""
 
 
@@ -120,18 +120,18 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
 
     Raises
     ------
-    PortGone
+    PortGoneError
         If it is not there.
     """
     roots = roots or Roots()
     if port is None:
         found = find_candidates(roots)
         if not found:
-            raise PortGone("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
+            raise PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
         return found[0]
     path = Path(port)
     if not path.exists():
-        raise PortGone(f"{path} is not there")
+        raise PortGoneError(f"{path} is not there")
     usb = _usb_of(path.resolve().name, roots)
     interface, product = (usb[1], usb[0]) if usb else (None, None)
     by_id = roots.dev / "serial/by-id"
@@ -197,7 +197,7 @@ def _denied(path: Path) -> InputError:
 class SerialPort:
     """An open port: raw, non-blocking, locked for us.
 
-    Use :meth:`open`. Every method raises :class:`PortGone` when the device is gone.
+    Use :meth:`open`. Every method raises :class:`PortGoneError` when the device is gone.
     """
 
     def __init__(self, fd: int, path: Path) -> None:
@@ -210,7 +210,7 @@ class SerialPort:
 
         Raises
         ------
-        PortGone
+        PortGoneError
             If it is not there or vanishes meanwhile.
         InputError
             If we may not open it, another process holds it, or it is no serial port.
@@ -240,7 +240,7 @@ class SerialPort:
     def _open_error(path: Path, error: OSError | termios.error) -> Exception:
         number = error.args[0]
         if number in _GONE:
-            return PortGone(f"{path} is gone ({os.strerror(number)})")
+            return PortGoneError(f"{path} is gone ({os.strerror(number)})")
         if number in (errno.EBUSY, errno.EWOULDBLOCK):
             return _busy(path, holders(path))
         if number in (errno.EACCES, errno.EPERM):
@@ -263,9 +263,9 @@ class SerialPort:
         except BlockingIOError:
             return b""
         except OSError as error:
-            raise PortGone(f"{self.path} is gone ({error.strerror})") from None
+            raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
         if not data:  # with VMIN=1 an empty read is a hang-up
-            raise PortGone(f"{self.path} is gone (hung up)")
+            raise PortGoneError(f"{self.path} is gone (hung up)")
         return data
 
     def write(self, data: bytes, timeout_s: float = 1.0) -> None:
@@ -278,9 +278,9 @@ class SerialPort:
                 poller = select.poll()
                 poller.register(self._fd, select.POLLOUT)
                 if not poller.poll(max(0.0, deadline - time.monotonic()) * 1e3):
-                    raise PortGone(f"{self.path} takes no bytes") from None
+                    raise PortGoneError(f"{self.path} takes no bytes") from None
             except OSError as error:
-                raise PortGone(f"{self.path} is gone ({error.strerror})") from None
+                raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
 
     def close(self) -> None:
         """Give the port back; harmless if it is gone."""

@@ -20,15 +20,16 @@ import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, Union
+from typing import Literal
 
 from ..errors import InputError, UsageError
 from .framing import Answer, frame_transcript
 from .log import BadLine, read_log
 from .modem import QUERIES
 from .ports import make_raw
+from .stop import Stop
 
-Reply = Union[tuple[str, ...], None]
+Reply = tuple[str, ...] | None
 """Lines up to and with the final result; None: say nothing."""
 
 
@@ -539,8 +540,6 @@ def run_modem_sim(settings: ModemSimSettings, *, on_ready: Callable[[Path], None
     int
         Exit code 0.
     """
-    from .tap import Stop
-
     stop = Stop()
     try:
         with stop.on_signals(), ModemSimulator(settings) as modem:

@@ -9,300 +9,32 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import os
 import re
 import select
-import signal
-import threading
 import time
 import uuid
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..errors import InputError, UsageError
+from ..errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .log import SCHEMA, Clock, LogSettings, Record, SegmentLog, boot_id
-from .modem import OTHER_QUERIES, QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode, query_of
-from .ports import PortGone, PortInfo, Roots, SerialPort, find_candidates, find_port
+from .log import SCHEMA, Clock, Record, SegmentLog, boot_id
+from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
+from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
 from .predict import Predict, PredictionWorker
+from .schedule import Schedule
+from .session import TapSettings, TapStatus, TapSummary, format_status
+from .stop import Stop
+
+__all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
 CLOCK_STEP_NS = 50_000_000
 """A jump of the wall clock against the monotonic one beyond this is recorded."""
 RATE_WINDOW_S = 10.0
 NOISE_LINES_PER_S = 50
-
-
-@dataclass(frozen=True, slots=True)
-class TapSettings:
-    """What the tap does; the defaults suit a flight.
-
-    Parameters
-    ----------
-    folder : Path
-        Where the log segments go (``-o``); made if missing.
-    port : str, optional
-        The serial port; None: the first AT port of a Quectel modem.
-    ri_hz : float
-        Rate of ``nr5g_csi`` [Hz].
-    other_hz : float
-        Rate of each query in ``queries`` [Hz].
-    queries : tuple of str
-        Names in :data:`~aerpaw_cmp.live.modem.QUERIES`.
-    pause_s : float
-        Rest between an answer and the next command [s].
-    answer_timeout_s : float
-        An answer later than this is a ``late`` record [s].
-    probe_timeout_s : float
-        Each of the two probes of a newly opened port waits so long [s].
-    silent_s : float
-        Without any final result for so long, the port is opened anew [s].
-    enable_csi : bool
-        Switch CSI reporting on, and back on exit (the only command that writes).
-    no_csi_alarm_s : float, optional
-        Alarm when no rank came for so long [s].
-    no_csi_exit : bool
-        End with exit code 1 on that alarm instead of going on.
-    status_s : float
-        Interval of the status calls [s].
-    duration_s : float, optional
-        End by itself after so long [s].
-    wait_for_port_s : float
-        At the start, wait so long for the port to appear [s].
-    reconnect_min_s, reconnect_max_s : float
-        Back-off after a loss [s].
-    replay : Path, optional
-        Tap a simulated modem that plays this transcript or tap log, instead of a port.
-    log : LogSettings
-        Durability and rotation.
-    roots : Roots
-        Where devices are looked for.
-    """
-
-    folder: Path
-    port: str | None = None
-    ri_hz: float = 2.0
-    other_hz: float = 1.0
-    queries: tuple[str, ...] = OTHER_QUERIES
-    pause_s: float = 0.02
-    answer_timeout_s: float = 2.0
-    probe_timeout_s: float = 1.0
-    silent_s: float = 10.0
-    enable_csi: bool = False
-    no_csi_alarm_s: float | None = None
-    no_csi_exit: bool = False
-    status_s: float = 1.0
-    duration_s: float | None = None
-    wait_for_port_s: float = 0.0
-    reconnect_min_s: float = 0.1
-    reconnect_max_s: float = 2.0
-    replay: Path | None = None
-    log: LogSettings = field(default_factory=LogSettings)
-    roots: Roots = field(default_factory=Roots)
-
-    def __post_init__(self) -> None:
-        for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
-            if not 0 < getattr(self, name) < 1e6:
-                raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
-        for name in ("other_hz", "pause_s", "wait_for_port_s"):
-            if not 0 <= getattr(self, name) < 1e6:
-                raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
-        if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:
-            raise UsageError(f"no_csi_alarm_s is {self.no_csi_alarm_s}", expected="a positive number of seconds")
-        for name in self.queries:
-            query_of(name)
-        if RI_QUERY in self.queries:
-            raise UsageError(f"{RI_QUERY!r} stands in queries", expected="it only at its own rate, ri_hz")
-
-
-@dataclass(frozen=True, slots=True)
-class TapStatus:
-    """What the terminal shows.
-
-    Parameters
-    ----------
-    elapsed_s : float
-    connected : bool
-    rank : int or None
-        Of the last answer; None: no CSI.
-    rsrp_dbm, sinr_db : int or None
-        NR, last known.
-    ri_rate_hz : float
-        Answers with status ok over the last 10 s.
-    gaps, records, bytes_written : int
-    disk_free_bytes : int or None
-    missed : int
-        Poll slots that passed unused while connected.
-    predicted_rank : int or None
-        By the replay at the present pose.
-    predicts : bool
-        Whether predictions are made at all.
-    alarm : bool
-        No CSI for longer than asked: ring the bell.
-    message : str
-        Something to be read once (a loss, a fault, an advice); empty on regular calls.
-    """
-
-    elapsed_s: float
-    connected: bool
-    rank: int | None
-    rsrp_dbm: int | None
-    sinr_db: int | None
-    ri_rate_hz: float
-    gaps: int
-    records: int
-    bytes_written: int
-    disk_free_bytes: int | None
-    missed: int = 0
-    predicted_rank: int | None = None
-    predicts: bool = False
-    alarm: bool = False
-    message: str = ""
-
-
-@dataclass(frozen=True, slots=True)
-class TapSummary:
-    """How a session ended.
-
-    Parameters
-    ----------
-    reason : str
-        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or what the caller's stop said.
-    exit_code : int
-        0; 1 if the no-CSI alarm ended it or records were lost to the disk.
-    segments : tuple of Path
-    answers : mapping
-        Query to ``{status: count}``.
-    rates_hz, missed : mapping
-        Query to achieved rate, and to poll slots passed unused while connected.
-    gaps : int
-    gap_s, duration_s : float
-    records, lost_records, redacted : int
-    """
-
-    reason: str
-    exit_code: int
-    segments: tuple[Path, ...]
-    answers: dict[str, dict[str, int]]
-    rates_hz: dict[str, float]
-    missed: dict[str, int]
-    gaps: int
-    gap_s: float
-    duration_s: float
-    records: int
-    lost_records: int
-    redacted: int
-    alarms: int = 0
-
-
-def format_status(status: TapStatus) -> str:
-    """One line for the terminal; nothing in it comes from the modem as text."""
-    if not status.connected:
-        head = "NO PORT "
-    elif status.rank is None:
-        head = "rank -"
-    else:
-        head = f"rank {status.rank}"
-    if status.predicts:
-        predicted = "-" if status.predicted_rank is None else str(status.predicted_rank)
-        head += f" (predicted {predicted})"
-    parts = [
-        head,
-        "RSRP " + ("-" if status.rsrp_dbm is None else f"{status.rsrp_dbm} dBm"),
-        "SINR " + ("-" if status.sinr_db is None else f"{status.sinr_db} dB"),
-        f"{status.ri_rate_hz:.1f} Hz",
-        f"{status.gaps} gap{'' if status.gaps == 1 else 's'}",
-        f"{status.bytes_written / 2**20:.1f} MiB",
-        "disk ?" if status.disk_free_bytes is None else f"disk {status.disk_free_bytes / 2**30:.1f} GiB",
-    ]
-    if status.alarm:
-        parts.append("NO CSI")
-    return "  ".join(parts)
-
-
-class Stop:
-    """A request to end, from a signal or another thread; wakes the waiting tap."""
-
-    def __init__(self) -> None:
-        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
-        self.reason = ""
-        self.count = 0
-
-    def __call__(self, reason: str = "stop") -> None:
-        """Ask for the end; a second time: at once."""
-        self.reason = self.reason or reason
-        self.count += 1
-        with contextlib.suppress(OSError):
-            os.write(self._write, b"x")
-
-    def fileno(self) -> int:
-        """Readable once asked."""
-        return self._read
-
-    def hush(self) -> None:
-        """Forget the wake-up, not the request."""
-        with contextlib.suppress(OSError):
-            os.read(self._read, 64)
-
-    def close(self) -> None:
-        """Close the pipe."""
-        os.close(self._read)
-        os.close(self._write)
-
-    @contextlib.contextmanager
-    def on_signals(self) -> Iterator[None]:
-        """SIGINT, SIGTERM and SIGHUP ask for the end (in the main thread only)."""
-        if threading.current_thread() is not threading.main_thread():
-            yield
-            return
-        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-        before = [signal.signal(s, lambda number, frame: self(signal.Signals(number).name)) for s in signals]
-        try:
-            yield
-        finally:
-            for number, handler in zip(signals, before):
-                signal.signal(number, handler)
-
-
-class Schedule:
-    """When to ask what. The first name goes first whenever it is due; the others by age.
-
-    Parameters
-    ----------
-    periods_ns : mapping
-        Name to period.
-    """
-
-    def __init__(self, periods_ns: dict[str, int]) -> None:
-        self._periods = periods_ns
-        self._first = next(iter(periods_ns))
-        self._due: dict[str, int] = {}
-        self.missed: Counter[str] = Counter()
-
-    def reset(self, now_ns: int) -> None:
-        """Start anew: all due now."""
-        self._due = dict.fromkeys(self._periods, now_ns)
-
-    def next(self, now_ns: int) -> tuple[str, int]:
-        """Name and due time of the next poll."""
-        if self._due[self._first] <= now_ns:
-            return self._first, self._due[self._first]
-        name = min(self._due, key=lambda n: self._due[n])
-        return name, self._due[name]
-
-    def started(self, name: str, now_ns: int) -> None:
-        """A poll begins; slots that passed meanwhile are missed."""
-        period = self._periods[name]
-        skipped = max(0, (now_ns - self._due[name]) // period)
-        self.missed[name] += skipped
-        self._due[name] += (skipped + 1) * period
-
-    def slots(self, duration_ns: int) -> dict[str, int]:
-        """Polls that a gap of this length cost."""
-        return {name: duration_ns // period for name, period in self._periods.items()}
 
 
 _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
@@ -392,7 +124,7 @@ class Tap:
             try:
                 self._connect(self._settings.port)
                 return
-            except (PortGone, InputError) as error:
+            except (PortGoneError, InputError) as error:
                 if self._clock.mono_ns() >= deadline:
                     if isinstance(error, InputError):
                         raise
@@ -413,13 +145,13 @@ class Tap:
                     self._schedule.reset(self._clock.mono_ns())
                 while not self._stop.count:
                     self._poll_once()
-            except PortGone as gone:
+            except PortGoneError as gone:
                 self._lost(str(gone))
 
     def _poll_once(self) -> None:
         now = self._clock.mono_ns()
         if now - self._last_final_ns > self._settings.silent_s * 1e9:
-            raise PortGone(f"the modem answers nothing for {self._settings.silent_s:g} s")
+            raise PortGoneError(f"the modem answers nothing for {self._settings.silent_s:g} s")
         if not self._in_step:
             self._resynchronise()
             return
@@ -437,7 +169,7 @@ class Tap:
 
     def _finish(self) -> TapSummary:
         if self._port is not None and self._csi_changed and self._csi_before is not None and self._stop.count < 2:
-            with contextlib.suppress(PortGone):
+            with contextlib.suppress(PortGoneError):
                 self._exchange("csi_ctrl", csi_write(*self._csi_before))
         self._close_port()
         if self._gap_open is not None:
@@ -490,12 +222,12 @@ class Tap:
             ports += [port for port in find_candidates(self._settings.roots) if port.device not in known]
         if not ports:
             find_port(None, self._settings.roots)  # raises with the reason
-        first_error: PortGone | InputError | None = None
+        first_error: PortGoneError | InputError | None = None
         for info in ports:
             try:
                 self._open_and_probe(info)
                 return
-            except (PortGone, InputError) as error:
+            except (PortGoneError, InputError) as error:
                 self._close_port()
                 first_error = first_error or error
                 if name is not None and self._info is None:
@@ -546,7 +278,7 @@ class Tap:
                 # the stable name first; a given node that is gone may be back under another number
                 self._connect(self._info.path if self._info is not None else self._settings.port)
                 break
-            except (PortGone, InputError) as error:
+            except (PortGoneError, InputError) as error:
                 if isinstance(error, InputError) and str(error) != told:
                     told = str(error)
                     self._say(told)
@@ -619,7 +351,7 @@ class Tap:
 
         Raises
         ------
-        PortGone
+        PortGoneError
             After the record of what had come.
         """
         assert self._port is not None
@@ -630,11 +362,11 @@ class Tap:
         sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
         timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
         self._framer.send(text, query.prefixes if command is None else ())
-        gone: PortGone | None = None
+        gone: PortGoneError | None = None
         try:
             self._port.write(data)
             answer, last = self._await(sent + timeout_ns)
-        except PortGone as error:
+        except PortGoneError as error:
             gone, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
         decoded = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
         if gone is not None:
@@ -714,7 +446,7 @@ class Tap:
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(middle, record["n"] if "n" in record else -1, decoded.values.get("rank"))
+                    self._worker.ask(middle, record.get("n", -1), decoded.values.get("rank"))
             elif answer.status in ("error", "cme"):
                 self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":

@@ -1,8 +1,8 @@
 """The log of ``aerpaw-cmp tap``: JSON lines, each with the CRC-32 of what stands before its checksum.
 
-Specification (schema ``aerpaw-cmp-tap/1``). Each line is one object with ``kind`` and the number ``n`` of the record in
-its session; its last key is ``"crc"``: eight hex digits, CRC-32 of the bytes before ``,"crc":"``. Times are integers [ns]:
-UTC since 1970 and the monotonic clock.
+Specification (schema ``aerpaw-cmp-tap/1``). Each line is one object with ``kind`` and the number ``n`` of the record
+in its session; its last key is ``"crc"``: eight hex digits, CRC-32 of the bytes before ``,"crc":"``. Times are
+integers [ns]: UTC since 1970 and the monotonic clock.
 
 ``header``      first line of every segment: ``schema session segment boot_id port settings ri_base``
 ``exchange``    ``query command sent_utc_ns last_utc_ns`` (and ``_mono_``) ``status lines decoded flags``
@@ -163,7 +163,8 @@ def _frame(columns: dict[str, list[Any]]) -> pd.DataFrame:
     }
     for name, values in columns.items():
         content[name] = np.array([v if type(v) in (int, float) else np.nan for v in values], dtype=np.float64)
-    return pd.DataFrame(content)
+    frame: pd.DataFrame = pd.DataFrame(content)
+    return frame
 
 
 def _rank_frame(items: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
@@ -215,7 +216,8 @@ def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame) -> pd.DataFrame:
         fresh = (at >= 0) & (age_s <= COMPANION_S)
         rsrp_dbm = np.where(fresh, rsrp["rss_db"].to_numpy()[last], np.nan)
         sinr_db = np.where(fresh, rsrp["sinr_db"].to_numpy()[last], np.nan)
-    return rank.assign(rsrp_dbm=rsrp_dbm, sinr_db=sinr_db)
+    rank["rsrp_dbm"], rank["sinr_db"] = rsrp_dbm, sinr_db
+    return rank
 
 
 def _warnings(records: list[tuple[int, dict[str, Any]]], rejected: list[RejectedLine]) -> tuple[str, ...]:

@@ -343,11 +343,20 @@ class SpeedRow:
     reference: bool = False
 
     @property
+    def samples_label(self) -> str:
+        """Samples per source as ``1e6``; empty for an engine without samples."""
+        return "" if self.samples is None else f"{self.samples:.0e}".replace("e+0", "e").replace("e+", "e")
+
+    @property
+    def family(self) -> str:
+        """The setting but for the number of samples."""
+        thin = "" if self.thinning == 1 else f", 1 pose in {self.thinning}"
+        return f"{self.engine}, {self.arrays}, depth {self.depth}{thin}"
+
+    @property
     def label(self) -> str:
-        """Short name of the row."""
-        samples = "" if self.samples is None else f" {self.samples:.0e}".replace("e+0", "e").replace("e+", "e")
-        thin = "" if self.thinning == 1 else f", every {self.thinning}th pose"
-        return f"{self.engine}{samples}, {self.arrays}, depth {self.depth}{thin}"
+        """Name of the row."""
+        return self.family.replace(",", f" {self.samples_label},", 1) if self.samples_label else self.family
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

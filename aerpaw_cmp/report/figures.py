@@ -113,6 +113,7 @@ def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
     svg, png = io.BytesIO(), io.BytesIO()
     fig.savefig(png, format="png")
+    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
     fig.savefig(svg, format="svg", metadata={"Date": None})
     return svg.getvalue(), png.getvalue()
 
@@ -213,7 +214,7 @@ def lonely(level: FloatArray) -> BoolArray:
 
 
 def draw_out_of_coverage(
-    ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, bottom: float = 0.0, height: float = 1.0
+    ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
 ) -> None:
     """Hatched spans, marked Z where there is room, over a share of the height of the axes."""
     if not mask.any():
@@ -221,17 +222,16 @@ def draw_out_of_coverage(
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
     spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in runs(mask)]
     bars = ax.broken_barh(
-        spans, (bottom, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#999999",
-        hatch="////", linewidth=0.0, label=label, zorder=0.5,
+        spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
+        hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
     )  # fmt: skip
     bars.set_rasterized(len(spans) > 300)
     whole = max(float(seconds[-1] - seconds[0]), step)
     for left, width in spans:
-        if width > 0.02 * whole:
+        if width > 0.015 * whole and height == 1.0:
             ax.text(
-                left + width / 2, bottom + height / 2, "Z", transform=ax.get_xaxis_transform(), ha="center",
-                va="center", fontweight="bold", color="#444444",
-                bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+                left + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
+                fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )  # fmt: skip
 
 
@@ -265,10 +265,10 @@ def baseline_style(name: str, number: int) -> tuple[str, Any]:
 
 
 def rank_colour(rank: int) -> Any:
-    """Colour of rank 1 to 4, from dark to light; grey for 0."""
+    """Colour of rank 1 to 4, from dark to light in even steps; black for the crosses of 0."""
     from matplotlib import colormaps
 
-    return OUT_OF_COVERAGE if rank == 0 else colormaps["cividis"]((rank - 1) / 3)
+    return "black" if rank == 0 else colormaps["viridis"]((0.02, 0.38, 0.70, 1.0)[rank - 1])
 
 
 # --- site ---------------------------------------------------------------------------------------
@@ -341,6 +341,14 @@ def frame_around(
     middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
     ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
     ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
+
+
+def plan_shape(east: FloatArray, north: FloatArray) -> float:
+    """Width over height of the area that points cover, kept between 0.8 and 2."""
+    good = np.isfinite(east) & np.isfinite(north)
+    if not good.any():
+        return 1.0
+    return float(np.clip((np.ptp(east[good]) + 60.0) / (np.ptp(north[good]) + 60.0), 0.8, 2.0))
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str) -> None:
@@ -433,7 +441,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     ax, below = fig.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
     draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "Z: no path in the simulation")
     draw_out_of_coverage(
-        ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", bottom=0.0, height=0.06
+        ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
     )
     ax.plot(
         seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
@@ -469,7 +477,10 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     robust_limits(below, [panel.residual_db], around=0.0)
     below.set_ylabel("Residual [dB]")
     below.set_xlabel(time_label(start))
-    below.legend(*only(below, ("measured - simulated", f"RMSE {panel.rmse_db:.1f} dB")), loc="upper right", ncols=2)
+    handles, labels = only(below, ("measured - simulated", f"RMSE {panel.rmse_db:.1f} dB"))
+    below.legend(
+        handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
+    )  # fmt: skip
     return fig
 
 
@@ -547,6 +558,7 @@ def residual_histogram(ax: Axes, panel: RssPanel) -> None:
             at = np.linspace(-reach, reach, 200)
             height = np.exp(-0.5 * (at / panel.rmse_db) ** 2) / (panel.rmse_db * np.sqrt(2 * np.pi))
             ax.plot(at, height, color=SIMULATED, linewidth=1.0, linestyle=(0, (4, 2)), label="normal, same RMSE")
+        ax.set_ylim(top=1.35 * ax.get_ylim()[1])  # room for the legend above the bars
         ax.legend(loc="upper left", fontsize=7)
     ax.set_xlabel("Measured - simulated [dB]")
     ax.set_ylabel("Density [1/dB]")
@@ -559,6 +571,7 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
     if curve is None:
         return
     ax.plot(*thinned(curve.offset_db, curve.rmse_db), color=SIMULATED, linewidth=1.2, label="ray tracing")
+    span = (float(np.min(curve.offset_db)), float(np.max(curve.offset_db)))
     if np.isfinite(panel.offset_db):
         edge = " (edge of the search!)" if panel.at_search_edge else ""
         ax.plot(
@@ -569,16 +582,27 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
         colour, dashes = baseline_style(baseline.name, number)
         if np.isfinite(baseline.offset_db):
             ax.axvline(baseline.offset_db, color=colour, linestyle=dashes, linewidth=1.0, label=pretty(baseline.name))
-    ax.set_xlabel("Offset added to the measurement [dB]")
+    centres = [panel.offset_db, *(b.offset_db for b in panel.baselines)]
+    near = [c for c in centres if np.isfinite(c)]
+    if near:
+        # the shape near the minimum decides; the rest of the span is a straight line
+        low, high = min(near) - 10.0, max(near) + 10.0
+        shown = (curve.offset_db >= low) & (curve.offset_db <= high) & np.isfinite(curve.rmse_db)
+        ax.set_xlim(low, high)
+        ax.set_ylim(0.0, 1.5 * float(np.max(curve.rmse_db[shown], initial=1.0)))
+        for a, b in ((low, span[0]), (span[1], high)):
+            if a < b:
+                ax.axvspan(a, b, color="#DDDDDD", hatch="///", linewidth=0, label="not searched")
+    ax.set_xlabel(f"Offset added [dB], searched {span[0]:.0f} to {span[1]:.0f}")
     ax.set_ylabel("RMSE [dB]")
     ax.set_title("Is the offset well defined?")
-    ax.legend(loc="best", fontsize=7)
+    ax.legend(loc="upper center", fontsize=7)
 
 
 def residual_against_geometry(panel: RssPanel) -> Figure:
     """Residual against distance, angles, height, foliage, split by line of sight where known."""
     names = [name for name in GEOMETRY if name in panel.geometry]
-    columns = min(3, len(names))
+    columns = 2 if len(names) == 4 else min(3, len(names))
     rows = -(-len(names) // columns)
     fig = figure((9.2, 2.6 * rows + 0.3))
     axes = fig.subplots(rows, columns, squeeze=False, sharey=True)
@@ -629,36 +653,43 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
 
 
 def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
-    """Ranks at their positions: colour, marker and size differ; 0 is Z, NaN is left out."""
+    """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out."""
     draw_site(ax, site)
-    for value in (0, *RANKS):
+    counts = {value: int((rank == value).sum()) for value in (0, *RANKS)}
+    for value, count in counts.items():
         at = rank == value
-        if at.any():
-            label = "Z: no path" if value == 0 else f"rank {value}"
-            options: dict[str, Any] = {} if value == 0 else {"edgecolors": "#333333"}
-            ax.scatter(
-                east[at], north[at], s=9, marker=RANK_MARKER[value], color=rank_colour(value) if value == 0 else None,
-                facecolor=None if value == 0 else rank_colour(value), linewidths=0.5 if value == 0 else 0.2,
-                rasterized=True, zorder=3, label=f"{label} ({at.sum()})", **options,
-            )  # fmt: skip
-    frame_around(ax, east, north)
+        if not count:
+            continue
+        look: dict[str, Any] = {"color": "black", "linewidths": 0.8}
+        if value:
+            look = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
+        ax.scatter(
+            east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
+            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count})",
+            zorder=3.0 + 1.0 / count,  # the rarer a rank, the higher it lies: a few points must not vanish under many
+        )  # fmt: skip
     ax.set_title(title)
+    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t.startswith(("rank", "Z"))]
+    if pairs:
+        handles, labels = zip(*pairs, strict=True)
+        ax.legend(
+            handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6,
+            columnspacing=1.0,
+        )  # fmt: skip
 
 
 def rank_maps(data: ReportData, panel: RankPanel) -> Figure:
     """Measured rank and the rank of every K along the flight."""
-    maps = [("Measured (RI)", panel.measured)]
+    maps = [("Measured (reported RI)", panel.measured)]
     maps += [(f"Ray tracing, K = {k_key(at.k)}", at.rank.astype(float)) for at in panel.simulated]
     columns = 2 if len(maps) > 1 else 1
     rows = -(-len(maps) // columns)
-    fig = figure((9.2, 4.3 * rows + 0.2))
+    shape = plan_shape(panel.east_m, panel.north_m)
+    fig = figure((9.2, rows * (3.9 / shape + 1.1)))
     axes = fig.subplots(rows, columns, squeeze=False)
     for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
         rank_map(ax, data.site, panel.east_m, panel.north_m, rank, title)
-        handles, labels = ax.get_legend_handles_labels()
-        kept = [(h, t) for h, t in zip(handles, labels, strict=True) if t.startswith(("rank", "Z"))]
-        if kept:
-            ax.legend(*zip(*kept, strict=True), loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=2)
+        frame_around(ax, panel.east_m, panel.north_m, shape=shape)
     for ax in axes.ravel()[len(maps) :]:
         ax.set_visible(False)
     return fig
@@ -770,12 +801,14 @@ def confusion(panel: RankPanel) -> Figure:
         table = np.asarray(at.confusion, dtype=float)
         total = table.sum(axis=1, keepdims=True)
         share = 100 * np.divide(table, total, out=np.zeros_like(table), where=total > 0)
-        image = ax.imshow(share, cmap="cividis", vmin=0, vmax=100, aspect="auto")
+        image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
+        ax.plot(RANKS, range(len(RANKS)), "s", markersize=25, markerfacecolor="none", markeredgecolor=TOWER,
+                markeredgewidth=1.2, clip_on=False, label="equal")  # fmt: skip
         for row in range(table.shape[0]):
             for column in range(table.shape[1]):
                 ax.text(
                     column, row, f"{int(table[row, column])}", ha="center", va="center", fontsize=8,
-                    color="white" if share[row, column] < 55 else "black",
+                    color="white" if total[row] > 0 and share[row, column] < 55 else "black",
                 )  # fmt: skip
         ax.set_xticks(range(5), ["Z", "1", "2", "3", "4"])
         ax.set_yticks(range(4), [f"{r}" for r in RANKS])
@@ -820,36 +853,44 @@ def agreement_curve(panel: RankPanel) -> Figure:
 
 def pareto(speed: Sequence[SpeedRow]) -> Figure:
     """Seconds against the largest RSS error and against rank disagreement, with the front of the best."""
-    rows = [row for row in speed if not row.reference]
-    ks = sorted({k for row in rows for k in row.rank_disagreement})
-    fig = figure((9.2, 4.0))
+    ks = sorted({k for row in speed for k in row.rank_disagreement})
+    fig = figure((9.2, 4.4))
     axes = fig.subplots(1, 2 if ks else 1, squeeze=False)[0]
-    floor = 1e-6
-    pareto_axes(axes[0], rows, [max(row.rss_max_error_db, floor) for row in rows], "Largest RSS error [dB]")
-    axes[0].set_yscale("log")
+    pareto_axes(axes[0], speed, [row.rss_max_error_db for row in speed], "Largest RSS error [dB]")
+    axes[0].set_yscale("symlog", linthresh=0.01)  # an error of exactly zero has its place
+    errors = [row.rss_max_error_db for row in speed if np.isfinite(row.rss_max_error_db)]
+    axes[0].set_ylim(-0.001, 3.0 * max([0.01, *errors]))
     if ks:
-        k = ks[-1]
-        values = [100 * row.rank_disagreement.get(k, float("nan")) for row in rows]
-        pareto_axes(axes[1], rows, values, f"Links with another rank at K = {k_key(k)} [%]")
+        values = [100 * row.rank_disagreement.get(ks[-1], float("nan")) for row in speed]
+        pareto_axes(axes[1], speed, values, f"Links with another rank at K = {k_key(ks[-1])} [%]")
+        axes[1].set_ylim(bottom=-2.0)
     handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=3, fontsize=7)
+    fig.legend(handles, labels, loc="outside lower center", ncols=3)
     return fig
 
 
 def pareto_axes(ax: Axes, rows: Sequence[SpeedRow], error: Sequence[float], label: str) -> None:
-    """One plane of seconds against error; rows are told apart by marker, engines by colour."""
-    markers = "osD^v<>PX*hp8d"
-    colours = {"image": "#111111", "sionna": "#56B4E9"}
-    front = pareto_front([row.seconds for row in rows], error)
-    for number, (row, value) in enumerate(zip(rows, error, strict=True)):
+    """One plane of seconds against error: a line per setting, its points named by the number of samples."""
+    markers, colours = "osD^v<>P", ("#111111", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#0072B2")
+    families: dict[str, list[int]] = {}
+    for index, row in enumerate(rows):
+        families.setdefault(row.family, []).append(index)
+    for number, (family, members) in enumerate(families.items()):
         ax.plot(
-            row.seconds, value, marker=markers[number % len(markers)], color=colours.get(row.engine, "#D55E00"),
-            markeredgecolor="black", linestyle="none", markersize=8, label=row.label, zorder=3,
+            [rows[i].seconds for i in members], [error[i] for i in members], marker=markers[number % len(markers)],
+            color=colours[number % len(colours)], markeredgecolor="black", markersize=7, linewidth=0.8, label=family,
+            zorder=3,
         )  # fmt: skip
+        for i in members:
+            name = "reference" if rows[i].reference else rows[i].samples_label
+            ax.annotate(
+                name, (rows[i].seconds, error[i]), xytext=(5, 5), textcoords="offset points", fontsize=7, zorder=4
+            )  # fmt: skip
+    front = pareto_front([row.seconds for row in rows], error)
     if len(front) > 1:
         ax.plot(
-            [rows[i].seconds for i in front], [error[i] for i in front], color=WAYPOINT, linestyle=(0, (3, 2)),
-            linewidth=1.0, label="not beaten in both", zorder=2,
+            [rows[i].seconds for i in front], [error[i] for i in front], color=TOWER, linestyle=(0, (3, 2)),
+            linewidth=1.6, label="not beaten in both", zorder=2,
         )  # fmt: skip
     ax.set_xscale("log")
     ax.set_xlabel("Seconds for the same links")
@@ -886,14 +927,14 @@ def plates(data: ReportData) -> list[Plate]:
     for rank in data.rank:
         if len(rank.time):
             result += _rank_plates(data, rank)
-    if any(not row.reference for row in data.speed):
+    if data.speed:
         result.append(
             Plate(
                 name="speed_against_error",
                 section="speed",
                 title="Speed against error",
                 caption="Down and left is better. The dashed line joins the settings that no other setting beats in "
-                "both seconds and error.",
+                "both seconds and error. Numbers at the points are samples per source.",
                 alt="Scatter plot of seconds against error for each engine setting.",
                 draw=lambda: pareto(data.speed),
             )

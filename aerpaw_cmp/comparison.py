@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -256,6 +257,52 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
         paths=sum(len(r.replay.paths) for r in replays),
         settings={"max_depth": rt.max_depth, "samples": rt.samples, "attitude": rt.attitude, "foliage": rt.foliage},
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
+        audit=_audit(data, replays, progress) if rt.audit_links else None,
+    )
+
+
+def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> Any:
+    """One audit over all series: links are shared out in proportion to their poses."""
+    from .replay.audit import audit
+
+    rt = data.settings.rt
+    total = sum(len(r.poses) for r in replays)
+    parts = []
+    for replayed in replays:
+        count = len(replayed.poses)
+        links = min(count, math.ceil(rt.audit_links * count / max(total, 1)))
+        if links == 0:
+            continue
+        progress(f"audit {replayed.replay.towers[0]}: {links} links")
+        parts.append(
+            audit(
+                data.site,
+                replayed.link,
+                replayed.poses,
+                replayed.replay,
+                links=links,
+                max_depth=rt.max_depth,
+                samples=rt.samples,
+                batch=rt.batch,
+                ks=data.settings.rank.k,
+            )
+        )
+    if not parts:
+        return None
+    errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
+    links = sum(p.links for p in parts)
+    return report.Audit(
+        reference=parts[0].reference,
+        links=links,
+        missing_paths=sum(p.missing_paths for p in parts),
+        extra_paths=sum(p.extra_paths for p in parts),
+        rss_max_error_db=max(errors, default=float("nan")),
+        rank_disagreement={
+            k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in data.settings.rank.k
+        },
+        seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
+        reference_seconds=sum(p.reference_seconds for p in parts),
+        note="seconds of the engine are its share for the audited links; the reference's include its start-up",
     )
 
 

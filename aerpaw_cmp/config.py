@@ -157,12 +157,11 @@ def _rss_link() -> LinkSettings:
 
 
 def _rank_link() -> LinkSettings:
-    slants = [45.0, -45.0, 45.0, -45.0]
     return LinkSettings(
         carrier_hz=3.4e9,
         uav_transmits=False,
-        tower=ArraySettings(layout="tower_comparison", slant_deg=slants, yaw_deg=45.0),
-        uav=ArraySettings(layout="uav_comparison", slant_deg=slants, yaw_deg=315.0, roll_deg=90.0),
+        tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
+        uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
     )
 
 

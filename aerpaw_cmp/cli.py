@@ -206,3 +206,102 @@ def doctor(as_json: Json = False) -> int:
     else:
         _table(["check", "status", "found", "remedy"], [[c.name, c.status, c.found, c.remedy or "-"] for c in checks])
     return 1 if any(c.status == "fail" for c in checks) else 0
+
+
+@app.command(help=COMMANDS["tap"])
+def tap(
+    port: Annotated[Optional[str], typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,  # noqa: UP045
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the log segments.")] = Path("tap"),
+    status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
+    enable_csi: Annotated[bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
+    ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
+    other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
+    no_csi_alarm: Annotated[Optional[float], typer.Option(help="Bell when no CSI came for so many seconds.")] = None,  # noqa: UP045
+    no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="End with exit code 1 on that alarm.")] = False,
+    sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk.")] = 1.0,
+    duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
+    replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
+    export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
+    flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
+    telemetry: Annotated[Optional[Path], typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,  # noqa: UP045
+) -> int:
+    """Log the modem's rank indicator until interrupted."""
+    if export is not None:
+        if export != "csv":
+            raise UsageError(f"--export {export!r}", expected="csv")
+        from .live.export import export_csv
+
+        print(export_csv(out, out / "tap.csv"))
+        return 0
+    from .live.log import LogSettings
+    from .live.session import TapSettings, format_status
+    from .live.tap import run_tap
+
+    settings = TapSettings(
+        folder=out,
+        port=port,
+        ri_hz=ri_hz,
+        other_hz=other_hz,
+        enable_csi=enable_csi,
+        no_csi_alarm_s=no_csi_alarm,
+        no_csi_exit=no_csi_exit,
+        duration_s=duration,
+        replay=replay,
+        log=LogSettings(sync_interval_s=sync_s),
+    )
+    predict = None
+    if flight is not None:
+        from .run import live_prediction
+
+        predict = live_prediction(flight, telemetry)
+    terminal = sys.stderr.isatty()
+
+    def show(now: Any) -> None:
+        if now.message:
+            print(("\r\033[K" if terminal else "") + now.message, file=sys.stderr, flush=True)
+        if status:
+            line = format_status(now)
+            print(f"\r\033[K{line}" if terminal else line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+        if now.alarm:
+            print("\a", end="", file=sys.stderr, flush=True)
+
+    summary = run_tap(settings, on_status=show, predict=predict)
+    rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
+    _say(("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}")
+    for segment in summary.segments:
+        print(segment)
+    return int(summary.exit_code)
+
+
+@app.command("modem-sim", help=COMMANDS["modem-sim"])
+def modem_sim(
+    link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
+    source: Annotated[Optional[Path], typer.Option(help="Transcript or tap log to play.")] = None,  # noqa: UP045
+    kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
+    fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
+) -> int:
+    """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
+    from .live.simulator import ModemSimSettings, run_modem_sim
+
+    settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]
+    return run_modem_sim(settings, on_ready=lambda port: print(port, flush=True))
+
+
+def _faults(pairs: list[str]) -> Any:
+    """Faults from NAME=VALUE pairs."""
+    import dataclasses
+
+    from .live.simulator import Faults
+
+    known = {f.name: f.default for f in dataclasses.fields(Faults)}
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in known:
+            raise UsageError(f"--fault {pair!r}", expected="NAME=VALUE with one of " + ", ".join(known))
+        kind = type(known[name])
+        try:
+            values[name] = text.lower() in ("", "1", "true", "yes") if kind is bool else kind(text)
+        except ValueError as error:
+            raise UsageError(f"--fault {pair!r}", expected=f"a value of type {kind.__name__}") from error
+    return Faults(**values)

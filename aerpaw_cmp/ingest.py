@@ -25,7 +25,7 @@ MAX_BYTES = 512 * 2**20
 
 _GZIP = b"\x1f\x8b"
 
-__all__ = ["IngestedFile", "Ingested", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
+__all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
 
 OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
 

@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from .errors import InputError, UsageError
-from .records import RejectedLine, ReadResult, Stream
+from .records import ReadResult, RejectedLine, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -80,7 +80,7 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
         with part.open("rb") as done:
             os.fsync(done.fileno())
         part.chmod(0o666 & ~_umask())  # mkstemp makes files private; a flight file is an ordinary one
-        os.replace(part, target)
+        part.replace(target)
         _sync_folder(target.parent)
     except OSError as error:
         raise UsageError(f"cannot write the flight file ({error})", cause="a full disk", path=path) from error

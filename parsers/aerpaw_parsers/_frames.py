@@ -32,7 +32,8 @@ def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Ma
     for name, column in values.items():
         if name not in content:
             content[name] = column
-    return pd.DataFrame(content)
+    made: pd.DataFrame = pd.DataFrame(content)
+    return made
 
 
 def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:

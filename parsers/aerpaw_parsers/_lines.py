@@ -41,12 +41,12 @@ class Lines:
 
     @cached_property
     def buffer(self) -> AnyArray:
-        """The bytes as a uint8 array, padded so that fixed-layout columns may be gathered near the end."""
+        """The bytes as a uint8 array."""
         return np.frombuffer(self.data, dtype=np.uint8)
 
     @property
     def unterminated(self) -> bool:
-        """Does the last line lack its line end?"""
+        """Whether the last line lacks its line end."""
         return bool(self.data) and not self.data.endswith(b"\n")
 
     @cached_property
@@ -87,7 +87,7 @@ class Lines:
             return np.lib.stride_tricks.as_strided(
                 self.buffer[self.starts[numbers[0]] :], (len(numbers), width), (int(stride[0]), 1), writeable=False
             )
-        return self.buffer[self.starts[numbers][:, None] + np.arange(width)]
+        return np.asarray(self.buffer[self.starts[numbers][:, None] + np.arange(width)])
 
 
 def split(data: bytes) -> Lines:
@@ -112,7 +112,7 @@ def split(data: bytes) -> Lines:
 
 
 def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
-    """Lines that the pattern describes, and its groups.
+    r"""Lines that the pattern describes, and its groups.
 
     Parameters
     ----------
@@ -204,6 +204,6 @@ def first_lines(head: bytes, count: int = 40) -> list[bytes]:
 
 
 def mostly(head: bytes, pattern: re.Pattern[bytes], *, skip: int = 0) -> bool:
-    """Does the pattern describe more than half of the first lines?"""
+    """Whether the pattern describes more than half of the first lines."""
     lines = first_lines(head)[skip:]
     return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)

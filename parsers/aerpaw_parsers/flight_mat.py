@@ -17,7 +17,7 @@ import numpy as np
 
 from aerpaw_cmp.errors import InputError
 from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import RejectedLine, ReadResult, Stream
+from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray
 
 from . import _frames, _lines, _time
@@ -79,7 +79,7 @@ def _name(body: bytes, order: str) -> str | None:
 
 
 def sniff(head: bytes) -> bool:
-    """Is it a MATLAB file whose first variables are those of a merged flight?"""
+    """Whether it is a MATLAB file whose first variables are those of a merged flight."""
     return head.startswith(_MAGIC) and any(name in _NAMES for name in _names(head))
 
 
@@ -136,16 +136,14 @@ def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
 def _instants(
     table: dict[str, AnyArray], wall: AnyArray, clock: str, options: ReadOptions
 ) -> tuple[_time.Instants, list[str]]:
-    """UTC of each row: a text is local time; an epoch is local time stored as UTC unless ``clock: utc`` says otherwise."""
+    """UTC of each row: text and epoch both hold local wall clock unless ``clock: utc`` says otherwise."""
     warnings: list[str] = []
     if clock == _CLOCKS[1] and options.clock is None:
         warnings.append("timestamp_power is read as local wall clock stored as UTC, as AERPAW's authors write it")
     elif clock == _CLOCKS[0] and _CLOCKS[1] in table:
-        shift_s = np.round((_numeric(table[_CLOCKS[1]], _CLOCKS[1]) - wall / 1e9))
+        shift_s = np.round(_numeric(table[_CLOCKS[1]], _CLOCKS[1]) - wall / 1e9)
         if len(shift_s) and np.abs(shift_s).max() > 1:
-            warnings.append(
-                f"timestamp_power and its text differ by {shift_s[0]:.0f} s: here the epoch is true UTC; the text was used"
-            )
+            warnings.append(f"timestamp_power and its text differ by {shift_s[0]:.0f} s (true UTC?): the text was used")
     return _time.wall_to_utc(wall, options, needed_by="flight_mat"), warnings
 
 

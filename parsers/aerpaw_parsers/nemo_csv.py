@@ -23,7 +23,7 @@ _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm",
 
 
 def sniff(head: bytes) -> bool:
-    """Is the first line the header?"""
+    """Whether the first line is the header."""
     first = head.lstrip(b"\xef\xbb\xbf")[: len(_HEADER) + 2]
     return first.startswith(_HEADER) and first[len(_HEADER) :].strip() == b""
 

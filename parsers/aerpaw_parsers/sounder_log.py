@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import RejectedLine, ReadResult, Stream
+from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray, IntArray
 
 from . import _frames, _lines, _time
@@ -30,7 +30,7 @@ _FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
 
 
 def sniff(head: bytes) -> bool:
-    """Are most of the first lines od lines, with at least one sample?"""
+    """Whether most of the first lines are od lines, with at least one sample."""
     lines = _lines.first_lines(head)
     samples = sum(_ODD.match(line) is not None for line in lines)
     stars = sum(_STAR.match(line) is not None for line in lines)
@@ -45,6 +45,12 @@ class _Samples:
     wall: IntArray
     offset: IntArray
     value: FloatArray
+
+    @classmethod
+    def none(cls) -> _Samples:
+        """No samples."""
+        empty = np.zeros(0, dtype=np.int64)
+        return cls(empty, empty, empty, np.zeros(0))
 
     def take(self, order: AnyArray) -> _Samples:
         return _Samples(self.line[order], self.wall[order], self.offset[order], self.value[order])
@@ -94,7 +100,7 @@ def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
 def _fixed_layout(lines: _lines.Lines) -> _Samples:
     """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines."""
     length = lines.ends - lines.starts
-    found = _Samples(*(np.zeros(0, dtype=np.int64) for _ in range(3)), np.zeros(0))
+    found = _Samples.none()
     for width in _WIDTHS:
         rows = np.flatnonzero(length == _STAMP + 1 + width + _VALUE)
         if not len(rows):
@@ -142,7 +148,7 @@ def _odd_lines(lines: _lines.Lines, done: IntArray) -> tuple[_Samples, _Samples,
 def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, list[int]]:
     """Rows with parsed times; second, the lines whose time is none."""
     if not rows:
-        return _Samples(*(np.zeros(0, dtype=np.int64) for _ in range(3)), np.zeros(0)), []
+        return _Samples.none(), []
     line = np.array([row[0] for row in rows], dtype=np.int64)
     wall, valid, _, _ = _time.parse_texts(np.array([row[1] for row in rows]))
     offset = np.array([-1 if row[2] == b"-1" else int(row[2], 8) for row in rows], dtype=np.int64)

@@ -53,7 +53,7 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 
 
 def sniff(head: bytes) -> bool:
-    """Are most of the first lines telemetry rows?"""
+    """Whether most of the first lines are telemetry rows."""
     return _lines.mostly(head, _ROW)
 
 
@@ -114,16 +114,16 @@ def _values(column: list[AnyArray], flag: AnyArray) -> tuple[dict[str, AnyArray]
     _lines.add_flag(flag, no_fix, "no_fix")
     outside = ~no_fix & ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(altitude) < 1e5))
     _lines.add_flag(flag, outside, "position_out_of_range")
-    for values in (longitude, latitude, altitude):
-        values[no_fix | outside] = np.nan
+    for part in (longitude, latitude, altitude):
+        part[no_fix | outside] = np.nan
     zero = (angles[0] == 0) & (angles[1] == 0) & (angles[2] == 0)
     _lines.add_flag(flag, zero, "zero_attitude")
     if zero.any():
         text = f"{int(zero.sum())} rows have attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
         if zero.all():  # level flight due north in every row: no aircraft does that
             text += " zero_attitude and read as unknown, because no row has another attitude"
-            for values in (*angles, *velocity):
-                values[:] = np.nan
+            for part in (*angles, *velocity):
+                part[:] = np.nan
         warnings.append(text)
     if no_fix.any():
         warnings.append(f"{int(no_fix.sum())} rows have no position fix; their positions are NaN, flagged no_fix")

@@ -101,7 +101,7 @@ def _nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
     """UTC instants as int64 ns since 1970; NaT becomes the smallest integer. Floats are epoch seconds."""
     array = np.asarray(times)
     if array.dtype.kind == "M":
-        return array.astype("datetime64[ns]").astype(np.int64)
+        return np.asarray(array.astype("datetime64[ns]").astype(np.int64))
     if array.dtype.kind == "O":
         import pandas as pd
 
@@ -139,7 +139,7 @@ def _good_positions(latitude: FloatArray, longitude: FloatArray, altitude: Float
     finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
     with np.errstate(invalid="ignore"):
         possible = (np.abs(latitude) <= 90.0) & (np.abs(longitude) <= 180.0) & (altitude > -900.0)
-    return finite & possible & ~((latitude == 0.0) & (longitude == 0.0))
+    return np.asarray(finite & possible & ~((latitude == 0.0) & (longitude == 0.0)))
 
 
 def body_rotation(roll_deg: ArrayLike, pitch_deg: ArrayLike, yaw_deg: ArrayLike) -> FloatArray:
@@ -347,7 +347,7 @@ def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> Floa
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
     derived = np.gradient(position, t, axis=0)
-    missing = ~np.isfinite(logged).all(axis=1)
+    missing = np.asarray(~np.isfinite(logged).all(axis=1))
     if not np.any(logged[~missing]):  # converters write (0, 0, 0) for "unknown"
         missing[:] = True
     return np.where(missing[:, None], derived, logged)

@@ -1,8 +1,7 @@
-"""The stages between logs and report: replay each series, calibrate it, compare it, audit the engine."""
+"""Compare each replayed series with its measurement, audit the engine, and fill the panels of the report."""
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import platform
 from collections.abc import Callable, Sequence
@@ -15,34 +14,14 @@ import numpy as np
 from . import __version__
 from .compare import offset as offsets
 from .compare import rank as ranks
-from .flight import FlightData, RankSeries, RssSeries, rank_positions
-from .replay.arrays import Link, Poses
+from .compare import rss
+from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
-from .replay.paths import PathSet
-from .replay.replay import Replay, replay
+from .replaying import Replayed, direct_foliage_m
 from .report import data as report
-from .track import TrackPoses
 from .units import BoolArray, FloatArray
 
 Progress = Callable[[str], None]
-RANKS = (1, 2, 3, 4)
-
-
-@dataclass(frozen=True, slots=True)
-class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
-
-    link: Link
-    poses: Poses
-    valid: BoolArray
-    replay: Replay
-    track: TrackPoses | None
-
-    def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
-        """Values per replayed pose, put back at their samples (n,)."""
-        out = np.full(len(self.valid), fill, dtype=np.result_type(values.dtype, np.float64))
-        out[self.valid] = values
-        return out
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,105 +30,6 @@ class Compared:
 
     panel: Any
     warnings: tuple[str, ...]
-
-
-def replay_rss(data: FlightData, progress: Progress) -> list[Replayed]:
-    """Replay every RSS series; series of one tower with equal links are replayed together."""
-    groups: dict[tuple[str, str], list[int]] = {}
-    for index, series in enumerate(data.rss):
-        groups.setdefault((series.tower, series.settings_key), []).append(index)
-    out: dict[int, Replayed] = {}
-    for members in groups.values():
-        tower = data.rss[members[0]].tower
-        link = data.rss[members[0]].link.build([tower], data.folder)
-        tracks = [_track_poses(data, data.rss[i].time) for i in members]
-        poses = [_poses(data, track) for track in tracks]
-        joined = Poses(
-            np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses])
-        )
-        progress(f"replay RSS {tower}: {len(joined)} poses")
-        whole = _replay(data, link, joined)
-        start = 0
-        for index, track, part in zip(members, tracks, poses, strict=True):
-            stop = start + len(part)
-            out[index] = Replayed(link, part, track.valid, part_of(whole, start, stop), track)
-            start = stop
-    return [out[i] for i in range(len(data.rss))]
-
-
-def part_of(whole: Replay, start: int, stop: int) -> Replay:
-    """The replay of poses ``start`` to ``stop``."""
-    paths = whole.paths
-    chosen = (paths.pose >= start) & (paths.pose < stop)
-    share = (stop - start) / max(len(whole.rss_dbm), 1)
-    return dataclasses.replace(
-        whole,
-        rss_dbm=whole.rss_dbm[start:stop],
-        rss_power_dbm=whole.rss_power_dbm[start:stop],
-        h=whole.h[start:stop],
-        has_path=whole.has_path[start:stop],
-        paths=PathSet(
-            paths.pose[chosen] - start,
-            paths.tower[chosen],
-            paths.depth[chosen],
-            paths.faces[chosen],
-            paths.vertices_m[chosen],
-        ),
-        seconds=whole.seconds * share,
-        search_seconds=whole.search_seconds * share,
-    )
-
-
-def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
-    """Replay every rank series with the arrays of ``link.rank``."""
-    out = []
-    for series in data.rank:
-        link = data.settings.link.rank.build([series.tower], data.folder)
-        position, valid = rank_positions(series, data.track)
-        track = None if series.position_m is not None else _track_poses(data, series.time)
-        rotation = np.broadcast_to(np.eye(3), (len(position), 3, 3))
-        if track is not None and data.settings.rt.attitude != "ignored":
-            rotation = _attitude(data, track)
-        poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
-        progress(f"replay rank {series.tower}: {len(poses)} poses")
-        out.append(Replayed(link, poses, valid, _replay(data, link, poses), track))
-    return out
-
-
-def _track_poses(data: FlightData, time: Any) -> TrackPoses:
-    assert data.track is not None
-    return data.track.pose_at(time)
-
-
-def _attitude(data: FlightData, track: TrackPoses) -> FloatArray:
-    """Body rotations (n, 3, 3) as ``rt.attitude`` wants them."""
-    if data.settings.rt.attitude == "ignored":
-        return np.broadcast_to(np.eye(3), (len(track), 3, 3))
-    if data.settings.rt.attitude == "logged":
-        return track.rotation
-    from .replay.arrays import rotation_from_aircraft
-
-    heading = np.where(track.valid, track.heading_deg, 0.0)
-    return rotation_from_aircraft(np.zeros_like(heading), np.zeros_like(heading), heading)
-
-
-def _poses(data: FlightData, track: TrackPoses) -> Poses:
-    rotation = np.ascontiguousarray(_attitude(data, track)[track.valid])
-    return Poses(track.position_m[track.valid], rotation)
-
-
-def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
-    rt = data.settings.rt
-    return replay(
-        data.site,
-        link,
-        poses,
-        engine=rt.engine,
-        max_depth=rt.max_depth,
-        samples=rt.samples,
-        batch=rt.batch,
-        relevance_db=rt.relevance_db,
-    )
 
 
 def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
@@ -162,45 +42,149 @@ def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[st
 
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> Compared:
-    """Offset, RMSE, correlation and baselines of one tower and channel."""
+    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
     settings = data.settings.rss
-    simulated = replayed.spread(replayed.replay.rss_dbm[:, 0])
+    level = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
+    simulated = replayed.spread(level[:, 0])
     measured = series.measured_db
-    position = replayed.track.position_m if replayed.track is not None else np.full((len(measured), 3), np.nan)
-    compared = np.ones(len(measured), dtype=bool)
+    if settings.window_s > 0:
+        measured = rss.local_mean_db(series.time, measured, settings.window_s)
+        if settings.field == "local_mean":
+            simulated = rss.local_mean_db(series.time, simulated, settings.window_s)
+    geometry = _geometry(data, series.tower, replayed)
+    posed = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         with np.errstate(invalid="ignore"):
-            compared = position[:, 2] >= settings.minimum_height_m
-    used = np.where(compared, measured, np.nan)
-    fit = offsets.grid_offset(used, simulated, step_db=settings.step_db, span_db=settings.span_db)
-    baselines = []
-    for name, level_dbm in baseline_levels(data, series.tower, replayed).items():
-        level = replayed.spread(level_dbm)
-        base = offsets.grid_offset(used, level, step_db=settings.step_db, span_db=settings.span_db)
-        baselines.append(report.Baseline(name=name, level_dbm=level, offset_db=base.offset_db, rmse_db=base.rmse_db))
-    pairs = np.isfinite(used) & np.isfinite(simulated)
-    correlation = float(np.corrcoef(used[pairs], simulated[pairs])[0, 1]) if pairs.sum() > 2 else float("nan")
+            posed &= geometry["altitude_m"] >= settings.minimum_height_m
+    levels = {name: replayed.spread(v) for name, v in baseline_levels(data, series.tower, replayed).items()}
+    result = rss.compare_rss(
+        series.time,
+        measured,
+        simulated,
+        baselines=levels,
+        posed=posed,
+        step_db=settings.step_db,
+        span_db=settings.span_db,
+        replicates=max(settings.bootstrap, 1),
+    )
+    direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
+    position = geometry.pop("position_m")
     panel = report.RssPanel(
         tower=series.tower,
         channel=series.channel,
         unit=series.unit,
         time=series.time,
-        measured_db=measured,
-        simulated_dbm=simulated,
-        measured_out_of_coverage=~np.isfinite(measured),
-        simulated_out_of_coverage=replayed.valid & ~np.isfinite(simulated),
-        offset_db=fit.offset_db,
-        rmse_db=fit.rmse_db,
-        correlation=correlation,
-        n=fit.n,
-        n_out_of_coverage=int((compared & ~pairs).sum()),
-        at_search_edge=fit.at_edge,
-        baselines=tuple(baselines),
+        measured_db=np.where(posed, measured, np.nan),
+        simulated_dbm=np.where(posed, simulated, np.nan),
+        measured_out_of_coverage=posed & ~np.isfinite(measured),
+        simulated_out_of_coverage=posed & ~np.isfinite(simulated),
+        offset_db=result.offset_db,
+        rmse_db=result.rmse_db,
+        correlation=result.correlation,
+        n=result.n,
+        n_out_of_coverage=result.n_out_of_coverage,
+        at_search_edge=result.at_edge,
+        rmse_ci95_db=result.rmse_ci95_db,
+        offset_ci95_db=result.intervals.offset_db,
+        correlation_ci95=result.intervals.correlation,
+        n_effective=result.intervals.memory.n_effective,
+        baselines=tuple(
+            report.Baseline(
+                name=name,
+                level_dbm=levels[name],
+                offset_db=result.baselines[name].offset_db,
+                rmse_db=result.baselines[name].rmse_db,
+            )
+            for name in levels
+        ),
+        offset_curve=report.OffsetCurve(
+            **dict(
+                zip(
+                    ("offset_db", "rmse_db"),
+                    offsets.offset_curve(
+                        np.where(posed, measured, np.nan), simulated, step_db=settings.step_db, span_db=settings.span_db
+                    ),
+                    strict=True,
+                )
+            )
+        ),
         east_m=position[:, 0],
         north_m=position[:, 1],
         up_m=position[:, 2],
+        geometry=geometry,
+        line_of_sight=direct == 1.0,
+        worst=_worst(series, result, position, geometry, direct),
+        extra={k: v for k, v in result.as_dict().items() if k in EXTRA_RSS},
     )
-    return Compared(panel, ())
+    return Compared(panel, _rss_warnings(series, result))
+
+
+EXTRA_RSS = ("identifiable_db", "trimmed", "n_no_pose", "n_measured_out", "n_simulated_out", "block_length")
+"""Numbers of the comparison that metrics.json holds besides those of the panel."""
+
+
+def _has_direct(replayed: Replayed) -> BoolArray:
+    paths = replayed.replay.paths
+    direct = np.zeros(len(replayed.poses), dtype=np.bool_)
+    direct[paths.pose[paths.depth == 0]] = True
+    return direct
+
+
+def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
+    """Quantities that residuals are drawn against, at the samples of the series."""
+    position = np.full((len(replayed.valid), 3), np.nan)
+    position[replayed.valid] = replayed.poses.position_m
+    place = data.site.towers[tower]
+    line = position - place.position_m
+    across = np.hypot(line[:, 0], line[:, 1])
+    mount = replayed.link.tower_arrays[tower].mount
+    in_frame = line @ mount  # site to antenna axes: the transpose of the mount, applied from the right
+    out = {
+        "position_m": position,
+        "distance_m": np.linalg.norm(line, axis=1),
+        "elevation_deg": np.degrees(np.arctan2(line[:, 2], across)),
+        "azimuth_deg": np.degrees(np.arctan2(in_frame[:, 1], in_frame[:, 0])),
+        "altitude_m": position[:, 2],
+    }
+    if replayed.track is not None:
+        out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)
+    if len(data.site.trees) and data.settings.rt.foliage != "none":
+        out["foliage_depth_m"] = replayed.spread(direct_foliage_m(data, tower, replayed))
+    return out
+
+
+def _worst(
+    series: RssSeries, result: rss.RssComparison, position: FloatArray, geometry: dict[str, FloatArray], direct: FloatArray
+) -> tuple[Any, ...]:
+    """The spans of largest error, with place and likely cause."""
+    context: dict[str, Any] = {"los": direct, "elevation_deg": geometry["elevation_deg"], "height_m": geometry["altitude_m"]}
+    for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
+        if ours in geometry:
+            context[theirs] = geometry[ours]
+    spans = rss.error_spans(series.time, result.residual_db, position_m=position, context=context, largest=6)
+    start = series.time.min() if len(series.time) else np.datetime64(0, "ns")
+    return tuple(
+        report.ErrorSpan(
+            start=start + np.timedelta64(round(span.start_s * 1e9), "ns"),
+            end=start + np.timedelta64(round(span.end_s * 1e9), "ns"),
+            east_m=span.position_m[0],
+            north_m=span.position_m[1],
+            up_m=span.position_m[2],
+            mean_error_db=span.mean_db,
+            cause=span.cause,
+        )
+        for span in spans
+    )
+
+
+def _rss_warnings(series: RssSeries, result: rss.RssComparison) -> tuple[str, ...]:
+    name = f"{series.tower} {series.channel}"
+    out = []
+    if result.n == 0:
+        out.append(f"{name}: no sample could be compared; its numbers are missing, not zero.")
+    elif result.at_edge:
+        out.append(f"{name}: the best offset lies at the edge of the searched span; widen rss.span_db before using it.")
+    return tuple(out)
 
 
 def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> Compared:
@@ -212,39 +196,77 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     if settings.minimum_height_m is not None:
         with np.errstate(invalid="ignore"):
             keep &= position[:, 2] >= settings.minimum_height_m
-    h = replayed.replay.h[:, 0]
-    measured = np.where(keep, series.rank, np.nan)
-    measured_share = ranks.histogram(measured)
-    at_k = []
-    for k in settings.k:
-        simulated = np.zeros(len(series.rank), dtype=np.int64)
-        simulated[replayed.valid] = ranks.channel_rank(h, k)
-        both = np.isfinite(measured)
-        share = ranks.histogram(np.where(both, simulated, np.nan))
-        at_k.append(
-            report.RankAtK(
-                k=k,
-                rank=simulated,
-                histogram=report.Histogram(share=share),
-                n_out_of_coverage=int((both & (simulated == 0)).sum()),
-                agreement=ranks.agreement(measured, simulated),
-                total_variation=ranks.total_variation(measured_share, share),
-                wasserstein=ranks.wasserstein(measured_share, share),
-            )
-        )
+    h = np.zeros((len(series.rank), *replayed.replay.h.shape[2:]), dtype=np.complex128)
+    h[replayed.valid] = replayed.replay.h[:, 0]
+    rows = np.flatnonzero(keep)
+    measured, h = series.rank[rows], h[rows]
+    result = ranks.compare_rank(
+        measured,
+        h,
+        settings.k,
+        time_s=(series.time[rows] - series.time[:1]) / np.timedelta64(1, "s") if len(rows) else None,
+        sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
+        replicates=max(settings.bootstrap, 1),
+    )
+    sigma = ranks.singular_values(h)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio_db = 20.0 * np.log10(sigma[:, 1:] / sigma[:, :1])
     panel = report.RankPanel(
         tower=series.tower,
-        time=series.time,
-        east_m=position[:, 0],
-        north_m=position[:, 1],
-        up_m=position[:, 2],
+        time=series.time[rows],
+        east_m=position[rows, 0],
+        north_m=position[rows, 1],
+        up_m=position[rows, 2],
         measured=measured,
-        histogram=report.Histogram(share=measured_share),
-        simulated=tuple(at_k),
-        sinr_db=series.sinr_db,
-        extra={"n": int(np.isfinite(measured).sum())},
+        histogram=_histogram(result.histogram, result.histogram_ci95),
+        simulated=tuple(_at_k(k, fit, sigma) for k, fit in result.simulated.items()),
+        best_k=result.best_k,
+        best_k_ci95=result.curve.best_k_interval,
+        curve=report.KCurve(
+            k=result.curve.k, agreement=result.curve.agreement, total_variation=result.curve.total_variation
+        ),
+        singular_ratio_db=ratio_db,
+        sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
+        stale=~result.staleness.fresh,
+        extra={k: v for k, v in result.as_dict().items() if k not in ("measured", "simulated", "best_k", "best_k_ci95")},
     )
-    return Compared(panel, ())
+    return Compared(panel, _rank_warnings(series, result, len(series.rank) - len(rows)))
+
+
+def _histogram(share: FloatArray, intervals: list[tuple[float, float]]) -> Any:
+    low, high = np.array(intervals, dtype=np.float64).T
+    return report.Histogram(share=share, low=low, high=high)
+
+
+def _at_k(k: float, fit: ranks.RankFit, sigma: FloatArray) -> Any:
+    return report.RankAtK(
+        k=k,
+        rank=ranks.rank_from_singular_values(sigma, k),
+        histogram=_histogram(fit.histogram, fit.histogram_ci95),
+        n_out_of_coverage=fit.out_of_coverage,
+        agreement=fit.agreement,
+        total_variation=fit.total_variation,
+        wasserstein=fit.wasserstein,
+        kappa=fit.kappa,
+        agreement_ci95=fit.agreement_ci95,
+        total_variation_ci95=fit.total_variation_ci95,
+        p_value=fit.p_histogram,
+        confusion=fit.confusion[1:],
+    )
+
+
+def _rank_warnings(series: RankSeries, result: ranks.RankComparison, left_out: int) -> tuple[str, ...]:
+    out = []
+    if left_out:
+        out.append(f"Rank {series.tower}: {left_out} of {len(series.rank)} samples are below the minimum height or have no pose.")
+    if result.n == 0:
+        out.append(f"Rank {series.tower}: the modem reported no rank at any compared pose.")
+    if result.staleness.verdict == "held":
+        out.append(
+            f"Rank {series.tower}: the modem holds each report for about {result.staleness.hold_s:.1f} s; "
+            f"{result.n} samples are {result.staleness.n_reports} reports."
+        )
+    return tuple(out)
 
 
 def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> Any:

@@ -284,8 +284,9 @@ class RtSettings(Settings):
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
     foliage_model: Literal["p833", "weissberger"] = "p833"
-    gamma_db_per_m: Positive = 0.5
-    maximum_loss_db: Positive = 38.0
+    gamma_db_per_m: Positive | None = None
+    maximum_loss_db: Positive | None = None
+    """Replace P.833's specific attenuation and largest loss at the carrier."""
     leaves: Literal["in", "out"] = "in"
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""

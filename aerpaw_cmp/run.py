@@ -96,7 +96,8 @@ def run_report(
         settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files)
-    from .comparison import audit_replays, compare_rank_series, compare_rss_series, replay_rank, replay_rss
+    from .comparison import audit_replays, compare_rank_series, compare_rss_series
+    from .replaying import replay_rank, replay_rss
 
     with stages("replay"):
         rss_replays = replay_rss(data, progress)

@@ -11,7 +11,8 @@ import re
 import numpy as np
 
 from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.records import ReadResult, RejectedLine
+from aerpaw_cmp.units import IntArray
 
 from . import _lines, _nemo
 
@@ -80,7 +81,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )
 
 
-def _account(lines: _lines.Lines, rows: _lines.IntArray) -> tuple[int, list[_lines.RejectedLine]]:
+def _account(lines: _lines.Lines, rows: IntArray) -> tuple[int, list[RejectedLine]]:
     """Markup is nearly all of the file: only lines with a hint of a report are looked at one by one."""
     hints = np.array([found.start() for found in _HINT.finditer(lines.data)], dtype=np.int64)
     suspects = np.unique(np.searchsorted(lines.starts, hints, side="right") - 1)

@@ -219,7 +219,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     if lte is not None:
         streams.append(_level("lte_rsrp", [(lte, lte.column[1], None)], lines, options))
         with_nr = np.flatnonzero(lte.column[5] != b"")
-        instants = _time.Instants(*(part[with_nr] for part in (lte.instants.time, lte.instants.ambiguous, lte.instants.nonexistent)))  # fmt: skip
+        instants = lte.instants.take(with_nr)
         nsa = _Rows(lte.number[with_nr], instants, [cells[with_nr] for cells in lte.column])
         nr_parts.append((nsa, nsa.column[5], nsa.column[6]))
     if sa is not None:

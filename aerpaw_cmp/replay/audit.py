@@ -163,7 +163,7 @@ def _spread(poses: Poses, count: int | None) -> IntArray:
     good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
     if count is None or count >= len(good):
         return good
-    return good[np.linspace(0, len(good) - 1, count).round().astype(np.int64)]
+    return np.asarray(good[np.linspace(0, len(good) - 1, count).round().astype(np.int64)])
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:

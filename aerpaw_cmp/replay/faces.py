@@ -169,7 +169,7 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
 
 
 def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: float) -> BoolArray:
-    """Which points, taken as lying in the plane of their face, belong to the face (edges do).
+    """Which points, taken as lying in the plane of their face, belong to the face.
 
     Parameters
     ----------
@@ -178,7 +178,7 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
         Face of each point.
     points_m : (points, 3)
     tolerance_m : float
-        How far outside an edge a point still counts.
+        How far outside an edge a point still counts; negative: how far inside it must lie.
 
     Returns
     -------
@@ -195,8 +195,9 @@ def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: flo
         rows = np.flatnonzero(good & (index == face))
         hit = shapely.intersects_xy(polygon, a[rows], b[rows])
         if tolerance_m > 0.0 and not hit.all():
-            near = shapely.dwithin(polygon, shapely.points(a[rows], b[rows]), tolerance_m)
-            hit = hit | near
+            hit = hit | shapely.dwithin(polygon, shapely.points(a[rows], b[rows]), tolerance_m)
+        elif tolerance_m < 0.0 and hit.any():
+            hit = hit & ~shapely.dwithin(polygon.boundary, shapely.points(a[rows], b[rows]), -tolerance_m)
         good[rows] = hit
     return np.asarray(good)
 

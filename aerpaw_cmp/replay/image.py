@@ -8,7 +8,8 @@ For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path
 
 A sequence is followed only while the beam from the image through its last face can still reach the next one.
 Sides are decided with a tolerance relative to the size of the scene; a segment never tests the faces it ends on.
-So a path along a wall stays, and rounding neither opens a crack between two walls nor closes an edge.
+A solid hides only with its open inside: a segment that merely touches edges is decided by the points halfway between
+the touches. So a path along a wall stays, and there is no crack between two walls.
 """
 
 from __future__ import annotations
@@ -273,6 +274,7 @@ def _meets_last_face(
     below = np.einsum("ij,ij->i", faces.normal[last], image) - faces.offset_m[last]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = below[:, None] / (below[:, None] - height)
+    share[height <= tolerance_m] = 0.0
     good = height > tolerance_m
     for axis, which in ((faces.along, 0), (faces.across, 1)):
         start = np.einsum("ij,ij->i", axis[last], image)[:, None]
@@ -425,10 +427,30 @@ class Occlusion:
         row, column = np.nonzero(through)
         share = before[row, column] / (before[row, column] - after[row, column])
         point = start[row] + share[:, None] * (end[row] - start[row])
-        hit = inside(faces, members[column], point, tolerance_m)
+        face = members[column]
+        surely = inside(faces, face, point, -tolerance_m)
         result = np.zeros(len(start), dtype=np.bool_)
-        result[row[hit]] = True
+        result[row[surely]] = True
+        touch = np.flatnonzero(~surely & ~result[row])
+        touch = touch[inside(faces, face[touch], point[touch], tolerance_m)]
+        if len(touch):
+            self._touching(result, start, end, row[touch], share[touch], members)
         return result
+
+    def _touching(
+        self, result: BoolArray, start: FloatArray, end: FloatArray, row: IntArray, share: FloatArray, members: IntArray
+    ) -> None:
+        """Mark segments that pass through edges of a solid and run inside it between two of them."""
+        order = np.lexsort((share, row))
+        row, share = row[order], share[order]
+        pair = np.flatnonzero(row[1:] == row[:-1])
+        halfway = ((share[1:] + share[:-1]) / 2)[pair]
+        row = row[pair]
+        point = start[row] + halfway[:, None] * (end[row] - start[row])
+        for roof in members[self.faces.normal[members, 2] == 1.0]:
+            below = point[:, 2] < self.faces.offset_m[roof] - self.tolerance_m
+            under = inside(self.faces, np.full(len(point), roof), point, -self.tolerance_m)
+            result[row[below & under]] = True
 
 
 def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, max_depth: int) -> PathSet:

@@ -106,10 +106,11 @@ def _nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
         import pandas as pd
 
         stamps = pd.DatetimeIndex(pd.to_datetime(array, utc=True)).tz_localize(None)
-        return stamps.to_numpy().astype("datetime64[ns]").astype(np.int64)
+        return np.asarray(stamps.to_numpy().astype("datetime64[ns]").astype(np.int64))
     seconds = array.astype(np.float64)
     good = np.isfinite(seconds)
-    return np.where(good, np.round(np.where(good, seconds, 0.0) * 1e9), np.iinfo(np.int64).min).astype(np.int64)
+    stamp = np.round(np.where(good, seconds, 0.0) * 1e9).astype(np.int64)
+    return np.asarray(np.where(good, stamp, np.iinfo(np.int64).min))
 
 
 _NAT = np.iinfo(np.int64).min

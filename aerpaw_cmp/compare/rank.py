@@ -260,7 +260,7 @@ def _kappa(observed: float, one: IntArray, two: IntArray) -> float:
 
 
 def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int | None = None) -> float:
-    """p-value of the agreement by pose: could two unrelated sequences with this memory agree as well?
+    """p-value of the agreement by pose against unrelated sequences of the same memory.
 
     Parameters
     ----------
@@ -318,7 +318,7 @@ def histogram_test(
 
 def _indicators(rank: IntArray | FloatArray, max_rank: int = MAX_RANK) -> FloatArray:
     """One column per rank 1 .. max_rank, 1 where the rank is it; (n, max_rank)."""
-    return (np.asarray(rank)[:, None] == np.arange(1, max_rank + 1)).astype(np.float64)
+    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, max_rank + 1), dtype=np.float64)
 
 
 # --- what explains the modem's decision ----------------------------------------------------------------------------
@@ -368,7 +368,7 @@ def k_curve(
     replicates: int = REPLICATES,
     seed: int = SEED,
 ) -> KCurve:
-    """Which K would explain the measured ranks best?
+    """Agreement for every K, and the K that explains the measured ranks best.
 
     Parameters
     ----------
@@ -393,7 +393,9 @@ def k_curve(
     equal = (ranks == ri[:, None]).astype(np.float64)
     apart = [(ranks == r).astype(np.float64) - (ri == r)[:, None] for r in range(1, MAX_RANK + 1)]
     length = memory(equal.mean(axis=1)).block_length
-    drawn = [bootstrap_means(part, length, replicates=replicates, seed=seed) for part in (equal, *apart)]
+    drawn = np.split(
+        bootstrap_means(np.hstack([equal, *apart]), length, replicates=replicates, seed=seed), 1 + MAX_RANK, axis=1
+    )
     agree, vary = equal.mean(axis=0), 0.5 * sum(np.abs(part.mean(axis=0)) for part in apart)
     varied = 0.5 * np.sum([np.abs(part) for part in drawn[1:]], axis=0)
     best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-np.asarray(vary)[None], grid)[0]
@@ -459,8 +461,9 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
 
     Examples
     --------
-    >>> capacity_rank(np.eye(4), [-10.0, 30.0])
-    array([1, 4])
+    >>> import numpy as np
+    >>> capacity_rank(np.diag([1.0, 0.5, 0.1, 0.1]), [-10.0, 5.0])
+    array([1, 2])
     """
     matrix = np.asarray(h)
     sigma = singular_values(matrix)

@@ -4,7 +4,7 @@ Samples a tenth of a second apart repeat each other, so every interval here rest
 into blocks as long as the residual remembers (Politis and White), blocks are drawn with replacement, and the
 spread of the statistic over the draws, corrected for the finite number of blocks, gives the interval.
 
-All statistics of this module are functions of column means, so that one matrix product serves all replicates.
+All statistics of this module are functions of column means, which block sums give without touching samples again.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import FloatArray, IntArray
+from ..units import FloatArray
 
 REPLICATES = 1000
 """Bootstrap replicates."""
@@ -28,8 +28,8 @@ _LONGER = 2.0
 """Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage
 (on 500 simulated flights it brings 89-93 % to 92-95 % where a flight holds only 25 independent samples)."""
 
-_WEIGHTS = 1 << 21
-"""Weights held at once (replicates x samples): bounds memory to 16 MiB."""
+_HELD = 1 << 21
+"""Numbers held at once per bootstrap: bounds memory to tens of MiB."""
 
 Interval = tuple[float, float]
 NO_INTERVAL: Interval = (float("nan"), float("nan"))
@@ -178,34 +178,35 @@ def bootstrap_means(
 
     Notes
     -----
-    A resample is a vector of weights (how often each sample was drawn): +1 at each block start, -1 past its end,
-    summed along. All statistics then are one product of weights and columns, in chunks.
+    The sum over a block is known from its start alone, so a resample is a set of starts: few long blocks are
+    gathered, many short ones counted and multiplied (one matrix product for all replicates).
     """
-    n = len(columns)
+    n, width = columns.shape
     rng = np.random.default_rng(seed)
     blocks = -(-n // block_length)
-    last = n - (blocks - 1) * block_length
-    result = np.empty((replicates, columns.shape[1]))
-    chunk = max(1, _WEIGHTS // (n + block_length + 1))
+    sums = _block_sums(columns, block_length)
+    last = _block_sums(columns, n - (blocks - 1) * block_length)
+    result = np.empty((replicates, width))
+    few = 2 * (blocks - 1) * width < n * (3.0 + 0.2 * width)
+    chunk = max(1, _HELD // max(1, (blocks - 1) * width if few else n))
     for start in range(0, replicates, chunk):
         count = min(chunk, replicates - start)
         begin = rng.integers(0, n, (count, blocks))
-        result[start : start + count] = _block_weights(begin, block_length, last, n) @ columns / n
+        whole = begin[:, :-1]
+        if few:
+            total = sums[whole].sum(axis=1)
+        else:
+            cell = np.arange(count)[:, None] * n + whole
+            total = np.bincount(cell.ravel(), minlength=count * n).reshape(count, n).astype(np.float64) @ sums
+        result[start : start + count] = (total + last[begin[:, -1]]) / n
     return result
 
 
-def _block_weights(begin: IntArray, length: int, last: int, n: int) -> FloatArray:
-    """How often each sample is drawn (count, n), for blocks of ``length`` (the last one shorter) on a circle."""
-    count, blocks = begin.shape
-    width = n + length + 1
-    size = np.full(blocks, length)
-    size[-1] = last
-    row = np.arange(count)[:, None] * width
-    step = np.bincount((row + begin).ravel(), minlength=count * width).astype(np.float64)
-    step -= np.bincount((row + begin + size).ravel(), minlength=count * width)
-    weight = np.cumsum(step.reshape(count, width), axis=1)
-    weight[:, : length + 1] += weight[:, n:]  # the part past the end continues at the start
-    return weight[:, :n]
+def _block_sums(columns: FloatArray, length: int) -> FloatArray:
+    """Sum of ``length`` rows from every start (n, m), on a circle."""
+    running = np.zeros((len(columns) + length, columns.shape[1]))
+    np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
+    return np.asarray(running[length:] - running[:-length])
 
 
 def _spread(replicates: FloatArray) -> float:

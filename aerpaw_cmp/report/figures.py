@@ -10,7 +10,7 @@ from __future__ import annotations
 import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -112,7 +112,7 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
     svg, png = io.BytesIO(), io.BytesIO()
-    fig.savefig(png, format="png")
+    fig.savefig(png, format="png", pil_kwargs={"compress_level": 4})
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
     fig.savefig(svg, format="svg", metadata={"Date": None})
     return svg.getvalue(), png.getvalue()
@@ -452,7 +452,8 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
         # each model is drawn where its own best offset puts it against the same calibrated points
         level = baseline.level_dbm + (panel.offset_db - baseline.offset_db)
         ax.plot(
-            *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.1, zorder=2.5,
+            *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.2,
+            zorder=2.5 if baseline.name == "two_ray" else 3.7,  # its dense fringes would hide the rest
             label=f"{pretty(baseline.name)} (own offset)",
         )  # fmt: skip
     ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
@@ -784,9 +785,8 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, pane
             va="bottom",
             color=TOWER,
         )
-    ax.set_ylim(
-        bottom=max(float(np.nanmin(np.where(np.isfinite(values), values, np.nan), initial=0.0)), -100.0), top=2.0
-    )
+    lowest = [-20 * np.log10(at.k) for at in panel.simulated] + values[np.isfinite(values)].tolist()
+    ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # below -110 dB lies nothing but rounding
     ax.set_ylabel("Singular value\nover largest [dB]")
     ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
 
@@ -939,6 +939,16 @@ def plates(data: ReportData) -> list[Plate]:
                 draw=lambda: pareto(data.speed),
             )
         )
+    return _with_own_names(result)
+
+
+def _with_own_names(found: list[Plate]) -> list[Plate]:
+    """The same plates, a number added where two names became one file name."""
+    seen: dict[str, int] = {}
+    result = []
+    for plate in found:
+        count = seen[plate.name] = seen.get(plate.name, 0) + 1
+        result.append(plate if count == 1 else replace(plate, name=f"{plate.name}_{count}"))
     return result
 
 

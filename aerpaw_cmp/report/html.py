@@ -109,6 +109,8 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         headline=words.headline(data),
         verdicts=words.verdicts(data),
         warnings=words.warnings(data),
+        baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
+        speed_ks=sorted({k for row in data.speed for k in row.rank_disagreement}),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,

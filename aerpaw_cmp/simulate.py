@@ -26,9 +26,8 @@ from .replay.replay import replay
 from .site.site import Site
 from .units import FloatArray, IntArray
 
-NO_SIGNAL_DB = -788.5956
-"""What the channel sounder prints without a signal at its default gain of 30 dB: 20 log10(FLT_MIN) - 30."""
-SINGLE_PRECISION_FLOOR_DBM = -400.0
+LOWEST_DBM = -400.0
+"""Below this the simulated level is no signal."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -241,7 +240,7 @@ class FlightSimulator:
         )
         if plan.noise_floor_db is not None:
             level = np.fmax(level, plan.noise_floor_db)
-        out_of_coverage = ~np.isfinite(level) | (level < SINGLE_PRECISION_FLOOR_DBM)
+        out_of_coverage = ~np.isfinite(level) | (level < LOWEST_DBM)
         shift = plan.clock_shift_s.get(log.node, 0.0) + plan.clock_drift_s_per_s.get(log.node, 0.0) * time_s
         self.truth_["rss"].setdefault(log.node, {})[log.channel] = {
             "offset_db": offset,
@@ -253,7 +252,7 @@ class FlightSimulator:
         }
         return format_power_log(
             times_after(self.start_utc, time_s + shift),
-            np.where(out_of_coverage, NO_SIGNAL_DB, level),
+            np.where(out_of_coverage, np.nan, level),
             str(log.timezone or self.settings.timezone),
         )
 
@@ -273,14 +272,16 @@ class FlightSimulator:
             "samples": len(truth),
             "histogram": {str(r): int((truth == r).sum()) for r in range(5)},
         }
-        return format_ri_csv(
-            times_after(self.start_utc, time_s),
-            reported,
-            latitude,
-            longitude,
-            poses.position_m[:, 2],
-            str(log.timezone or self.settings.timezone),
+        records = pd.DataFrame(
+            {
+                "time": times_after(self.start_utc, time_s),
+                "rank": reported,
+                "latitude_deg": latitude,
+                "longitude_deg": longitude,
+                "altitude_m": poses.position_m[:, 2],
+            }
         )
+        return format_ri_csv(records, str(log.timezone or self.settings.timezone))
 
     def _reported(self, rank: IntArray, layers: int) -> IntArray:
         """What the modem prints: one layer off now and then, 0 without CSI."""

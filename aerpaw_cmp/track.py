@@ -7,8 +7,9 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Literal
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -46,6 +47,8 @@ class TrackAccount:
         Intervals between used rows that are longer than the limit.
     longest_gap_s : float
         The longest interval [s].
+    hour_steps : int
+        Steps of whole hours between neighbouring rows of the file: a clock that changed to or from daylight saving.
     """
 
     rows: int
@@ -56,6 +59,21 @@ class TrackAccount:
     unknown_attitude: int
     gaps: int
     longest_gap_s: float
+    hour_steps: int = 0
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What a user should know, one sentence each."""
+        told = (
+            (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
+            (self.backward_time, "telemetry row(s) out of time order were left out"),
+            (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were left out"),
+            (self.no_time, "telemetry row(s) without a time stamp were left out"),
+            (self.bad_position, "telemetry row(s) without a position (NaN, -999) were left out"),
+            (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not bridged"),
+            (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course stands in"),
+        )
+        return tuple(f"{count} {text}" for count, text in told if count)
 
 
 @dataclass(frozen=True, slots=True)
@@ -133,6 +151,13 @@ def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     repeated = np.concatenate([[False], np.diff(stamp[kept]) == 0])
     keep[kept[repeated]] = False
     return keep, int(repeated.sum()), int((~ordered).sum())
+
+
+def _hour_steps(stamp: AnyArray) -> int:
+    """Steps between rows that are whole hours, forward or back, give or take five seconds."""
+    step = np.diff(stamp) * 1e-9
+    hours = np.round(step / 3600.0)
+    return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
 
 
 def _good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
@@ -246,6 +271,7 @@ class Track:
             unknown_attitude=int((~known).sum()),
             gaps=int((interval > self.maximum_gap_s).sum()),
             longest_gap_s=float(interval.max()) if len(interval) else 0.0,
+            hour_steps=_hour_steps(stamp[timed]),
         )
 
     def __len__(self) -> int:
@@ -362,3 +388,443 @@ def _courses(velocity: FloatArray) -> FloatArray:
         return np.zeros(len(velocity))
     last = np.searchsorted(moving, np.arange(len(velocity)), side="right") - 1
     return np.asarray(course[moving[np.maximum(last, 0)]])
+
+
+# --- do the clocks agree? ------------------------------------------------------------------------------------------
+
+LAG_WINDOW_S = 12.0
+"""Lags searched on either side of zero [s]."""
+
+LAG_LIMIT_S = 1.0
+"""An interval wider than this on either side is no answer, and another optimum farther than this is a rival [s]."""
+
+DRIFT_LIMIT = 10e-3 / 60.0
+"""Drifts searched on either side of zero [s/s]: 10 ms per minute."""
+
+_RIVAL = 10.83
+"""Log-likelihood ratio (chi-squared, one degree) at 0.001 that a rival lag must lose by."""
+
+_SCANNED = 6000
+"""The search runs on at most this many samples; the refinement on all."""
+
+_FEWEST = 30
+"""Fewer samples tell nothing about a lag."""
+
+
+@dataclass(frozen=True, slots=True)
+class LagFit:
+    """Offset and drift between the radio and the telemetry clock.
+
+    Parameters
+    ----------
+    lag_s : float
+        To be **added to radio times** to get telemetry times [s], at ``reference``; NaN if failed.
+    interval_s : (low, high)
+        95 % interval of ``lag_s``; the whole window where the data say nothing.
+    drift_s_per_s : float
+        Growth of the lag; 0 where it was not fitted.
+    drift_interval_s_per_s : (low, high)
+        95 % interval of the drift; NaN where it was not fitted.
+    verdict : {"ok", "ambiguous", "failed"}
+        Only "ok" should be applied, and only when the user asks for it.
+    reason : str
+        Why not ok.
+    reference : float
+        Instant at which the lag is ``lag_s``: seconds after the first radio sample.
+    n : int
+        Samples used.
+    rmse_db, rmse_unshifted_db : float
+        Residual with the lag and without, each after its best offset, on the samples used [dB].
+    window_s : float
+        Lags searched on either side [s].
+    curve_lag_s, curve_rmse_db : (m,)
+        Residual against lag (without drift).
+    """
+
+    lag_s: float
+    interval_s: tuple[float, float]
+    drift_s_per_s: float
+    drift_interval_s_per_s: tuple[float, float]
+    verdict: Literal["ok", "ambiguous", "failed"]
+    reason: str
+    reference: float
+    n: int
+    rmse_db: float
+    rmse_unshifted_db: float
+    window_s: float
+    curve_lag_s: FloatArray = field(repr=False)
+    curve_rmse_db: FloatArray = field(repr=False)
+
+    def apply(self, times: AnyArray) -> AnyArray:
+        """Radio times (datetime64 or seconds, the first sample first) on the telemetry clock."""
+        array = np.asarray(times)
+        if array.dtype.kind == "M":
+            since = (array - array[0]) / np.timedelta64(1, "s")
+            lag = self.lag_s + self.drift_s_per_s * (since - self.reference)
+            return np.asarray(array + np.round(lag * 1e9).astype("timedelta64[ns]"))
+        lag = self.lag_s + self.drift_s_per_s * (array - array[0] - self.reference)
+        return np.asarray(array + lag)
+
+
+class _Prediction:
+    """A predicted level over the flight, sampled once and shifted as often as needed."""
+
+    def __init__(self, first: float, step: float, level: FloatArray) -> None:
+        self.first, self.step, self.level = first, step, level
+        self.slope = np.gradient(level, step)
+
+    def at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
+        """Linear interpolation at t; NaN outside and next to NaN."""
+        source = self.level if values is None else values
+        place = (t - self.first) / self.step
+        left = np.floor(place).astype(np.int64)
+        inside = (left >= 0) & (left < len(source) - 1)
+        left = np.where(inside, left, 0)
+        weight = place - left
+        level = source[left] * (1.0 - weight) + source[left + 1] * weight
+        return np.where(inside, level, np.nan)
+
+    def common(self, t: FloatArray, reach: float) -> BoolArray:
+        """Instants whose prediction exists for every shift up to ``reach``."""
+        bad = np.concatenate([[0], np.cumsum(~np.isfinite(self.level))])
+        low = np.floor((t - reach - self.first) / self.step).astype(np.int64)
+        high = np.ceil((t + reach - self.first) / self.step).astype(np.int64) + 1
+        inside = (low >= 0) & (high <= len(self.level))
+        low, high = np.clip(low, 0, len(self.level)), np.clip(high, 0, len(self.level))
+        return np.asarray(inside & (bad[high] == bad[low]))
+
+
+def estimate_lag(
+    times: ArrayLike | pd.Series,
+    measured_db: ArrayLike,
+    predictor: Callable[[AnyArray], ArrayLike],
+    *,
+    window_s: float = LAG_WINDOW_S,
+    resolution_s: float = 0.1,
+    limit_s: float = LAG_LIMIT_S,
+    drift: bool | None = None,
+) -> LagFit:
+    """Clock offset and drift between a radio log and the telemetry, from the data.
+
+    Parameters
+    ----------
+    times : array_like, (n,)
+        Instants of the radio samples, datetime64 (UTC) or seconds.
+    measured_db : array_like, (n,)
+        Levels [dB]; NaN does not count.
+    predictor : callable
+        ``predictor(times) -> level_db``: what should be measured at instants of the **telemetry** clock (free space,
+        two-ray or a replay), in the kind of ``times``; NaN where there is no pose or no path. Called once.
+    window_s : float
+        Lags from ``-window_s`` to ``window_s`` are searched [s].
+    resolution_s : float
+        Spacing at which the predictor is sampled [s]; lags are resolved finer than that.
+    limit_s : float
+        Half width of the interval, and distance of a rival optimum, beyond which the verdict is "ambiguous" [s].
+    drift : bool, optional
+        Fit a drift too; by default for flights of ten minutes and more.
+
+    Returns
+    -------
+    LagFit
+        Nothing is applied here.
+
+    Notes
+    -----
+    The residual's offset is free at every lag. A search over lags (and drifts) finds the valley, Gauss-Newton the
+    bottom. Neighbouring residuals resemble each other (patterns, obstacles), so both run on residuals whitened by
+    their AR(1) coefficient (Cochrane and Orcutt 1949, doi:10.1080/01621459.1949.10483290), and the standard error is a
+    block sandwich. A lag is "ok" only if every lag farther than ``limit_s`` away is worse by a likelihood ratio of
+    0.1 % significance.
+    """
+    stamp, levels = _nanoseconds(times).ravel(), np.asarray(measured_db, dtype=np.float64).ravel()
+    if stamp.shape != levels.shape:
+        raise ValueError(f"{len(stamp)} times and {len(levels)} levels")
+    used = (stamp != _NAT) & np.isfinite(levels)
+    origin = int(stamp[stamp != _NAT][0]) if np.any(stamp != _NAT) else 0
+    order = np.argsort(stamp[used], kind="stable")
+    t, m = ((stamp[used] - origin) * 1e-9)[order], levels[used][order]
+    lags = _symmetric(window_s, max(0.05, resolution_s))
+    if len(t) < _FEWEST:
+        return _no_lag("too few samples", len(t), window_s, lags)
+    reach = window_s + 2.0 + DRIFT_LIMIT * (t[-1] - t[0])
+    grid = np.arange(t[0] - reach, t[-1] + reach + resolution_s, resolution_s)
+    as_time = np.asarray(times).dtype.kind != "f" and np.asarray(times).dtype.kind not in "iu"
+    nanoseconds = np.round(grid * 1e9).astype(np.int64) + origin
+    asked = nanoseconds.astype("datetime64[ns]") if as_time else nanoseconds * 1e-9
+    prediction = _Prediction(float(grid[0]), resolution_s, np.asarray(predictor(asked), dtype=np.float64).ravel())
+    if len(prediction.level) != len(grid):
+        raise ValueError(f"the predictor gave {len(prediction.level)} levels for {len(grid)} instants")
+    keep = prediction.common(t, window_s + resolution_s)
+    if keep.sum() < max(_FEWEST, 0.3 * len(t)):  # a short or gappy flight: let the samples vary with the lag
+        keep = np.isfinite(prediction.at(t))
+    if keep.sum() < _FEWEST:
+        return _no_lag("no prediction at the radio samples: the two logs do not overlap", 0, window_s, lags)
+    t, m = t[keep], m[keep]
+    drifting = (t[-1] - t[0]) >= 600.0 if drift is None else drift
+    return _fit_lag(t, m, prediction, lags, limit_s, drifting)
+
+
+def _symmetric(window: float, step: float) -> FloatArray:
+    count = int(np.floor(window / step + 1e-9))
+    return np.arange(-count, count + 1) * step
+
+
+def _no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
+    nan = float("nan")
+    return LagFit(
+        nan,
+        (-window_s, window_s),
+        0.0,
+        (nan, nan),
+        "failed",
+        reason,
+        0.0,
+        n,
+        nan,
+        nan,
+        window_s,
+        lags,
+        np.full(len(lags), nan),
+    )
+
+
+def _whitened(residual: FloatArray, phi: float) -> FloatArray:
+    """Residual without its mean and without what the sample before tells; NaN (no prediction) left out."""
+    r = residual[np.isfinite(residual)]
+    r = r - r.mean() if len(r) else r
+    return r[1:] - phi * r[:-1]
+
+
+def _cost(residual: FloatArray, phi: float, least: int) -> float:
+    """Mean square of the whitened residual about its mean; infinite where too few samples have a prediction."""
+    w = _whitened(residual, phi)
+    return float(w.var()) if len(w) >= least else float("inf")
+
+
+def _phi(residual: FloatArray) -> float:
+    r = residual[np.isfinite(residual)]
+    r = r - r.mean()
+    power = float(r @ r)
+    return float(np.clip(r[1:] @ r[:-1] / power, 0.0, 0.99)) if power > 0 else 0.0
+
+
+def _fit_lag(
+    t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
+) -> LagFit:
+    """Search, refine, judge."""
+    middle = 0.5 * float(t[0] + t[-1])
+    few = slice(None, None, -(-len(t) // _SCANNED))
+    ts, ms = t[few], m[few]
+    least = max(_FEWEST, len(ts) // 2)
+
+    def residual(lag: float, rate: float) -> FloatArray:
+        return ms - prediction.at(ts + lag + rate * (ts - middle))
+
+    def scan(phi: float, rate: float) -> FloatArray:
+        return np.array([_cost(residual(lag, rate), phi, least) for lag in lags])
+
+    plain = scan(0.0, 0.0)
+    if not np.isfinite(plain).any():
+        return _no_lag("no prediction at the radio samples: the two logs do not overlap", 0, float(lags[-1]), lags)
+    phi = _phi(residual(lags[_best(plain, lags)], 0.0))
+    rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if drifting else np.zeros(1)
+    table = np.stack([scan(phi, rate) for rate in rates])
+    row, column = np.unravel_index(_best(table, np.broadcast_to(lags, table.shape)), table.shape)
+    start = np.array([lags[column], rates[row]])[: 2 if drifting else 1]
+    (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
+    ratio = _likelihood_ratios(table.min(axis=0), _whitened(residual(float(lags[column]), float(rates[row])), phi))
+    verdict, reason, interval = _judge(lag, width, ratio, lags, limit_s)
+    nan = float("nan")
+    return LagFit(
+        lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
+        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain),
+    )  # fmt: skip
+
+
+def _rates(span_s: float, lag_step_s: float) -> FloatArray:
+    """Drifts to try: from one to the next, the lag at the ends of the flight changes by about one lag step."""
+    return _symmetric(DRIFT_LIMIT, min(DRIFT_LIMIT, 2.0 * lag_step_s / span_s))
+
+
+def _best(cost: FloatArray, lags: FloatArray) -> int:
+    """Flat index of the least cost; costs that are equal but for rounding go to the lag nearest zero."""
+    flat = cost.ravel()
+    near = np.flatnonzero(flat <= np.nanmin(flat) * (1.0 + 1e-12))
+    return int(near[np.argmin(np.abs(np.asarray(lags).ravel()[near]))])
+
+
+def _refine(
+    t: FloatArray, m: FloatArray, prediction: _Prediction, middle: float, start: FloatArray
+) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Gauss-Newton from the scan's optimum: (lag, drift), half widths of their 95 % intervals, RMSE [dB]."""
+    scale = np.array([1.0, max(1.0, 0.5 * float(t[-1] - t[0]))])[: len(start)]
+    relative = np.stack([np.ones(len(t)), (t - middle) / scale[-1]])[: len(start)]
+
+    def evaluate(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+        at = t + shift @ relative
+        r, slope = m - prediction.at(at), prediction.at(at, prediction.slope)
+        ok = np.isfinite(r) & np.isfinite(slope)
+        columns = np.vstack([r, -slope * relative])[:, ok]
+        return columns[0] - columns[0].mean(), columns[1:] - columns[1:].mean(axis=1, keepdims=True)
+
+    shift = start * scale
+    phi = _phi(evaluate(shift)[0])
+    for _ in range(20):
+        r, jacobian = evaluate(shift)
+        rw, jw = r[1:] - phi * r[:-1], jacobian[:, 1:] - phi * jacobian[:, :-1]
+        step = -np.linalg.lstsq(jw.T, rw, rcond=None)[0]
+        size = float(np.abs(step).max())
+        shift = shift + step * min(1.0, 0.3 / max(size, 1e-12))  # the valley is no wider than fractions of a second
+        if size < 1e-5:
+            break
+    if np.abs(shift - start * scale).max() > 0.5:  # no valley here: keep what the scan found
+        shift = start * scale
+    r, jacobian = evaluate(shift)
+    rw, jw = r[1:] - phi * r[:-1], jacobian[:, 1:] - phi * jacobian[:, :-1]
+    width = _sandwich(rw, jw) / scale
+    found = np.zeros(2)
+    found[: len(start)] = shift / scale
+    reach = np.full(2, np.nan)
+    reach[: len(start)] = width
+    return (float(found[0]), float(found[1])), (float(reach[0]), float(reach[1])), float(np.sqrt(np.mean(r**2)))
+
+
+def _blocks(values: FloatArray) -> FloatArray:
+    """Sums over blocks of 2 n^(1/3) neighbours along the last axis; the remainder is left out."""
+    n = values.shape[-1]
+    length = max(4, round(2.0 * n ** (1.0 / 3.0)))
+    count = max(1, n // length)
+    return np.asarray(values[..., : count * length].reshape(*values.shape[:-1], count, -1).sum(axis=-1))
+
+
+def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
+    """Half widths of 95 % intervals of least-squares parameters whose residuals remember each other."""
+    from scipy.stats import t as student
+
+    normal = jacobian @ jacobian.T
+    if np.linalg.matrix_rank(normal) < len(normal):
+        return np.full(len(normal), np.inf)
+    scores = _blocks(jacobian * residual)
+    count = scores.shape[1]
+    bread = np.linalg.inv(normal)
+    covariance = bread @ (scores @ scores.T) @ bread * count / max(count - 1, 1)
+    return np.asarray(student.ppf(0.975, max(count - 1, 1)) * np.sqrt(np.diag(covariance)))
+
+
+def _likelihood_ratios(cost: FloatArray, whitened: FloatArray) -> FloatArray:
+    """Log-likelihood ratio (times two) by which every lag is worse than the best one."""
+    sums = _blocks(whitened - whitened.mean())
+    long_run = float(np.mean(sums**2)) * len(sums) / len(whitened)
+    # correlation that AR(1) left over takes evidence away; anticorrelation does not add any
+    size = len(whitened) * min(1.0, float(whitened.var()) / long_run) if long_run > 0 else len(whitened)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = size * np.log(cost / np.nanmin(cost))
+    return np.asarray(np.where(np.isfinite(cost), np.nan_to_num(ratio, nan=0.0, posinf=np.inf), np.inf))
+
+
+def _judge(
+    lag: float, width: float, ratio: FloatArray, lags: FloatArray, limit_s: float
+) -> tuple[Literal["ok", "ambiguous", "failed"], str, tuple[float, float]]:
+    """Verdict, reason and interval from the width of the valley and from its rivals."""
+    possible = lags[ratio <= 3.84]
+    low, high = min(lag - width, float(possible.min())), max(lag + width, float(possible.max()))
+    interval = (max(low, float(lags[0])), min(high, float(lags[-1])))
+    far = np.abs(lags - lag) > limit_s
+    rivals = lags[far & (ratio <= _RIVAL)]
+    if max(lag - low, high - lag) > limit_s or len(rivals):
+        flat = np.median(ratio[np.isfinite(ratio)]) <= _RIVAL if np.isfinite(ratio).any() else True
+        why = (
+            "the level hardly depends on the lag (a flat flight, or a model that explains too little)"
+            if flat
+            else f"other lags explain the data as well, such as {rivals[0]:+.1f} s" if len(rivals)
+            else "the interval is too wide"
+        )  # fmt: skip
+        return "ambiguous", why, interval
+    if abs(lag) > float(lags[-1]) - (lags[1] - lags[0]):
+        return "failed", "the best lag lies at the edge of the window: look for a clock error of another kind", interval
+    return "ok", "", interval
+
+
+# --- whole hours ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class ClockTrap:
+    """Two logs of one flight that only overlap after a shift of whole (or half) hours.
+
+    Parameters
+    ----------
+    hours : float
+        To be added to radio times.
+    overlap_s, shifted_overlap_s : float
+        Overlap with the telemetry before and after the shift [s].
+    explanation : str
+        What this looks like.
+    """
+
+    hours: float
+    overlap_s: float
+    shifted_overlap_s: float
+    explanation: str
+
+
+def clock_trap(
+    radio_span: tuple[Any, Any], telemetry_span: tuple[Any, Any], timezone: str | None = None
+) -> ClockTrap | None:
+    """Recognise a clock that is off by whole hours, such as local time stored as if it were UTC.
+
+    Parameters
+    ----------
+    radio_span, telemetry_span : (first, last)
+        datetime64 (UTC) or epoch seconds.
+    timezone : str, optional
+        IANA zone of the site: a shift that equals its offset from UTC on that day is named so.
+
+    Returns
+    -------
+    ClockTrap or None
+        None if the logs overlap as they are, or if no shift of up to 14 h (in half hours) brings them together.
+
+    Examples
+    --------
+    >>> trap = clock_trap((0.0, 600.0), (4 * 3600.0, 4 * 3600.0 + 620.0), "America/New_York")
+    >>> trap.hours
+    4.0
+    """
+    radio = _nanoseconds(np.asarray(radio_span)) * 1e-9
+    telemetry = _nanoseconds(np.asarray(telemetry_span)) * 1e-9
+
+    def overlap(hours: FloatArray) -> FloatArray:
+        start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
+        return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
+
+    shifts = np.arange(-28, 29) * 0.5
+    shared = overlap(shifts)
+    now = float(overlap(np.zeros(1))[0])
+    # whole hours before half hours, near ones before far ones
+    order = [(-round(float(shared[i])), shifts[i] % 1 != 0, abs(float(shifts[i])), i) for i in range(len(shifts))]
+    best = min(order)[-1]
+    shorter = min(radio[1] - radio[0], telemetry[1] - telemetry[0])
+    if now >= 0.5 * shorter or shared[best] < max(0.5 * shorter, 1e-9):
+        return None
+    hours = float(shifts[best])
+    return ClockTrap(hours, now, float(shared[best]), _explain_hours(hours, float(telemetry[0]), timezone))
+
+
+def _explain_hours(hours: float, instant: float, timezone: str | None) -> str:
+    if timezone is not None:
+        from datetime import datetime
+        from datetime import timezone as utc
+        from zoneinfo import ZoneInfo
+
+        moment = datetime.fromtimestamp(instant, utc.utc).astimezone(ZoneInfo(timezone))
+        offset = moment.utcoffset()
+        east = offset.total_seconds() / 3600.0 if offset else 0.0
+        if east and hours == -east:
+            return f"radio times are local time ({timezone}) stored as if they were UTC"
+        if east and hours == east:
+            return f"telemetry times are local time ({timezone}) stored as if they were UTC"
+        if abs(hours) == 1.0:
+            return "one hour: daylight saving taken into account in one log only"
+    return f"the clocks differ by {hours:+g} h: a time zone was taken into account in one log only"

@@ -197,7 +197,8 @@ def _keys(replay: Replay, chosen: IntArray) -> set[tuple[int, ...]]:
     paths: PathSet = replay.paths.select(place[replay.paths.pose] >= 0)
     plane = np.append(planes_of(replay.faces), -1)
     rows = np.column_stack([place[paths.pose], paths.tower, plane[paths.faces]])
-    return {tuple(row) for row in rows.tolist()}
+    # without the padding: the two may have different depths
+    return {tuple(n for n in row if n >= 0) for row in rows.tolist()}
 
 
 def _number(value: float | FloatArray) -> float | None:

@@ -6,8 +6,10 @@ Paths depend on the faces, the ends and the search, not on arrays, attitude or p
 from __future__ import annotations
 
 import hashlib
+import io
 import os
 import tempfile
+import zipfile
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -59,11 +61,12 @@ class PathCache:
 
     def load(self, key: str) -> PathSet | None:
         """The entry, or None when it is missing or damaged."""
-        path = self.folder / f"{key}.npz"
         try:
-            with np.load(path, allow_pickle=False) as entry:
+            # in memory first: np.load leaves a damaged file open
+            data = io.BytesIO((self.folder / f"{key}.npz").read_bytes())
+            with np.load(data, allow_pickle=False) as entry:
                 return PathSet(*(entry[name] for name in _COLUMNS))
-        except (OSError, ValueError, KeyError, EOFError):
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 
     def save(self, key: str, paths: PathSet) -> None:

@@ -46,7 +46,7 @@ def make_poses(position_m, rotation=None):
 
 def make_link(site, tower_array=None, uav_array=None, **settings):
     tower = tower_array or single_element()
-    return Link(CARRIER_HZ, {name: tower for name in site.towers}, uav_array or single_element(), **settings)
+    return Link(CARRIER_HZ, dict.fromkeys(site.towers, tower), uav_array or single_element(), **settings)
 
 
 def path_keys(paths):

@@ -124,7 +124,7 @@ def test_path_along_a_wall_is_neither_lost_nor_blocked(scenes):
 def test_grazing_reflection_appears_exactly_when_the_pose_is_in_front(scenes):
     site = scenes.site([Building("b", box(20, -10, 40, -1e-3), 30.0)])
     faces, paths = search(site, [[60.0, 5e-4, 10.0], [60.0, -2e-3, 10.0], [60.0, -4e-4, 10.0]], 1)
-    wall = [i for i, n in enumerate(faces.normal) if n[1] == 1.0][0]
+    wall = next(i for i, n in enumerate(faces.normal) if n[1] == 1.0)
     assert set(paths.pose[paths.faces[:, 0] == wall]) == {0, 2}
 
 
@@ -136,7 +136,7 @@ def test_no_crack_between_two_walls_or_wall_and_roof(scenes):
     dead_behind = np.array([[60.0, 20.0, 10.0], [60.0, 0.0, 10.0], [60.0, 12.0, 24.9]])
     _, paths = search(site, dead_behind, 0)
     assert len(paths) == 0
-    _, paths = search(site, [behind_corner + [0, 1e-6, 0], over_the_ridge + [0, 0, 1e-6]], 0)
+    _, paths = search(site, [behind_corner + np.array([0, 1e-6, 0]), over_the_ridge + np.array([0, 0, 1e-6])], 0)
     assert paths.pose.tolist() == [0, 1]
 
 

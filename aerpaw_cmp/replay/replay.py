@@ -267,7 +267,8 @@ def _evaluate(
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
-    has_path[paths.pose, paths.tower] = True
+    open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
+    has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     return Replay(
         rss_dbm=rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm),
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm),

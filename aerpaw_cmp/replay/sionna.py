@@ -15,10 +15,6 @@ Guards against what Sionna RT 2.2.0 does silently:
 
 from __future__ import annotations
 
-import ctypes.util
-import glob
-import os
-import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -27,14 +23,13 @@ from typing import Any
 import numpy as np
 
 from ..errors import CheckError, UsageError
+from ..llvm import prepare_llvm
 from ..site.materials import material
-from ..units import BoolArray, FloatArray, IntArray, wavelength_m
+from ..units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from .arrays import Array, Link, Poses
 from .faces import inside, triangles
 from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .paths import Faces, PathSet
-
-MINIMUM_LLVM = 17
-"""LLVM 14 is refused by Dr.Jit; 15 and 16 abort the process on AVX-512 machines."""
 
 SPECULAR_TABLE_SLOTS = 2**24
 MAXIMUM_PATHS = 1_000_000
@@ -44,23 +39,6 @@ HALF_SPACE_THICKNESS_M = 10.0
 """Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
 EDGE_TOLERANCE_M = 1e-3
 """A float32 reflection point may lie this far outside its face."""
-
-
-def find_llvm() -> str | None:
-    """Path of the newest LLVM library that Dr.Jit can use, ``DRJIT_LIBLLVM_PATH`` first; None if there is none."""
-    named = os.environ.get("DRJIT_LIBLLVM_PATH")
-    if named:
-        return named
-    places = ("/usr/lib/x86_64-linux-gnu", "/usr/lib/aarch64-linux-gnu", "/usr/lib64", "/usr/lib", "/usr/local/lib")
-    found: dict[int, str] = {}
-    for place in places:
-        for path in glob.glob(f"{place}/libLLVM*.so*"):  # noqa: PTH207 - plain strings are wanted
-            number = re.search(r"libLLVM(?:-|\.so\.)(\d+)", path)
-            if number and int(number[1]) >= MINIMUM_LLVM:
-                found.setdefault(int(number[1]), path)
-    if found:
-        return found[max(found)]
-    return ctypes.util.find_library("LLVM")
 
 
 def load_variant(prefer: str | None = None) -> str:
@@ -74,28 +52,26 @@ def load_variant(prefer: str | None = None) -> str:
     Raises
     ------
     UsageError
-        If the variant cannot be set.
+        If Dr.Jit finds no device of that kind.
+    CheckError
+        If no LLVM serves.
     """
-    llvm = find_llvm()
-    if llvm and "DRJIT_LIBLLVM_PATH" not in os.environ:
-        os.environ["DRJIT_LIBLLVM_PATH"] = llvm
     import mitsuba as mi
 
     current = mi.variant()
-    wanted = [f"{kind}_ad_mono_polarized" for kind in ((prefer,) if prefer else ("cuda", "llvm"))]
-    if current in wanted:
+    kinds = (prefer,) if prefer else ("cuda", "llvm")
+    if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)
     import drjit as dr
 
-    for name in wanted:
-        backend = dr.JitBackend.CUDA if name.startswith("cuda") else dr.JitBackend.LLVM
-        if dr.has_backend(backend):
-            mi.set_variant(name)
-            return name
+    for kind in kinds:
+        if kind == "llvm":
+            prepare_llvm()  # before Dr.Jit looks for one by itself
+        if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
+            mi.set_variant(f"{kind}_ad_mono_polarized")
+            return str(mi.variant())
     raise UsageError(
-        "Dr.Jit finds neither a CUDA device nor a usable LLVM",
-        expected=f"LLVM {MINIMUM_LLVM} or newer",
-        cause="install libllvm19, or name it in DRJIT_LIBLLVM_PATH; 'aerpaw-cmp doctor' says more",
+        f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
     )
 
 
@@ -163,82 +139,126 @@ def _points(values: FloatArray) -> Any:
     return mi.Point3f(*(mi.Float(column) for column in columns))
 
 
+@dataclass(frozen=True, slots=True)
+class _Ends:
+    """Devices as PathSolver wants them: centres (devices, 3), turns (devices, 3, 3) and the array they carry."""
+
+    centres_m: FloatArray
+    turns: FloatArray
+    elements_m: FloatArray
+
+    @classmethod
+    def points(cls, centres_m: FloatArray) -> _Ends:
+        """Single elements, not turned."""
+        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)), np.zeros((1, 3)))
+
+    def arguments(self, synthetic: bool) -> tuple[Any, Any, Any]:
+        """Positions, orientations and element offsets; with explicit arrays each element is an end."""
+        offsets = np.einsum("dij,ej->dei", self.turns, self.elements_m)
+        angles = _euler(self.turns)
+        if synthetic:
+            return _points(self.centres_m), _points(angles), _points(offsets.reshape(-1, 3))
+        places = (self.centres_m[:, None] + offsets).reshape(-1, 3)
+        return _points(places), _points(np.repeat(angles, len(self.elements_m), axis=0)), None
+
+    def padded(self, count: int) -> _Ends:
+        """The last device repeated until there are ``count``."""
+        rows = np.minimum(np.arange(count), len(self.centres_m) - 1)
+        return _Ends(self.centres_m[rows], self.turns[rows], self.elements_m)
+
+
+def _euler(turns: FloatArray) -> FloatArray:
+    """(yaw, pitch, roll) of rotations, TR 38.901 eq. (7.1-4)."""
+    yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+    pitch = -np.arcsin(np.clip(turns[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(turns[:, 2, 1], turns[:, 2, 2])
+    return np.asarray(np.stack([yaw, pitch, roll], axis=1))
+
+
 class _Finder:
     """PathSolver with fixed-size batches of targets.
 
     Parameters
     ----------
     built : _Scene
-    sources_m : (sources, 3)
+    sources : _Ends
+    elements_m : (elements, 3)
+        Array of the targets.
     batch : int
+    synthetic : bool
+        Plane waves over the arrays, or each element its own end.
     """
 
-    def __init__(self, built: _Scene, sources_m: FloatArray, batch: int) -> None:
-        import drjit as dr
-        import mitsuba as mi
+    def __init__(
+        self, built: _Scene, sources: _Ends, elements_m: FloatArray, batch: int, *, synthetic: bool = True
+    ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = SPECULAR_TABLE_SLOTS
-        self.built, self.batch = built, batch
+        self.built, self.batch, self.synthetic = built, batch, synthetic
         scene = built.scene
-        scene.tx_array = scene.rx_array = rt.PlanarArray(
-            num_rows=1, num_cols=1, pattern="iso", polarization="VH", polarization_model="tr38901_2"
-        )
-        for i in range(len(sources_m)):
+        for name, elements in (("tx_array", sources.elements_m), ("rx_array", elements_m)):
+            pattern = rt.antenna_pattern.antenna_pattern_registry.get("iso")(polarization="VH")
+            wavelength = float(np.asarray(scene.wavelength).ravel()[0])
+            setattr(scene, name, rt.AntennaArray(pattern, _points(elements / wavelength)))
+        for i in range(len(sources.centres_m)):
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
-
-        def endpoints(positions: Any, count: int, velocities: bool) -> tuple[Any, Any, Any, Any]:
-            still = dr.zeros(mi.Vector3f, count) if velocities else None
-            return positions, dr.zeros(mi.Point3f, count), dr.zeros(mi.Point3f, count), still
-
-        source_points = _points(sources_m)
-        self.target_points = _points(np.zeros((batch, 3)))
-
-        # public methods with a documented result; the devices' own positions would be literals in the kernels
-        def sources(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
-            return endpoints(source_points, len(sources_m), return_velocities)
-
-        def targets(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
-            return endpoints(self.target_points, batch, return_velocities)
-
-        scene.sources, scene.targets = sources, targets
+        self.sources = sources.arguments(synthetic)
+        self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
+        self._replace_endpoints(len(sources.centres_m))
         self.solver = rt.PathSolver()
 
-    def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
-        """Arrays of one batch: valid, shape, primitive, kind, amplitude, for the real (not padding) targets."""
-        count = len(targets_m)
-        padded = np.concatenate([targets_m, np.repeat(targets_m[-1:], self.batch - count, axis=0)])
-        self.target_points = _points(padded)
-        paths = self.solver(
+    def _replace_endpoints(self, towers: int) -> None:
+        """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""
+        import drjit as dr
+        import mitsuba as mi
+
+        # public methods with a documented result
+        def sources(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
+            return *self.sources, dr.zeros(mi.Vector3f, towers) if return_velocities else None
+
+        def targets(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
+            return *self.targets, dr.zeros(mi.Vector3f, self.batch) if return_velocities else None
+
+        self.built.scene.sources, self.built.scene.targets = sources, targets
+
+    def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
+        """Sionna's paths of one batch, padded."""
+        self.targets = targets.padded(self.batch).arguments(self.synthetic)
+        return self.solver(
             self.built.scene,
             max_depth=max_depth,
             max_num_paths_per_src=MAXIMUM_PATHS,
             samples_per_src=samples,
-            synthetic_array=True,
+            synthetic_array=self.synthetic,
             los=True,
             specular_reflection=max_depth > 0,
             diffuse_reflection=False,
             refraction=False,
             diffraction=False,
         )
+
+    def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
+        """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
+        count = len(targets_m)
+        paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
-        result = {
-            "valid": paths.valid.numpy()[:count],
+        valid = paths.valid.numpy()
+        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * MAXIMUM_PATHS:
+            raise CheckError(
+                f"a tower has nearly {MAXIMUM_PATHS} paths in one batch, beyond which Sionna drops paths",
+                cause="take a smaller batch",
+            )
+        return {
+            "valid": valid[:count],
             "kind": paths.interactions.numpy()[:, :count],
             "shape": paths.objects.numpy()[:, :count],
             "primitive": paths.primitives.numpy()[:, :count],
             "gain": np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count],
         }
-        if paths.valid.numpy().sum(axis=(0, 2)).max(initial=0) > 0.9 * MAXIMUM_PATHS:
-            raise CheckError(
-                f"a tower has nearly {MAXIMUM_PATHS} paths in one batch, beyond which Sionna drops paths",
-                cause="take a smaller batch",
-            )
-        del paths
-        return result
 
 
 def find_paths(
@@ -286,7 +306,8 @@ def find_paths(
         if not len(poses):
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        finder = _Finder(_build(faces, chosen, reach, carrier_hz), sources_m[towers], batch)
+        built = _build(faces, chosen, reach, carrier_hz)
+        finder = _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch)
         for start in range(0, len(poses), batch):
             some = poses[start : start + batch]
             raw = finder.solve(targets_m[some], max_depth, samples)
@@ -297,6 +318,65 @@ def find_paths(
                 progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
     found = merge(pieces, max_depth, faces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
+
+
+def own_channels(
+    faces: Faces,
+    sources_m: FloatArray,
+    poses: Poses,
+    link: Link,
+    *,
+    explicit: bool,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    usable: BoolArray | None = None,
+) -> ComplexArray:
+    """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
+
+    Parameters
+    ----------
+    faces, sources_m, max_depth, samples, batch, usable
+        As in :func:`find_paths`.
+    poses : Poses
+    link : Link
+        Isotropic elements; all towers with the same element positions and slants.
+    explicit : bool
+        Spherical waves, each element pair traced; else plane waves over each array.
+
+    Returns
+    -------
+    (poses, towers, n_rx, n_tx) complex
+    """
+    load_variant()
+    arrays = list(link.tower_arrays.values())
+    for array in (*arrays, link.uav_array):
+        if any(pattern.name != "iso" for pattern in array.patterns):
+            raise UsageError("a pattern that is not isotropic", expected="isotropic elements in Sionna's own arrays")
+    h = np.zeros((len(poses), len(arrays), len(link.uav_array), len(arrays[0])), dtype=np.complex128)
+    reach = 4.0 * float(max(np.abs(poses.position_m).max(), np.abs(sources_m).max(), 100.0))
+    for towers, chosen in _groups(faces, sources_m, usable):
+        mounts = np.stack([arrays[t].mount for t in towers])
+        sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
+        built = _build(faces, chosen, reach, link.carrier_hz)
+        finder = _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit)
+        for start in range(0, len(poses), batch):
+            rows = slice(start, start + batch)
+            targets = _Ends(
+                poses.position_m[rows], poses.rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m
+            )
+            a, _ = finder.trace(targets, max_depth, samples).cir(normalize_delays=False, out_type="numpy")
+            mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
+            h[rows, towers] = np.moveaxis(mixed, 2, 1)
+    return np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
+
+
+def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
+    """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements)."""
+    n_uav, n_tower = len(uav), len(tower)
+    halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
+    weights = [np.stack([np.cos(x.slant_rad), np.sin(x.slant_rad)]) for x in (uav, tower)]
+    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, *weights))
 
 
 def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
@@ -390,4 +470,4 @@ def _relocate(
     return np.asarray(result)
 
 
-__all__ = ["engine_versions", "find_llvm", "find_paths", "load_variant"]
+__all__ = ["engine_versions", "find_paths", "load_variant", "own_channels"]

@@ -128,7 +128,7 @@ def _feature(kind: str, coordinates: Any, properties: dict[str, Any]) -> dict[st
 
 def _lonlat(frame: SiteFrame, points_m: FloatArray) -> FloatArray:
     latitude, longitude = frame.to_geographic(points_m[:, 0], points_m[:, 1])
-    return np.round(np.column_stack([longitude, latitude]), 7)  # 1 cm
+    return np.asarray(np.round(np.column_stack([longitude, latitude]), 7), dtype=np.float64)  # 1 cm
 
 
 def _cell_corners(grid: Grid, frame: SiteFrame) -> FloatArray:
@@ -263,9 +263,7 @@ def _picture(grid: Grid, layer: Layer, low: float, high: float) -> bytes:
     cells = grid.raster(_colours(layer, low, high))[::-1]  # pictures begin in the north
     pixels = np.repeat(np.repeat(cells, PIXELS_PER_CELL, axis=0), PIXELS_PER_CELL, axis=1)
     buffer = io.BytesIO()
-    imsave(
-        buffer, np.ascontiguousarray((255 * pixels).round().astype(np.uint8)), format="png", metadata={"Software": None}
-    )
+    imsave(buffer, np.ascontiguousarray((255 * pixels).round().astype(np.uint8)), format="png")
     return buffer.getvalue()
 
 
@@ -293,7 +291,7 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
         bar.set_label(f"{layer.unit}; grey: out of coverage", fontsize=8, labelpad=1)
         bar.ax.tick_params(labelsize=8, pad=1)
     buffer = io.BytesIO()
-    figure.savefig(buffer, format="png", metadata={"Software": None})
+    figure.savefig(buffer, format="png", metadata={"Software": "aerpaw-cmp"})
     return buffer.getvalue()
 
 
@@ -374,11 +372,11 @@ def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequen
     _check(grid, layers)
     try:
         import rasterio
-        from rasterio.transform import from_origin
     except ImportError as missing:
         raise _extra_missing("GeoTIFF", missing) from None
     half = grid.spacing_m / 2
-    corner = from_origin(grid.east_m[0] - half, grid.north_m[-1] + half, grid.spacing_m, grid.spacing_m)
+    step = grid.spacing_m
+    corner = rasterio.Affine(step, 0.0, grid.east_m[0] - half, 0.0, -step, grid.north_m[-1] + half)
     crs = f"+proj=aeqd +lat_0={frame.latitude_deg!r} +lon_0={frame.longitude_deg!r} +ellps=WGS84 +units=m +no_defs"
     rows, columns = grid.shape
     target = Path(path)
@@ -422,7 +420,9 @@ def _plain(value: Any) -> Any:
         return [_plain(item) for item in value]
     if isinstance(value, np.ndarray):
         if value.dtype.kind == "f" and not np.isfinite(value).all():
-            return np.where(np.isfinite(value), value, None).tolist()
+            boxed = value.astype(object)
+            boxed[~np.isfinite(value)] = None
+            return boxed.tolist()
         return value.tolist()
     if isinstance(value, float | np.floating):
         return float(value) if np.isfinite(value) else None

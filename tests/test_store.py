@@ -126,6 +126,23 @@ def test_a_failure_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: 
     assert sorted(p.name for p in tmp_path.iterdir()) == ["flight.h5", "log"]
 
 
+def test_the_old_file_stands_until_the_new_one_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, [])
+    before = path.read_bytes()
+    seen = []
+
+    def refuse(self: Path, target: Path) -> Path:
+        seen.append((self.parent, h5py.File(self).attrs["format"], path.read_bytes() == before))
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(UsageError, match="Input/output"):
+        write_flight(path, all_samples_of_one(tmp_path))
+    assert seen == [(tmp_path, "aerpaw-cmp flight", True)]
+    assert path.read_bytes() == before
+
+
 def all_samples_of_one(folder: Path) -> list[IngestedFile]:
     (folder / "log").write_bytes(SAMPLES["vehicle_out"]["nine_fields"][0])
     return list(ingest(folder / "log", options=OPTIONS))

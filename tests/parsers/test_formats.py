@@ -61,6 +61,13 @@ def test_no_fix_is_flagged_and_has_no_position() -> None:
     assert row["yaw_deg"] == pytest.approx(np.degrees(1.5)), "the attitude does not need a fix"
 
 
+def test_a_fix_below_two_is_no_position_whatever_it_says() -> None:
+    line = samples.VEHICLE_8.splitlines(keepends=True)[0]
+    frame = read("vehicle_out", line + line.replace(b",3,12", b",1,12")).streams[0].frame
+    assert frame["flag"].tolist() == ["", "no_fix"]
+    assert frame["latitude_deg"].isna().tolist() == [False, True]
+
+
 def test_zero_attitude_is_flagged_and_unknown_where_it_is_all_there_is() -> None:
     result = read("vehicle_out", samples.VEHICLE_10)
     assert result.streams[0].frame["flag"].iloc[2] == "zero_attitude"

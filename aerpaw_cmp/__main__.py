@@ -44,7 +44,7 @@ def help_text() -> str:
             "  --version   The version.",
             "  --debug     Show the traceback of a failure (also AERPAW_CMP_DEBUG=1).",
             "",
-            "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration, 3 an input could not be read.",
+            "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration, 3 unreadable input.",
         ]
     )
 
@@ -84,6 +84,8 @@ def _message(error: BaseException) -> tuple[str, int]:
 
     if isinstance(error, AerpawCmpError):
         return f"aerpaw-cmp: {error}", error.exit_code
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
+        return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
     kind = type(error).__name__
     return (
         f"aerpaw-cmp: internal error, {kind}: {str(error).strip() or 'no message'}\n"

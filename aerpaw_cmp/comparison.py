@@ -17,7 +17,7 @@ from .compare import rank as ranks
 from .compare import rss
 from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
-from .replaying import Replayed, direct_foliage_m
+from .replaying import Clock, Replayed, direct_foliage_m
 from .report import data as report
 from .units import BoolArray, FloatArray
 
@@ -43,7 +43,7 @@ def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[st
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> Compared:
     """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
-    settings = data.settings.rss
+    settings, clock = data.settings.rss, replayed.clock
     level = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
     simulated = replayed.spread(level[:, 0])
     measured = series.measured_db
@@ -66,6 +66,8 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         step_db=settings.step_db,
         span_db=settings.span_db,
         replicates=max(settings.bootstrap, 1),
+        lag_s=float("nan") if clock is None else clock.shift_s,
+        fitted_on_scored=("lag",) if clock is not None and clock.applied == "estimated and applied" else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     position = geometry.pop("position_m")
@@ -88,6 +90,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         offset_ci95_db=result.intervals.offset_db,
         correlation_ci95=result.intervals.correlation,
         n_effective=result.intervals.memory.n_effective,
+        lag_s=result.lag_s,
+        lag_verdict="" if clock is None else clock.verdict,
+        fitted=("offset", *result.fitted_on_scored),
         baselines=tuple(
             report.Baseline(
                 name=name,
@@ -114,9 +119,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         geometry=geometry,
         line_of_sight=direct == 1.0,
         worst=_worst(series, result, position, geometry, direct),
-        extra={k: v for k, v in result.as_dict().items() if k in EXTRA_RSS},
+        extra={**{k: v for k, v in result.as_dict().items() if k in EXTRA_RSS}, "clock": _clock_entry(clock)},
     )
-    return Compared(panel, _rss_warnings(series, result))
+    return Compared(panel, _rss_warnings(series, result, clock))
 
 
 EXTRA_RSS = ("identifiable_db", "trimmed", "n_no_pose", "n_measured_out", "n_simulated_out", "block_length")
@@ -177,9 +182,29 @@ def _worst(
     )
 
 
-def _rss_warnings(series: RssSeries, result: rss.RssComparison) -> tuple[str, ...]:
+def _clock_entry(clock: Clock | None) -> dict[str, Any] | None:
+    if clock is None:
+        return None
+    return {
+        "shift_s": clock.shift_s,
+        "shift_ci95_s": list(clock.shift_ci95_s),
+        "drift_s_per_s": clock.drift_s_per_s,
+        "verdict": clock.verdict,
+        "reason": clock.reason,
+        "applied": clock.applied,
+    }
+
+
+def _rss_warnings(series: RssSeries, result: rss.RssComparison, clock: Clock | None) -> tuple[str, ...]:
     name = f"{series.tower} {series.channel}"
     out = []
+    if clock is not None and clock.verdict == "ok" and clock.applied == "estimated, not applied":
+        low, high = clock.shift_ci95_s
+        if low > 0 or high < 0:
+            out.append(
+                f"{name}: the radio clock shows {clock.shift_s:+.2f} s ({low:+.2f} .. {high:+.2f}) against the telemetry; "
+                "not applied (rss.lag: apply would)."
+            )
     if result.n == 0:
         out.append(f"{name}: no sample could be compared; its numbers are missing, not zero.")
     elif result.at_edge:

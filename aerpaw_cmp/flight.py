@@ -18,7 +18,7 @@ from .readers import HEAD_BYTES, Reader, by_name, catalogue
 from .records import Stream
 from .site.site import Site
 from .site.siteyaml import load_site
-from .track import Track
+from .track import Track, clock_trap
 from .units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 
 Times = NDArray[np.datetime64]
@@ -220,23 +220,17 @@ def _check_overlap(data: FlightData) -> None:
             raise InputError(
                 f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {pd.Timestamp(start)} .. {pd.Timestamp(end)} (UTC)",
                 expected="logs of the same flight",
-                cause=whole_hours(time, start, end) or "logs of different flights, or a wrong 'timezone' or 'clock'",
+                cause=_clock_cause(data, time, start, end),
             )
 
 
-def whole_hours(time: Times, start: np.datetime64, end: np.datetime64) -> str | None:
-    """Say so when a shift by whole hours would make the spans overlap: local time stored as UTC, or the reverse."""
-    if len(time) == 0:
-        return None
-    gap_h = float((start - time.min()) / np.timedelta64(1, "h"))
-    hours = round(gap_h)
-    moved = np.timedelta64(hours, "h")
-    if hours != 0 and abs(hours) <= 14 and time.min() + moved <= end and time.max() + moved >= start:
-        return (
-            f"one clock is off by {hours:+d} h, as when local time is stored as UTC: try 'clock: local_as_utc', "
-            "'clock: local' or 'clock: utc' beside the log"
-        )
-    return None
+def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+    trap = None
+    if len(time):
+        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+    if trap is None:
+        return "logs of different flights, or a wrong 'timezone' or 'clock'"
+    return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:

@@ -149,7 +149,7 @@ def _system_paths() -> list[Path]:
 
 
 def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
-    """libLLVM files in the order they are worth trying: newest first, unknown versions last.
+    """The libLLVM files in the order they are worth trying: newest first, unknown versions last.
 
     With ``DRJIT_LIBLLVM_PATH`` set, that file alone.
 
@@ -357,7 +357,7 @@ def _os_families() -> set[str]:
 def apt_packages(search_output: str) -> list[str]:
     """LLVM runtime packages new enough, newest first, from the output of ``apt-cache search``.
 
-    >>> apt_packages("libllvm14 - x\\nlibllvm19 - x\\nlibllvm17t64 - x\\nlibllvm19-dbg - x")
+    >>> apt_packages(os.linesep.join(["libllvm14 - x", "libllvm19 - x", "libllvm17t64 - x", "libllvm19-dbg - x"]))
     ['libllvm19', 'libllvm17t64']
     """
     found = re.findall(r"^(libllvm(\d+)(?:t64)?)\s", search_output + "\n", flags=re.MULTILINE)

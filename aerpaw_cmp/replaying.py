@@ -9,15 +9,35 @@ from typing import Any
 
 import numpy as np
 
-from .flight import FlightData, rank_positions
+from .flight import FlightData, RssSeries, Times, rank_positions
 from .replay.arrays import Link, Poses, rotation_from_aircraft
 from .replay.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
 from .replay.paths import PathSet
 from .replay.replay import Loss, Replay, replay
-from .track import TrackPoses
+from .track import TrackPoses, estimate_lag
 from .units import BoolArray, FloatArray
 
 Progress = Callable[[str], None]
+
+COHERENT_STEP_S = 0.02
+"""Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""
+
+
+@dataclass(frozen=True, slots=True)
+class Clock:
+    """Radio clock against telemetry clock of one series.
+
+    ``shift_s`` is how much more the radio clock shows, ``shift_ci95_s`` its interval; ``drift`` in s/s; ``applied_s``
+    (n,) is what was taken off the radio times before the replay.
+    """
+
+    shift_s: float
+    shift_ci95_s: tuple[float, float]
+    drift_s_per_s: float
+    verdict: str
+    reason: str
+    applied: str
+    applied_s: FloatArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,6 +49,7 @@ class Replayed:
     valid: BoolArray
     replay: Replay
     track: TrackPoses | None
+    clock: Clock | None = None
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values per replayed pose, put back at their samples (n,)."""
@@ -37,28 +58,102 @@ class Replayed:
         return out
 
 
-def replay_rss(data: FlightData, progress: Progress) -> list[Replayed]:
+def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] | None = None) -> list[Replayed]:
     """Replay every RSS series; series of one tower with equal links are replayed together."""
     groups: dict[tuple[str, str], list[int]] = {}
     for index, series in enumerate(data.rss):
         groups.setdefault((series.tower, series.settings_key), []).append(index)
+    shifts = clocks or [None] * len(data.rss)
     out: dict[int, Replayed] = {}
     for members in groups.values():
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
-        tracks = [_track_poses(data, data.rss[i].time) for i in members]
+        tracks = [_track_poses(data, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
         poses = [_poses(data, track) for track in tracks]
-        joined = Poses(
-            np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses])
-        )
+        joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
         progress(f"replay RSS {tower}: {len(joined)} poses")
         whole = _replay(data, link, joined)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
             stop = start + len(part)
-            out[index] = Replayed(link, part, track.valid, part_of(whole, start, stop), track)
+            out[index] = Replayed(link, part, track.valid, part_of(whole, start, stop), track, shifts[index])
             start = stop
     return [out[i] for i in range(len(data.rss))]
+
+
+def telemetry_time(time: Times, clock: Clock | None) -> Times:
+    """Radio times on the telemetry's clock."""
+    if clock is None:
+        return time
+    return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
+
+
+def estimate_clocks(data: FlightData, progress: Progress) -> list[Clock | None]:
+    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks.
+
+    Predictions are the image engine's RSS along the track with at most one reflection.
+    """
+    wanted = data.settings.rss.lag
+    if wanted == "off" or data.track is None:
+        return [None] * len(data.rss)
+    out: list[Clock | None] = []
+    for series in data.rss:
+        if isinstance(wanted, float):
+            applied = np.full(len(series.time), wanted)
+            out.append(Clock(wanted, (wanted, wanted), 0.0, "given", "", "given in flight.yaml", applied))
+            continue
+        progress(f"clock {series.tower} {series.channel}")
+        out.append(_estimated_clock(data, series, apply=wanted == "apply"))
+    return out
+
+
+def _estimated_clock(data: FlightData, series: RssSeries, *, apply: bool) -> Clock:
+    """Lag by the coherent replay and by its power sum; the one that leaves the smaller residual decides.
+
+    Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
+    (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
+    """
+    link = series.link.build([series.tower], data.folder)
+
+    def predictor(field: str) -> Callable[[Any], FloatArray]:
+        def predict(times: Any) -> FloatArray:
+            track = _track_poses(data, times)
+            level = np.full(len(track), np.nan)
+            depth = min(data.settings.rt.max_depth, 1)
+            result = replay(data.site, link, _poses(data, track), engine="image", max_depth=depth)
+            level[track.valid] = getattr(result, field)[:, 0]
+            return level
+
+        return predict
+
+    measured = series.measured_db
+    if data.settings.rss.minimum_height_m is not None:
+        with np.errstate(invalid="ignore"):
+            low = ~(_track_poses(data, series.time).position_m[:, 2] >= data.settings.rss.minimum_height_m)
+        measured = np.where(low, np.nan, measured)
+    window = data.settings.rss.lag_window_s
+    fits = {
+        name: estimate_lag(series.time, measured, predictor(field), window_s=window, resolution_s=resolution)
+        for name, field, resolution in (
+            ("coherent replay", "rss_dbm", COHERENT_STEP_S),
+            ("power sum of the replay", "rss_power_dbm", 0.1),
+        )
+    }
+    by = min(fits, key=lambda name: np.nan_to_num(fits[name].rmse_db, nan=np.inf))
+    fit = fits[by]
+    elapsed = (series.time - series.time.min()) / np.timedelta64(1, "s") if len(series.time) else np.zeros(0)
+    used = apply and fit.verdict == "ok"
+    # the fit's lag is added to radio times; users think of how much the radio clock shows too much
+    shift = -(fit.lag_s + fit.drift_s_per_s * (elapsed - fit.reference))
+    return Clock(
+        shift_s=-fit.lag_s,
+        shift_ci95_s=(-fit.interval_s[1], -fit.interval_s[0]),
+        drift_s_per_s=-fit.drift_s_per_s,
+        verdict=fit.verdict,
+        reason=f"by the {by}" + (f": {fit.reason}" if fit.reason else ""),
+        applied="estimated and applied" if used else "estimated, not applied",
+        applied_s=shift if used else np.zeros(len(series.time)),
+    )
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:

@@ -97,10 +97,12 @@ def run_report(
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files)
     from .comparison import audit_replays, compare_rank_series, compare_rss_series
-    from .replaying import replay_rank, replay_rss
+    from .replaying import estimate_clocks, replay_rank, replay_rss
 
+    with stages("clocks"):
+        clocks = estimate_clocks(data, progress)
     with stages("replay"):
-        rss_replays = replay_rss(data, progress)
+        rss_replays = replay_rss(data, progress, clocks)
         rank_replays = replay_rank(data, progress)
     with stages("compare"):
         rss = [compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)]

@@ -484,6 +484,18 @@ class _Prediction:
         level = source[left] * (1.0 - weight) + source[left + 1] * weight
         return np.where(inside, level, np.nan)
 
+    def smooth_at(self, t: FloatArray) -> FloatArray:
+        """Cubic (Catmull-Rom) interpolation at t: linear pieces would bias a lag where fades are steep."""
+        place = (t - self.first) / self.step
+        left = np.floor(place).astype(np.int64)
+        inside = (left >= 0) & (left < len(self.level) - 1)
+        left = np.where(inside, left, 0)
+        u = place - left
+        a, b = self.level[left], self.level[left + 1]
+        da, db = self.slope[left] * self.step, self.slope[left + 1] * self.step
+        level = a + u * (da + u * (3.0 * (b - a) - 2.0 * da - db + u * (2.0 * (a - b) + da + db)))
+        return np.where(inside, level, np.nan)
+
     def common(self, t: FloatArray, reach: float) -> BoolArray:
         """Instants whose prediction exists for every shift up to ``reach``."""
         bad = np.concatenate([[0], np.cumsum(~np.isfinite(self.level))])
@@ -500,7 +512,7 @@ def estimate_lag(
     predictor: Callable[[AnyArray], ArrayLike],
     *,
     window_s: float = LAG_WINDOW_S,
-    resolution_s: float = 0.1,
+    resolution_s: float = 0.05,
     limit_s: float = LAG_LIMIT_S,
     drift: bool | None = None,
 ) -> LagFit:
@@ -544,7 +556,7 @@ def estimate_lag(
     origin = int(stamp[stamp != _NAT][0]) if np.any(stamp != _NAT) else 0
     order = np.argsort(stamp[used], kind="stable")
     t, m = ((stamp[used] - origin) * 1e-9)[order], levels[used][order]
-    lags = _symmetric(window_s, max(0.05, resolution_s))
+    lags = _symmetric(window_s, max(0.1, resolution_s))
     if len(t) < _FEWEST:
         return _no_lag("too few samples", len(t), window_s, lags)
     reach = window_s + 2.0 + DRIFT_LIMIT * (t[-1] - t[0])
@@ -567,7 +579,7 @@ def estimate_lag(
 
 def _symmetric(window: float, step: float) -> FloatArray:
     count = int(np.floor(window / step + 1e-9))
-    return np.arange(-count, count + 1) * step
+    return np.asarray(np.arange(-count, count + 1) * step, dtype=np.float64)
 
 
 def _no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
@@ -631,7 +643,8 @@ def _fit_lag(
     rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if drifting else np.zeros(1)
     table = np.stack([scan(phi, rate) for rate in rates])
     row, column = np.unravel_index(_best(table, np.broadcast_to(lags, table.shape)), table.shape)
-    start = np.array([lags[column], rates[row]])[: 2 if drifting else 1]
+    near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row])), phi, least))
+    start = np.array([near, rates[row]])[: 2 if drifting else 1]
     (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
     ratio = _likelihood_ratios(table.min(axis=0), _whitened(residual(float(lags[column]), float(rates[row])), phi))
     verdict, reason, interval = _judge(lag, width, ratio, lags, limit_s)
@@ -640,6 +653,14 @@ def _fit_lag(
         lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
         middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain),
     )  # fmt: skip
+
+
+def _between(cost: FloatArray, lags: FloatArray, cost_at: Callable[[float], float]) -> float:
+    """Best lag on a ten times finer grid around the five best of the scan: interference makes valleys narrower."""
+    step = float(lags[1] - lags[0])
+    coarse = lags[np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")[:5]]
+    fine = (coarse[:, None] + np.arange(-6, 7) * (step / 10.0)).ravel()
+    return float(fine[_best(np.array([cost_at(float(lag)) for lag in fine]), fine)])
 
 
 def _rates(span_s: float, lag_step_s: float) -> FloatArray:
@@ -663,7 +684,7 @@ def _refine(
 
     def evaluate(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
         at = t + shift @ relative
-        r, slope = m - prediction.at(at), prediction.at(at, prediction.slope)
+        r, slope = m - prediction.smooth_at(at), prediction.at(at, prediction.slope)
         ok = np.isfinite(r) & np.isfinite(slope)
         columns = np.vstack([r, -slope * relative])[:, ok]
         return columns[0] - columns[0].mean(), columns[1:] - columns[1:].mean(axis=1, keepdims=True)
@@ -799,7 +820,7 @@ def clock_trap(
         start = np.maximum(radio[0] + 3600.0 * hours, telemetry[0])
         return np.asarray(np.maximum(0.0, np.minimum(radio[1] + 3600.0 * hours, telemetry[1]) - start))
 
-    shifts = np.arange(-28, 29) * 0.5
+    shifts = np.asarray(np.arange(-28, 29) * 0.5, dtype=np.float64)
     shared = overlap(shifts)
     now = float(overlap(np.zeros(1))[0])
     # whole hours before half hours, near ones before far ones

@@ -340,6 +340,9 @@ class Framer:
     def _final(self, status: Status, code: str | None, events: list[Event]) -> None:
         now = self._open
         if now is None or self._is_owed_final(now, status):
+            if now is not None:  # before the echo of our command: not ours
+                self._stray += now.lines
+                now.lines.clear()
             events.append(Late(tuple(self._stray), status, code))
             self._stray.clear()
             del self._owed[:1]

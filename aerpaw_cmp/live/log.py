@@ -458,7 +458,10 @@ def segments(source: Path) -> list[Path]:
 def read_log(source: Path, bad: list[BadLine] | None = None) -> Iterator[Record]:
     """Records of a log, file or folder, in order; bad lines go to ``bad``."""
     for path in segments(source):
-        lines = path.read_bytes().split(b"\n")
+        try:
+            lines = path.read_bytes().split(b"\n")
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", expected="a tap log", path=path) from None
         tail = len(lines)
         for number, line in enumerate(lines, 1):
             if not line.strip():

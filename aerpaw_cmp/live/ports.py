@@ -10,7 +10,9 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import grp
 import os
+import pwd
 import select
 import stat
 import termios
@@ -178,9 +180,6 @@ def _busy(path: Path, others: list[Holder]) -> InputError:
 
 
 def _denied(path: Path) -> InputError:
-    import grp
-    import pwd
-
     state = path.stat()
     try:
         owner, group = pwd.getpwuid(state.st_uid).pw_name, grp.getgrgid(state.st_gid).gr_name

@@ -176,7 +176,7 @@ class TapSummary:
 def format_status(status: TapStatus) -> str:
     """One line for the terminal; nothing in it comes from the modem as text."""
     if not status.connected:
-        head = "NO PORT "
+        head = "NO PORT"
     elif status.rank is None:
         head = "rank -"
     else:

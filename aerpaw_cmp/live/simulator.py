@@ -396,9 +396,11 @@ class ModemSimulator:
         link = self.settings.link
         if link is not None:
             link.parent.mkdir(parents=True, exist_ok=True)
-            with contextlib.suppress(FileNotFoundError):
-                if link.is_symlink():
-                    link.unlink()
+            if link.is_symlink():
+                link.unlink()
+            elif link.exists():
+                os.close(master)
+                raise UsageError("the name is taken by something that is not a link", expected="a new name", path=link)
             link.symlink_to(node)
         return node
 

@@ -7,7 +7,6 @@ Each position is the centre of its cell: 1080 m x 2130 m at 30 m gives 36 x 71 =
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -223,6 +222,35 @@ def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
     return np.asarray(counts / max(counts.sum(), 1))
 
 
-def class_names(highest: int = 4) -> Sequence[str]:
+def class_names(highest: int = 4) -> tuple[str, ...]:
     """Names of the rank classes: ``Z``, ``1``, ..."""
     return (OUT_OF_COVERAGE, *(str(rank) for rank in range(1, highest + 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One map to draw or to export.
+
+    Parameters
+    ----------
+    name : str
+        Identifier such as ``"rank_k10_h030m_joint"``: letters, digits, underscores.
+    values : (n,)
+        In index order; NaN (classes: 0) is out of coverage.
+    unit : str
+        Such as ``"dBm"``; ``"1"`` for classes and ratios.
+    title : str
+        For legends.
+    classes : tuple of str
+        Names of the values 0, 1, ... when the layer holds classes.
+    """
+
+    name: str
+    values: AnyArray
+    unit: str
+    title: str
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.name.replace("_", "").isalnum():
+            raise ValueError(f"layer name {self.name!r} holds more than letters, digits and underscores")

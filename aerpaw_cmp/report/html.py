@@ -69,7 +69,8 @@ def data_uri(svg: bytes) -> str:
 
 
 @cache
-def _environment() -> Any:
+def environment() -> Any:
+    """The template engine: everything escaped, an undefined name is an error."""
     from jinja2 import Environment, PackageLoader, StrictUndefined
 
     environment = Environment(
@@ -100,7 +101,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     sections: dict[str, list[Picture]] = {}
     for picture in pictures:
         sections.setdefault(picture.section, []).append(picture)
-    template = _environment().get_template("report.html.jinja")
+    template = environment().get_template("report.html.jinja")
     text: str = template.render(
         data=data,
         sections=sections,

@@ -147,7 +147,7 @@ def _mapping(value: Any) -> dict[str, Any]:
 
 
 def _int(value: Any) -> int:
-    return value if type(value) is int else 0
+    return value if type(value) is int and abs(value) < 2**62 else 0
 
 
 def _flags(record: dict[str, Any]) -> list[str]:
@@ -162,7 +162,9 @@ def _frame(columns: dict[str, list[Any]]) -> pd.DataFrame:
         "flag": pd.Series(columns.pop("flag", []), dtype=object),
     }
     for name, values in columns.items():
-        content[name] = np.array([v if type(v) in (int, float) else np.nan for v in values], dtype=np.float64)
+        content[name] = np.array(
+            [v if type(v) in (int, float) and abs(v) < 1e9 else np.nan for v in values], dtype=np.float64
+        )
     frame: pd.DataFrame = pd.DataFrame(content)
     return frame
 
@@ -233,7 +235,7 @@ def _warnings(records: list[tuple[int, dict[str, Any]]], rejected: list[Rejected
         elif kind == "gap":
             open_gap = record
         elif kind == "clock":
-            found.append(f"the wall clock stepped by {int(record.get('step_ns', 0)) / 1e9:+.3f} s")
+            found.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
         elif kind == "disk":
             found.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
     if open_gap is not None:

@@ -67,13 +67,13 @@ def sampled(start: np.ndarray, end: np.ndarray, stand: Trees, shape: str, count:
 
 @pytest.mark.parametrize("shape", ["cone", "ellipsoid", "cylinder"])
 def test_chords_equal_monte_carlo(shape: str) -> None:
-    stand = grove(40, seed=3)
+    stand = grove(50, seed=3)
     random = np.random.default_rng(4)
-    start = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(-5, 18, 24)])
-    end = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(-5, 18, 24)])
+    start = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(0, 9, 24)])
+    end = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(0, 9, 24)])
     found = foliage_depth_m(start, np.zeros((24, 0, 3)), end, CrownIndex(stand, shape))  # type: ignore[arg-type]
     expected = [sampled(a, b, stand, shape, 100_000, n) for n, (a, b) in enumerate(zip(start, end, strict=True))]
-    assert np.count_nonzero(found > 1) > 12  # the case is not empty
+    assert np.count_nonzero(found > 1) > 8  # the case is not empty
     # a stratified sample is off by about one stratum (< 2.3 mm here) per surface crossed, half of them either way
     np.testing.assert_allclose(found, expected, rtol=1e-3, atol=5e-3)
 

@@ -37,6 +37,7 @@ CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
 
 Progress = Callable[[float], None]
+Select = Callable[[int, "list[Sequences]"], "list[Sequences]"]
 
 
 def find_paths(
@@ -48,6 +49,7 @@ def find_paths(
     usable: BoolArray | None = None,
     excluded: BoolArray | None = None,
     budget: int = SEQUENCE_BUDGET,
+    select: Select | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
@@ -67,6 +69,8 @@ def find_paths(
         Links without any path, e.g. poses inside buildings.
     budget : int
         Largest number of sequences followed per tower.
+    select : callable, optional
+        ``select(tower, levels)`` gives the sequences to follow of those that geometry allows.
     progress : callable, optional
         Called with the share done.
 
@@ -93,8 +97,8 @@ def find_paths(
             alive &= ~excluded[tower]
         poses = np.flatnonzero(alive)
         if len(poses):
-            tree = _Sequences.of(faces, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m)
-            for level in tree:
+            tree = Sequences.of(faces, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m)
+            for level in select(tower, tree) if select else tree:
                 found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((tower + 1) / len(sources_m))
@@ -108,13 +112,18 @@ def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
 
 
 @dataclass(frozen=True, slots=True)
-class _Sequences:
-    """Face sequences of one length with their images."""
+class Sequences:
+    """Face sequences of one length with their images.
+
+    Parameters
+    ----------
+    faces : (sequences, depth) int
+    images_m : (sequences, depth, 3)
+        The source mirrored at the first 1, 2, ... faces.
+    """
 
     faces: IntArray
-    """(sequences, depth)"""
     images_m: FloatArray
-    """(sequences, depth, 3): source mirrored at the first 1, 2, ... faces"""
 
     @classmethod
     def of(
@@ -126,7 +135,7 @@ class _Sequences:
         max_depth: int,
         budget: int,
         tolerance_m: float,
-    ) -> list[_Sequences]:
+    ) -> list[Sequences]:
         """Sequences of depth 0 .. max_depth that geometry does not rule out for any target."""
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]
@@ -155,14 +164,14 @@ def _facing(faces: Faces, box: FloatArray, tolerance_m: float) -> BoolArray:
 
 def _grow(
     faces: Faces,
-    level: _Sequences,
+    level: Sequences,
     source: FloatArray,
     usable: BoolArray,
     facing: BoolArray,
     box: FloatArray,
     tolerance_m: float,
     budget: int,
-) -> _Sequences:
+) -> Sequences:
     """Sequences one face longer."""
     grown: list[IntArray] = []
     images: list[FloatArray] = []
@@ -193,7 +202,7 @@ def _grow(
                 expected="a rural scene with few faces",
                 cause="take engine 'sionna', a smaller max_depth, or leave out small faces",
             )
-    return _Sequences(np.concatenate(grown), np.concatenate(images))
+    return Sequences(np.concatenate(grown), np.concatenate(images))
 
 
 def _beam_meets(apex: FloatArray, window: FloatArray, target: FloatArray, tolerance_m: float) -> BoolArray:
@@ -214,8 +223,8 @@ def _beam_meets(apex: FloatArray, window: FloatArray, target: FloatArray, tolera
 
 
 def _reaching(
-    faces: Faces, level: _Sequences, lit: BoolArray, box: FloatArray, hull: FloatArray, tolerance_m: float
-) -> _Sequences:
+    faces: Faces, level: Sequences, lit: BoolArray, box: FloatArray, hull: FloatArray, tolerance_m: float
+) -> Sequences:
     """Sequences whose last face, and the beam through it, can reach the box of targets."""
     if not level.faces.shape[1]:
         return level
@@ -224,12 +233,12 @@ def _reaching(
     row = np.flatnonzero(keep & np.isfinite(faces.lower[last, 0]))
     for part in np.array_split(row, max(1, len(row) // 20_000)):
         keep[part] = _beam_meets(level.images_m[part, -1], box[last[part]], hull[None], tolerance_m)
-    return _Sequences(level.faces[keep], level.images_m[keep])
+    return Sequences(level.faces[keep], level.images_m[keep])
 
 
 def _paths_of_level(
     faces: Faces,
-    level: _Sequences,
+    level: Sequences,
     source: FloatArray,
     targets: FloatArray,
     poses: IntArray,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal
 
@@ -20,6 +20,7 @@ from .cache import PathCache
 from .faces import inside_solids, site_faces, smaller_than_fresnel_zone
 from .field import channel_matrices, mean_pair_power, rss_dbm
 from .paths import Faces, PathSet
+from .relevance import Relevance
 
 Engine = Literal["sionna", "image"]
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
@@ -101,7 +102,8 @@ def replay(
         Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
     relevance_db : float, optional
-        Leave out faces that cannot change the RSS of any link by more than this.
+        ``image`` only: leave out face sequences that cannot change the RSS of any link by more than this
+        (:mod:`aerpaw_cmp.replay.relevance`).
     drop_small_faces : bool
         Leave out faces smaller than the first Fresnel zone of every link.
     variant : {"cuda", "llvm"}, optional
@@ -116,13 +118,23 @@ def replay(
     Raises
     ------
     UsageError
-        Unknown tower or engine, a scene too large for ``image``.
+        Unknown tower or engine, a scene too large for ``image``, ``relevance_db`` with ``sionna``.
     """
     started = time.perf_counter()
     scene = Scene.of(site, link, poses)
-    scene, left_out = _reduce(scene, link, poses, relevance_db, drop_small_faces)
+    scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     settings = Settings(engine, max_depth, samples, batch, variant)
-    paths = _search(scene, link, poses, settings, _cache(engine, cache_dir), progress)
+    if relevance_db is None:
+        paths = _search(scene, link, poses, settings, _cache(engine, cache_dir), progress)
+    elif engine == "image":
+        paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
+        left_out += idle
+    else:
+        raise UsageError(
+            "relevance_db with the sionna engine",
+            expected="engine 'image'",
+            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
+        )
     searched = time.perf_counter()
     return _evaluate(scene, link, poses, paths, engine, loss, left_out, started, searched)
 
@@ -181,20 +193,50 @@ class Scene:
         return cls(faces, sources, usable, excluded)
 
 
-def _reduce(
-    scene: Scene, link: Link, poses: Poses, relevance_db: float | None, drop_small_faces: bool
-) -> tuple[Scene, list[str]]:
-    """Scene without the mirrors that are asked to be left out; they still hide what lies behind them."""
-    usable = scene.usable.copy()
-    left_out: list[str] = []
+def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
+    """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
     good = np.isfinite(poses.position_m).all(axis=1)
-    if drop_small_faces and good.any():
-        small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
-        usable &= ~small
-        left_out += [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
-    if relevance_db is not None and good.any():
-        raise UsageError("relevance_db is not available yet")
-    return Scene(scene.faces, scene.sources_m, usable, scene.excluded), left_out
+    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
+    left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
+    return replace(scene, usable=scene.usable & ~small), left_out
+
+
+def _search_relevant(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    relevance_db: float,
+    progress: Callable[[float], None] | None,
+) -> tuple[PathSet, list[str]]:
+    """Paths without the sequences that cannot matter; poses at which they might are searched with all."""
+    if not relevance_db > 0.0:
+        raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
+
+    def field_of(paths: PathSet) -> FloatArray:
+        return np.sqrt(mean_pair_power(channel_matrices(paths, scene.faces, scene.sources_m, poses, link).h))
+
+    ground = replace(scene, usable=scene.usable & (scene.faces.solid < 0))
+    kept = field_of(_search(ground, link, poses, settings, None, None))
+    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    chooser = Relevance(scene.faces, poses.position_m[known], link, relevance_db, kept[known])
+    paths = image.find_paths(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        max_depth=settings.max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        select=chooser,
+        progress=progress,
+    )
+    again = np.zeros(len(poses), dtype=np.bool_)
+    again[known] = chooser.failing(field_of(paths)[known])
+    if again.any():
+        all_of_them = replace(scene, excluded=scene.excluded | ~again)
+        full = _search(all_of_them, link, poses, settings, None, None)
+        paths = image.merge([paths.select(~again[paths.pose]), full], settings.max_depth, None)
+    return paths, chooser.report(tuple(link.tower_arrays), int(again.sum()), len(known))
 
 
 def _search(

@@ -255,7 +255,7 @@ def test_fully_hidden_flight_has_no_path(scenes):
     assert np.isnan(result.rss_power_dbm).all()
 
 
-@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e4])
+@pytest.mark.parametrize("scale", [0.05, 1.0, 3.0])
 def test_scaled_scene_and_wavelength_give_the_same_channel(scenes, scale):
     """Lengths and wavelength times one factor: H is unchanged over empty ground of metal (nearly frequency free)."""
     from dataclasses import replace

@@ -229,6 +229,11 @@ def load_site(
         raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path) from None
 
 
+def site_model(name_or_path: str | Path) -> SiteModel:
+    """The checked settings of a packaged site or a site.yaml, before trees are placed."""
+    return _find(name_or_path)[1]
+
+
 def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or path.is_file():

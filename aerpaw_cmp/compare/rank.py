@@ -65,7 +65,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
         part = flat[start : start + step]
         good = np.isfinite(part).all(axis=(1, 2))
         result[start : start + step][good] = np.linalg.svd(_scaled(part[good]), compute_uv=False)
-    return result.reshape(*lead, -1)
+    return result.reshape(*lead, min(rows, columns))
 
 
 def _scaled(matrix: ComplexArray) -> ComplexArray:
@@ -345,7 +345,7 @@ class KCurve:
     best_k_agreement, best_k_total_variation : float
         Where the best value is reached (the middle, on the log scale, of the best run of K); NaN without a pair.
     best_k_interval, best_k_total_variation_interval : (low, high)
-        Central 95 % of the best K over the bootstrap replicates.
+        Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
     at_edge : bool
         The best agreement is reached at an end of the grid.
     """
@@ -404,9 +404,9 @@ def k_curve(
         agree,
         np.asarray(vary),
         float(best),
-        _central(_middle_of_best(drawn[0], grid)),
+        _central(_middle_of_best(drawn[0], grid), grid),
         float(best_tv),
-        _central(_middle_of_best(-varied, grid)),
+        _central(_middle_of_best(-varied, grid), grid),
         bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
     )
 
@@ -421,9 +421,12 @@ def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(k[first] * k[end]))
 
 
-def _central(values: FloatArray) -> Interval:
+def _central(values: FloatArray, k: FloatArray) -> Interval:
+    """Central 95 % of best values, one grid step wider on either side: nothing finer was tried."""
     low, high = np.quantile(values, [0.025, 0.975])
-    return float(low), float(high)
+    first = max(0, int(np.searchsorted(k, low * (1 + 1e-9))) - 2)
+    last = min(len(k) - 1, int(np.searchsorted(k, high * (1 - 1e-9))) + 1)
+    return float(min(k[first], low)), float(max(k[last], high))
 
 
 def condition_number_rank(h: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
@@ -481,6 +484,35 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
     alive = np.isfinite(stacked).all(axis=-1)
     best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1
     return np.where(alive, best, 0).astype(np.int64)
+
+
+def profile_by_rank(measured: ArrayLike, sigma: ArrayLike) -> dict[int, FloatArray]:
+    """Singular-value profiles behind each measured rank: what the channel was where the RI was 2.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        RI; NaN where none.
+    sigma : array_like, (n, m)
+        Singular values, descending.
+
+    Returns
+    -------
+    dict of int to ndarray, (3, m)
+        Lower quartile, median, upper quartile of ``20 log10 (sigma_i / sigma_1)`` [dB] where the RI was that rank. A
+        threshold rule with K explains a rank r if the median of column r lies above ``-20 log10 K`` and that of
+        column r + 1 below.
+    """
+    ri, profile = _ranks(measured), np.asarray(sigma, dtype=np.float64)
+    alive = (ri >= 1) & (profile[:, 0] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio_db = 20.0 * np.log10(profile / profile[:, :1])
+    result = {}
+    for rank in np.unique(ri[alive]).astype(int):
+        rows = np.sort(ratio_db[alive & (ri == rank)], axis=0)
+        # order statistics, not interpolation: ratios of rank-deficient channels are minus infinity
+        result[int(rank)] = rows[np.round(np.array([0.25, 0.5, 0.75]) * (len(rows) - 1)).astype(int)]
+    return result
 
 
 @dataclass(frozen=True, slots=True)

@@ -389,22 +389,23 @@ def k_curve(
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
         return KCurve(grid, nothing, nothing, float("nan"), NO_INTERVAL, float("nan"), NO_INTERVAL, False)
-    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1)
+    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
     equal = (ranks == ri[:, None]).astype(np.float64)
-    apart = [(ranks == r).astype(np.float64) - (ri == r)[:, None] for r in range(1, MAX_RANK + 1)]
     length = memory(equal.mean(axis=1)).block_length
-    drawn = np.split(
-        bootstrap_means(np.hstack([equal, *apart]), length, replicates=replicates, seed=seed), 1 + MAX_RANK, axis=1
-    )
-    agree, vary = equal.mean(axis=0), 0.5 * sum(np.abs(part.mean(axis=0)) for part in apart)
-    varied = 0.5 * np.sum([np.abs(part) for part in drawn[1:]], axis=0)
-    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-np.asarray(vary)[None], grid)[0]
+    agree = equal.mean(axis=0)
+    drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
+    vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
+    for rank in range(1, MAX_RANK + 1):  # the same seed draws the same blocks each time
+        apart = (ranks == rank).astype(np.float64) - (ri == rank)[:, None]
+        vary += 0.5 * np.abs(apart.mean(axis=0))
+        varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
+    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
     return KCurve(
         grid,
         agree,
-        np.asarray(vary),
+        vary,
         float(best),
-        _central(_middle_of_best(drawn[0], grid), grid),
+        _central(_middle_of_best(drawn, grid), grid),
         float(best_tv),
         _central(_middle_of_best(-varied, grid), grid),
         bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),

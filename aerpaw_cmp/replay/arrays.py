@@ -120,7 +120,9 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     [0.0, 1.0, 0.0]
     """
     yaw, pitch, roll = np.broadcast_arrays(
-        np.asarray(yaw_rad, dtype=np.float64), np.asarray(pitch_rad, dtype=np.float64), np.asarray(roll_rad, dtype=np.float64)
+        np.asarray(yaw_rad, dtype=np.float64),
+        np.asarray(pitch_rad, dtype=np.float64),
+        np.asarray(roll_rad, dtype=np.float64),
     )
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
@@ -155,9 +157,7 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
     [1.0, 0.0, 0.0]
     """
     # nose up + turns the boresight up, TR 38.901 pitch turns it down; right wing down is a positive roll in both
-    return rotation_from_yaw_pitch_roll(
-        np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg)
-    )
+    return rotation_from_yaw_pitch_roll(np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg))
 
 
 # Ports of the measurement comparison in arXiv 2502.10324, section VII-D

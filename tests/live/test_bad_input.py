@@ -70,7 +70,7 @@ def test_no_permission_names_the_group(modem, tmp_path):
     import grp
 
     sim = modem()
-    os.chmod(sim.node, 0o660)
+    sim.node.chmod(0o660)
     os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"

@@ -11,7 +11,6 @@ import zlib
 from pathlib import Path
 
 import pytest
-from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,6 +25,7 @@ from aerpaw_cmp.live.log import (
     read_log,
 )
 from aerpaw_cmp.readers import ReadOptions
+from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 
 
 def header():

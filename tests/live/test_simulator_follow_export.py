@@ -116,7 +116,7 @@ def read_lines(data, options):
     return ReadResult("t", (Stream("telemetry", "t", pd.DataFrame(content)),), len(rows), len(rows), 0)
 
 
-LINES = Reader("t", "", ("telemetry",), "", lambda head: True, read_lines)
+LINES = Reader("t", "", ("telemetry",), "", lambda _head: True, read_lines)
 
 
 def second(i):
@@ -174,7 +174,7 @@ def test_export(modem, tap, tmp_path):
     ranks = [row["rank"] for row in rows if row["query"] == "nr5g_csi"]
     assert ranks
     assert set(ranks) <= {"1", "2", "3", "4"}
-    assert [row["rsrp_dbm"] for row in rows if row["query"] == "servingcell"][0].startswith("-")
+    assert next(row["rsrp_dbm"] for row in rows if row["query"] == "servingcell").startswith("-")
     assert all(row["rsrp_rx3_dbm"] for row in rows if row["query"] == "qrsrp")
     assert all(row["sinr_rx0_db"] for row in rows if row["query"] == "qsinr")
 

@@ -325,6 +325,7 @@ class ModemSimulator:
         self._stop = threading.Event()
         self._unplugged = threading.Event()
         self._answered = 0
+        self._pending: Served | None = None
         self.journal: list[Served] = []
         self.unplugs: list[int] = []
         self.keep_journal = True
@@ -363,6 +364,7 @@ class ModemSimulator:
         """Pull the cable: the port hangs up and its node goes away."""
         with self._lock:
             self._unplugged.set()
+            self._pending = None  # nobody can tell whether it was read
             self.unplugs.append(time.monotonic_ns())
             old, self._master = self._master, -1
             if self.settings.link is not None:
@@ -478,8 +480,10 @@ class ModemSimulator:
             self._stop.wait(0.05)
 
     def _serve(self, command: str) -> None:
-        if self.journal:
-            self.journal[-1].read = True
+        with self._lock:
+            if self._pending is not None:
+                self._pending.read = True
+                self._pending = None
         if self.settings.kind != "modem" or not command:
             return
         faults = self.settings.faults
@@ -496,14 +500,20 @@ class ModemSimulator:
         data, lines = self._spoil(number, reply)
         if not data:
             return
+        served = Served(number, command, lines, time.monotonic_ns())
+        with self._lock:  # before the bytes go out: who reads them may look here at once
+            self._pending = served
+            if self.keep_journal:
+                self.journal.append(served)
         if faults.bytewise_s > 0:
             sent = all(
                 self._write(data[i : i + 1]) and not self._stop.wait(faults.bytewise_s) for i in range(len(data))
             )
         else:
             sent = self._write(data)
-        if sent and self.keep_journal:
-            self.journal.append(Served(number, command, lines, time.monotonic_ns()))
+        with self._lock:
+            if not sent and self.keep_journal:
+                self.journal.pop()
 
     def _spoil(self, number: int, reply: Reply) -> tuple[bytes, tuple[str, ...]]:
         """Bytes of an answer with the faults of its number, and its lines without final result."""

@@ -40,11 +40,11 @@ def soak(simulated_s: float, speed: float, folder: Path) -> dict[str, object]:
         )
         until = time.monotonic() + duration_s - 0.5
         while time.monotonic() < until and process.poll() is None:
-            time.sleep(min(1.0, duration_s / 20))
             memory.append(resident_kib(process.pid))
+            time.sleep(min(1.0, duration_s / 20))
         out, err = process.communicate(timeout=60)
     if process.returncode:
-        raise RuntimeError(err)
+        raise RuntimeError(f"the tap ended with {process.returncode}: {err or out}")
     summary = json.loads(out)
     bad: list[BadLine] = []
     count = sum(1 for _ in read_log(log, bad))

@@ -119,7 +119,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "warnings": list(data.warnings),
     }
     safe: dict[str, Any] = json_safe(result)
-    _merge(safe, json_safe(data.extra_metrics))
+    merge(safe, json_safe(data.extra_metrics))
     return safe
 
 
@@ -144,6 +144,9 @@ def _rss_metrics(panel: RssPanel) -> dict[str, Any]:
         "unit": panel.unit,
         "fitted": list(panel.fitted),
         "baselines": {b.name: {"offset_db": b.offset_db, "rmse_db": b.rmse_db} for b in panel.baselines},
+        "variants": {
+            v.name: {"offset_db": v.offset_db, "rmse_db": v.rmse_db, "fitted": v.fitted} for v in panel.variants
+        },
         **panel.extra,
     }
 
@@ -216,10 +219,11 @@ def _speed_metrics(row: SpeedRow) -> dict[str, Any]:
     return result
 
 
-def _merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+    """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
     for key, value in other.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
+            merge(into[key], value)
         else:
             into[key] = value
 
@@ -347,7 +351,8 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    written = [write_atomic(folder / "metrics.json", json.dumps(metrics(data), indent=2, ensure_ascii=False) + "\n")]
+    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    written = [write_atomic(folder / "metrics.json", numbers)]
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
         # written even without rows, so that the table of an earlier report never stands beside this one
         written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))

@@ -246,8 +246,9 @@ def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float 
     return Trial(None, not reason, reason, blames_library="No module named" not in reason)
 
 
-def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] = try_library) -> list[Trial]:
-    """Try libraries in order until one works; the trials made, the working one last."""
+def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
+    """Try libraries in order (by default with :func:`try_library`) until one works; the trials made, that one last."""
+    attempt = attempt or try_library
     trials: list[Trial] = []
     for library in libraries:
         trials.append(attempt(library))
@@ -403,15 +404,15 @@ def root_prefix() -> list[str] | None:
     return [sudo] if sys.stdin is not None and sys.stdin.isatty() else None
 
 
-def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] = try_library) -> Trial | None:
+def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | None = None) -> Trial | None:
     """Install the distribution's newest LLVM runtime with apt, trying older ones if its trial fails.
 
     Parameters
     ----------
     say : callable
         Told each command before it runs.
-    attempt : callable
-        The trial.
+    attempt : callable, optional
+        The trial; :func:`try_library` by default.
 
     Returns
     -------

@@ -140,6 +140,37 @@ def test_a_fault_of_ours_is_called_one(command_line, capsys, monkeypatch: pytest
     assert "Traceback" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["report"], 2, "aerpaw-cmp report: Missing argument 'flight'; 'aerpaw-cmp report --help' tells the options"),
+        (["report", "f.yaml", "--nope"], 2, "aerpaw-cmp report: No such option: --nope"),
+        (["report", "f.yaml", "--batch", "many"], 2, "aerpaw-cmp report: "),
+        (["report", "f.yaml", "--batch", "3"], 3, ""),
+        (["report", "f.yaml"], 0, ""),
+    ],
+)
+def test_wrong_options_are_one_line_whatever_copy_of_click_typer_uses(
+    arguments: list[str], code: int, said: str, command_line, capsys
+) -> None:
+    import typer
+
+    app = typer.Typer(add_completion=False)
+
+    @app.command("report")
+    def report(flight: str, batch: int = 0) -> None:
+        raise typer.Exit(batch)
+
+    @app.command("formats")
+    def formats() -> None: ...
+
+    command_line(lambda words: app(args=words, prog_name="aerpaw-cmp", standalone_mode=False) or 0)
+    assert program.main(arguments) == code
+    err = capsys.readouterr().err
+    assert err.startswith(said)
+    assert err.count("\n") == bool(said)
+
+
 def test_debug_is_taken_out_of_the_arguments_but_not_after_two_dashes(command_line) -> None:
     seen: list[list[str]] = []
     command_line(lambda arguments: seen.append(arguments) or 0)

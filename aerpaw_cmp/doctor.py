@@ -10,7 +10,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -51,11 +51,15 @@ class Check:
 
 def checks() -> list[Check]:
     """All checks, in the order in which a newcomer meets them. Takes a few seconds: LLVM is tried, not believed."""
+    gpu = gpu_check()
+    compilers = list(llvm_checks())
+    if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
+        compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
         python_check(),
         *package_checks(),
-        *llvm_checks(),
-        gpu_check(),
+        *compilers,
+        gpu,
         cores_check(),
         memory_check(),
         disk_check(Path.cwd()),

@@ -62,6 +62,18 @@ def test_llvm_found_and_tried(monkeypatch: pytest.MonkeyPatch) -> None:
     assert [(check.status, check.remedy) for check in with_trials(monkeypatch)] == [("fail", "the line")]
 
 
+def test_a_gpu_that_works_needs_no_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_trials(monkeypatch)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
+    for works, status in ((True, "warn"), (False, "fail")):
+        trial = llvm.Trial(None, works, "" if works else "the trial ended with 1: no CUDA device")
+        monkeypatch.setattr(llvm, "try_variant", lambda _, trial=trial: trial)
+        found = {check.name: check for check in doctor.checks()}
+        assert found["LLVM"].status == status
+        assert found["GPU"].status == ("ok" if works else "warn")
+        assert ("cuda_ad_mono_polarized" in found["GPU"].found) == works
+
+
 def test_a_child_that_aborts_is_a_row_not_a_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "libLLVM.so.19.1").touch()
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))

@@ -129,7 +129,8 @@ def llvm_checks() -> Iterator[Check]:
         if trial.ok:
             yield Check("LLVM", "ok", f"{name}, tried: two paths traced in a child process, lengths right")
         elif not trial.blames_library:
-            yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", "make setup")
+            remedy = llvm.install_line() if trial.missing else "make setup"
+            yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", remedy)
         else:
             remedy = "none needed, another one works" if works else llvm.install_line()
             yield Check("LLVM", "warn" if works else "fail", f"{name}: {trial.reason}", remedy)

@@ -117,6 +117,30 @@ def test_missing_sionna_is_not_the_librarys_fault() -> None:
     assert not trial.blames_library
 
 
+def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
+    program = (
+        "try: raise ImportError('libatomic.so.1: cannot open shared object file: No such file or directory')\n"
+        "except ImportError: _drjit_ext"
+    )
+    (tmp_path / "libLLVM.so.19").touch()
+    trial = llvm.try_library(llvm.Library(tmp_path / "libLLVM.so.19", (19,)), program=program)
+    assert not trial.blames_library
+    assert trial.missing == "libatomic.so.1"
+    assert trial.reason == "Dr.Jit cannot be loaded, the system has no libatomic.so.1"
+    fake_tool(tmp_path, "apt-get", f'[ "$1" = install ] && touch "{tmp_path}/installed"; exit 0')
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
+    monkeypatch.setattr(llvm, "root_prefix", list)
+    said: list[str] = []
+    again = llvm.install(said.append, lambda library: llvm.Trial(library, (tmp_path / "installed").exists()))
+    assert again is not None
+    assert again.ok
+    assert [line.split()[-1] for line in said] == ["-qq", "libatomic1"]
+
+
 def test_the_child_gets_the_library_and_an_empty_kernel_cache() -> None:
     program = (
         "import json, os; assert os.listdir(os.environ['DRJIT_CACHE_DIR']) == [];"
@@ -207,7 +231,11 @@ def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
     assert trial is not None
     assert trial.ok
     assert trial.library == llvm.Library(libraries / "libLLVM.so.19", (19,))
-    assert [line.split()[-1] for line in said] == ["-qq", "libllvm22", "libllvm19"]
+    assert [line.rpartition(" -")[2].partition(" ")[2] for line in said] == [
+        "",
+        "libllvm22 libatomic1",
+        "libllvm19 libatomic1",
+    ]
 
 
 def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -455,7 +455,7 @@ def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | No
 
     apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
     # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
-    wanted = [(APT_RUNTIME,)] if candidates() else []
+    wanted: list[tuple[str, ...]] = [(APT_RUNTIME,)] if candidates() else []
     wanted += [(package, APT_RUNTIME) for package in _offered_by_apt()]
     last: Trial | None = None
     for packages in wanted:

@@ -59,6 +59,13 @@ class Dem:
             except CRSError:
                 raise UsageError(f"unknown crs '{self.crs}'", expected="such as EPSG:4326 or EPSG:26917") from None
             object.__setattr__(self, "_to_grid", transformer)
+            end = self.west + self.step_x * self.height_m.shape[1], self.south + self.step_y * self.height_m.shape[0]
+            if transformer.target_crs.is_geographic and (max(abs(self.west), abs(end[0])) > 361 or abs(end[1]) > 91):
+                raise InputError(
+                    f"the grid runs to {end[0]:g}, {end[1]:g} degrees",
+                    expected=f"coordinates of {self.crs}",
+                    cause="they are metres or feet: another crs",
+                )
         if np.isnan(self.absolute_m(0.0, 0.0)):
             raise InputError(
                 "the elevation model has no height at the site's origin",
@@ -114,7 +121,9 @@ class Dem:
             while stop < len(order) and count[order[stop]] * (stop + 1 - begin) <= _SAMPLES_AT_ONCE:
                 stop += 1
             some = order[begin:stop]
-            share = (np.arange(1, count[some].max()) / count[some].max())[:, None]
+            # samples of a link do not depend on its batch: shorter links repeat their last one
+            step = np.arange(1, count[some].max())[:, None]
+            share = np.minimum(step, count[some] - 1) / count[some]
             point = source[some] + share[..., None] * (target - source)[some]
             bulge = share * (1 - share) * length[some] ** 2 / (2 * EARTH_RADIUS_M)
             ground = self.ground_m(point[..., 0], point[..., 1])

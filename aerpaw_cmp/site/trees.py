@@ -54,7 +54,7 @@ class Distribution:
 
     def draw(self, count: int, random: np.random.Generator) -> FloatArray:
         """``count`` values; rejected draws are repeated, so the limits do not pile up."""
-        values = np.full(count, self.mean)
+        values = np.full(count, float(self.mean))
         wrong = np.ones(count, dtype=bool) if self.deviation > 0 else np.zeros(count, dtype=bool)
         for _ in range(100):
             if not wrong.any():

@@ -463,6 +463,28 @@ class LagFit:
     curve_lag_s: FloatArray = field(repr=False)
     curve_rmse_db: FloatArray = field(repr=False)
 
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json; NaN becomes None, the curve is left out."""
+        names = {
+            "lag_s": self.lag_s,
+            "lag_ci95_s": list(self.interval_s),
+            "drift_ms_per_min": self.drift_s_per_s * 60e3,
+            "drift_ci95_ms_per_min": [60e3 * v for v in self.drift_interval_s_per_s],
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "window_s": self.window_s,
+            "n": self.n,
+            "rmse_db": self.rmse_db,
+            "rmse_unshifted_db": self.rmse_unshifted_db,
+        }
+
+        def known(value: Any) -> Any:
+            if isinstance(value, list):
+                return [known(item) for item in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        return {name: known(value) for name, value in names.items()}
+
     def apply(self, times: AnyArray) -> AnyArray:
         """Radio times (datetime64 or seconds, the first sample first) on the telemetry clock."""
         array = np.asarray(times)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -273,6 +274,7 @@ def test_a_planted_lag_comes_back_within_a_tenth_of_a_second(lag):
     assert fit.interval_s[0] - 0.02 <= lag <= fit.interval_s[1] + 0.02
     assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
     np.testing.assert_allclose(fit.apply(t), t + lag, atol=0.1)
+    assert json.loads(json.dumps(fit.as_dict(), allow_nan=False))["drift_ci95_ms_per_min"] == [None, None]
 
 
 @pytest.mark.parametrize("drift_ms_per_min", [-5.0, 2.0, 5.0])

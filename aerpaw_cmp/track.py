@@ -759,13 +759,13 @@ def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
 
 
 def _likelihood_ratios(cost: FloatArray, whitened: FloatArray) -> FloatArray:
-    """Log-likelihood ratio (times two) by which every lag is worse than the best one."""
+    """Log-likelihood ratio (times two) by which every lag, and last a constant, is worse than the best lag."""
     sums = _blocks(whitened - whitened.mean())
     long_run = float(np.mean(sums**2)) * len(sums) / len(whitened)
     # correlation that AR(1) left over takes evidence away; anticorrelation does not add any
     size = len(whitened) * min(1.0, float(whitened.var()) / long_run) if long_run > 0 else len(whitened)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = size * np.log(cost / np.nanmin(cost))
+        ratio = size * np.log(cost / np.min(cost[:-1]))
     return np.asarray(np.where(np.isfinite(cost), np.nan_to_num(ratio, nan=0.0, posinf=np.inf), np.inf))
 
 

@@ -325,6 +325,22 @@ def test_a_periodic_flight_has_rivals():
     assert "other lags" in fit.reason
 
 
+def test_a_prediction_that_explains_nothing_is_not_trusted():
+    rng = np.random.default_rng(8)
+    knots = np.cumsum(rng.normal(0, 1, 700))
+    knots -= np.interp(np.arange(700), [0, 699], [knots[0], knots[-1]])
+
+    def level(x):
+        return np.interp(x, np.arange(-200, 500), knots * 3)
+
+    t = np.arange(0, 300, 0.1)
+    weak = 0.3 * level(t + 1.0) + rng.normal(0, 1, len(t))  # ten decibels were predicted where three are seen
+    fit = estimate_lag(t, weak, level)
+    assert fit.verdict == "ambiguous"
+    assert "no more than a constant" in fit.reason
+    assert estimate_lag(t, weak / 0.3, level).verdict == "ok"
+
+
 def test_a_lag_outside_the_window_is_not_passed_off_as_a_result():
     level = two_ray_flight(300)
     t = np.arange(0, 300, 0.1)

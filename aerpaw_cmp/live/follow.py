@@ -1,0 +1,156 @@
+"""The present pose from a telemetry log that is still being written."""
+
+from __future__ import annotations
+
+import os
+from bisect import bisect_left
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import InputError
+from ..readers import Reader, ReadOptions, identify
+from .predict import Predict
+
+TAIL_BYTES = 65_536
+"""Of a log that is long already, only its end is read."""
+
+
+@dataclass(frozen=True, slots=True)
+class TelemetrySample:
+    """Where the UAV was at ``utc_ns``; angles as in the telemetry record."""
+
+    utc_ns: int
+    latitude_deg: float
+    longitude_deg: float
+    altitude_m: float
+    roll_deg: float
+    pitch_deg: float
+    yaw_deg: float
+
+
+_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
+
+
+class TelemetryFollower:
+    """Reads what was appended to a telemetry log since the last look.
+
+    For formats whose lines stand alone (``vehicleOut``). A torn last line waits for its rest; a file that was
+    replaced or cut is read anew.
+
+    Parameters
+    ----------
+    path : Path
+        May not exist yet.
+    options : ReadOptions
+        Zone of the log's clock and so on.
+    reader : Reader, optional
+        None: told by the content.
+    keep_s : float
+        History kept in memory [s].
+    """
+
+    def __init__(
+        self, path: Path, *, options: ReadOptions | None = None, reader: Reader | None = None, keep_s: float = 120.0
+    ) -> None:
+        self.path = path
+        self.rejected = 0
+        self._options = options or ReadOptions()
+        self._reader = reader
+        self._keep_ns = int(keep_s * 1e9)
+        self._samples: deque[TelemetrySample] = deque()
+        self._position = 0
+        self._identity: tuple[int, int] | None = None
+
+    def poll(self) -> int:
+        """Take in what is new.
+
+        Returns
+        -------
+        int
+            Number of new samples.
+
+        Raises
+        ------
+        InputError
+            If the content is no telemetry.
+        """
+        data = self._new_lines()
+        if not data.strip():
+            return 0
+        reader = self._reader = self._reader or identify(data, path=str(self.path))
+        result = reader.read(data, self._options)
+        self.rejected += len(result.rejected)
+        streams = [stream for stream in result.streams if stream.kind == "telemetry"]
+        if not streams:
+            if result.streams:
+                raise InputError(
+                    f"the log holds {result.streams[0].kind} records",
+                    expected="telemetry",
+                    cause="another log was named to be followed",
+                    path=self.path,
+                )
+            return 0
+        frame = streams[0].frame
+        times = frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
+        columns = [frame[name].to_numpy(dtype="float64") for name in _COLUMNS]
+        self._samples.extend(
+            TelemetrySample(int(row[0]), *(float(v) for v in row[1:])) for row in zip(times, *columns, strict=True)
+        )
+        while self._samples[-1].utc_ns - self._samples[0].utc_ns > self._keep_ns:
+            self._samples.popleft()
+        return len(frame)
+
+    def latest(self) -> TelemetrySample | None:
+        """The last sample."""
+        return self._samples[-1] if self._samples else None
+
+    def at(self, utc_ns: int, *, max_age_s: float = 2.0) -> TelemetrySample | None:
+        """The sample nearest in time, None if it is further away than ``max_age_s``."""
+        if not self._samples:
+            return None
+        samples = list(self._samples)
+        index = bisect_left(samples, utc_ns, key=lambda sample: sample.utc_ns)
+        near = min(samples[max(0, index - 1) : index + 1], key=lambda sample: abs(sample.utc_ns - utc_ns))
+        return near if abs(near.utc_ns - utc_ns) <= max_age_s * 1e9 else None
+
+    def _new_lines(self) -> bytes:
+        """Complete lines since the last call."""
+        try:
+            with self.path.open("rb") as file:
+                state = os.fstat(file.fileno())
+                identity = (state.st_dev, state.st_ino)
+                if identity != self._identity or state.st_size < self._position:
+                    self._identity = identity
+                    self._position = max(0, state.st_size - TAIL_BYTES)
+                    if self._position:
+                        file.seek(self._position)
+                        self._position += len(file.readline())
+                file.seek(self._position)
+                data = file.read(16 * 2**20)
+        except FileNotFoundError:
+            return b""
+        except OSError as error:
+            raise InputError(f"cannot be read ({error.strerror})", expected="a telemetry log", path=self.path) from None
+        end = data.rfind(b"\n") + 1
+        self._position += end
+        return data[:end]
+
+
+def predict_along(follower: TelemetryFollower, rank_at: Callable[[TelemetrySample], int | None]) -> Predict:
+    """``predict`` for :func:`~aerpaw_cmp.live.tap.run_tap`: the rank at the pose of the followed log.
+
+    Parameters
+    ----------
+    follower : TelemetryFollower
+    rank_at : callable
+        Rank of the replay at a pose; None out of coverage.
+    """
+
+    def predict(utc_ns: int) -> int | None:
+        follower.poll()
+        sample = follower.at(utc_ns)
+        return None if sample is None else rank_at(sample)
+
+    return predict

@@ -1,0 +1,436 @@
+"""Bytes of an AT port to answers and unsolicited lines: no file, no port, no clock.
+
+:class:`Framer` serves the tap, which knows the command in flight. :class:`TranscriptFramer` serves captured
+text, where commands show only as echoes. Both give the same events however the bytes are cut into pieces, and
+both hold a bounded buffer: a line is kept up to ``max_line_bytes``, an answer up to ``max_lines``; the rest is
+counted, not stored.
+
+A line ends at any run of CR and LF (a modem with echo ends the echo with CR CR LF). Bytes become text as Latin-1,
+so nothing that came in is lost, whatever it was.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+MAX_LINE_BYTES = 65_536
+MAX_LINES = 256
+
+Status = Literal["ok", "error", "cme", "cms", "timeout", "lost", "cut"]
+
+
+@dataclass(frozen=True, slots=True)
+class Line:
+    """One line without its end; ``dropped`` bytes of it were not kept."""
+
+    text: str
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """What came back for one command.
+
+    Parameters
+    ----------
+    command : str or None
+        None where a transcript does not show it.
+    lines : tuple of str
+        Information lines, without echo and final result.
+    status : str
+        ``ok``, ``error``, ``cme``, ``cms``; or how it ended without a final result: ``timeout``, ``lost``
+        (port gone), ``cut`` (the next command or the end of a transcript).
+    code : str or None
+        Text after ``+CME ERROR:`` or ``+CMS ERROR:``.
+    flags : tuple of str
+        ``echo``, ``glued``, ``overlong:<bytes dropped>``, ``too_many_lines:<dropped>``, ``ambiguous``.
+    partial : str
+        Unfinished line at a time-out or loss.
+    """
+
+    command: str | None
+    lines: tuple[str, ...]
+    status: Status
+    code: str | None = None
+    flags: tuple[str, ...] = ()
+    partial: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Unsolicited:
+    """A line that belongs to no command."""
+
+    text: str
+    dropped: int = 0
+
+
+@dataclass(frozen=True, slots=True)
+class Late:
+    """An answer that came after its time-out: kept, matched to nothing."""
+
+    lines: tuple[str, ...]
+    status: Status
+    code: str | None = None
+
+
+Event = Answer | Unsolicited | Late
+
+_UNSOLICITED = re.compile(
+    r"(RDY|APP RDY|RING|POWERED DOWN|NORMAL POWER DOWN|NO CARRIER|SMS DONE|PB DONE)$"
+    r"|\+(QUSIM|QIND|QGPSURC|QLWURC|QIURC|QNETDEVSTATUS|CREG|CGREG|CEREG|C5GREG|CGEV|CMTI|CMT|CDS|CDSI|CBM|CLIP"
+    r"|CRING|CCWA|CUSD|CTZV|CTZE|CTZDST|CPIN|CFUN):"
+)
+_GLUE = re.compile(r"\"|\+[A-Z][A-Z0-9]{1,15}(?: ERROR)?:")
+_GLUED_OK = re.compile(r"[0-9\"\-]OK$")
+_ECHO = re.compile(r"AT(?:[+$&#*%^][A-Z]|[A-Z]?\d?$)", re.IGNORECASE)
+
+
+def final_result(text: str) -> tuple[Status, str | None] | None:
+    """Status and code if the whole line is a final result, else None (3GPP TS 27.007, clause 9; TS 27.005, 3.2.5).
+
+    Examples
+    --------
+    >>> final_result("+CME ERROR: 516")
+    ('cme', '516')
+    >>> final_result('+QNWINFO: "TDD NR5G","TOKYO OK"') is None
+    True
+    """
+    if text == "OK":
+        return "ok", None
+    if text == "ERROR":
+        return "error", None
+    for start, status in (("+CME ERROR:", "cme"), ("+CMS ERROR:", "cms")):
+        if text.startswith(start):
+            return status, text[len(start) :].strip()  # type: ignore[return-value]
+    return None
+
+
+def is_unsolicited(text: str) -> bool:
+    """Whether a line is of a kind that modems send unasked (some are answers too, to their own query)."""
+    return _UNSOLICITED.match(text) is not None
+
+
+def unglue(text: str) -> tuple[str, ...]:
+    """Answers that a modem put on one line, apart; quotes protect what looks like a start.
+
+    Examples
+    --------
+    >>> unglue('+QCAINFO: "SCC",7,-,-+QCAINFO: "SCC",8')
+    ('+QCAINFO: "SCC",7,-,-', '+QCAINFO: "SCC",8')
+    >>> unglue('+QSPN: "X+CREG: 1"')
+    ('+QSPN: "X+CREG: 1"',)
+    """
+    if not text.startswith("+"):
+        return (text,)
+    cuts, quoted = [0], False
+    for match in _GLUE.finditer(text):
+        if match.group() == '"':
+            quoted = not quoted
+        elif not quoted and match.start() > 0:
+            cuts.append(match.start())
+    pieces = [text[a:b] for a, b in zip(cuts, [*cuts[1:], len(text)], strict=True)]
+    last = pieces[-1]
+    if not quoted and _GLUED_OK.search(last):
+        pieces[-1:] = [last[:-2], "OK"]
+    return tuple(piece.strip() for piece in pieces)
+
+
+class LineBuffer:
+    """Bytes to lines with a bounded buffer.
+
+    Parameters
+    ----------
+    max_line_bytes : int
+        Longer lines keep this many bytes; the rest is counted in :attr:`Line.dropped`.
+    """
+
+    def __init__(self, max_line_bytes: int = MAX_LINE_BYTES) -> None:
+        self._max = max_line_bytes
+        self._buffer = bytearray()
+        self._dropped = 0
+
+    def feed(self, data: bytes) -> Iterator[Line]:
+        """Complete lines, blank ones left out."""
+        start = 0
+        for match in _LINE_END.finditer(data):
+            self._keep(data, start, match.start())
+            start = match.end()
+            yield from self.flush()
+        self._keep(data, start, len(data))
+
+    def _keep(self, data: bytes, start: int, stop: int) -> None:
+        room = max(0, self._max - len(self._buffer))
+        self._buffer += data[start : min(stop, start + room)]
+        self._dropped += max(0, stop - start - room)
+
+    def peek(self) -> str:
+        """The unfinished line."""
+        return self._buffer.decode("latin-1")
+
+    def flush(self) -> Iterator[Line]:
+        """The unfinished line as a line, if it is not blank."""
+        text = self._buffer.decode("latin-1").strip(" \t")
+        line = Line(text, self._dropped)
+        self._buffer.clear()
+        self._dropped = 0
+        if text or line.dropped:
+            yield line
+
+    def __len__(self) -> int:
+        return len(self._buffer)
+
+
+_LINE_END = re.compile(rb"[\r\n]+")
+
+
+@dataclass(slots=True)
+class _Open:
+    """The command in flight, and what came for it."""
+
+    command: str
+    prefixes: tuple[str, ...] | None
+    lines: list[str]
+    flags: list[str]
+    echoed: bool = False
+    too_many: int = 0
+
+
+def _normal(text: str) -> str:
+    return text.replace(" ", "")
+
+
+def _matches(text: str, prefixes: tuple[str, ...] | None) -> bool:
+    if prefixes is None:
+        return not is_unsolicited(text)
+    return _normal(text).startswith(prefixes)
+
+
+class Framer:
+    r"""Answers to known commands, one in flight at a time.
+
+    A command that timed out still owes an answer. What comes for it later is a :class:`Late` event, told from the
+    next command's answer by its prefix, or by the echo where the modem echoes.
+
+    Parameters
+    ----------
+    max_line_bytes, max_lines : int
+        Bounds of the buffer.
+
+    Examples
+    --------
+    >>> framer = Framer()
+    >>> framer.send('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
+    >>> framer.feed(b'\r\n+QNWCFG: "nr5g_csi",13,2,8,896\r\n\r\nOK\r\n')[0].lines
+    ('+QNWCFG: "nr5g_csi",13,2,8,896',)
+    """
+
+    def __init__(self, *, max_line_bytes: int = MAX_LINE_BYTES, max_lines: int = MAX_LINES) -> None:
+        self._buffer = LineBuffer(max_line_bytes)
+        self._max_lines = max_lines
+        self._open: _Open | None = None
+        self._owed: list[_Open] = []
+        self._stray: list[str] = []
+        self._echo_seen = False
+
+    @property
+    def buffered(self) -> int:
+        """Bytes and lines held now; bounded whatever comes in."""
+        held = sum(len(x) for x in self._stray)
+        if self._open is not None:
+            held += sum(len(x) for x in self._open.lines)
+        return held + len(self._buffer)
+
+    def send(self, command: str, prefixes: tuple[str, ...] | None) -> None:
+        """A command goes out.
+
+        Parameters
+        ----------
+        command : str
+            As written to the port, without its end.
+        prefixes : tuple of str, or None
+            Starts of its information lines, without blanks; ``()`` if it has none, None if any line may be one.
+
+        Raises
+        ------
+        ValueError
+            If another command is in flight (a bug of the caller).
+        """
+        if self._open is not None:
+            raise ValueError(f"{self._open.command!r} is still in flight")
+        self._open = _Open(command, prefixes, [], [])
+
+    def feed(self, data: bytes) -> list[Event]:
+        """Events that these bytes complete, in their order."""
+        events: list[Event] = []
+        for line in self._buffer.feed(data):
+            pieces = unglue(line.text) if not line.dropped else (line.text,)
+            if len(pieces) > 1 and self._open is not None:
+                self._flag("glued")
+            for piece in pieces:
+                self._line(Line(piece, line.dropped), events)
+        return events
+
+    def give_up(self, status: Literal["timeout", "lost"] = "timeout") -> Answer:
+        """End the command in flight without a final result.
+
+        After ``timeout`` its answer is owed and may come late; after ``lost`` the buffer is emptied.
+        """
+        if self._open is None:
+            raise ValueError("no command in flight")
+        now, self._open = self._open, None
+        answer = Answer(now.command, tuple(now.lines), status, None, tuple(now.flags), self._buffer.peek())
+        self._echo_seen = now.echoed  # a reset modem may have stopped echoing
+        if status == "lost":
+            for _ in self._buffer.flush():
+                pass
+            self._owed.clear()
+        else:
+            self._owed.append(now)
+            del self._owed[:-16]
+        return answer
+
+    def settle(self) -> list[Event]:
+        """Forget what is owed (a probe was answered, so the modem is in step again)."""
+        self._owed.clear()
+        if not self._stray:
+            return []
+        lines, self._stray = tuple(self._stray), []
+        return [Late(lines, "cut")]
+
+    # one line ---------------------------------------------------------------------------------------------
+
+    def _line(self, line: Line, events: list[Event]) -> None:
+        text = line.text
+        final = final_result(text)
+        if final is not None:
+            self._final(final[0], final[1], events)
+            return
+        now = self._open
+        if now is not None and self._is_echo(text, now):
+            return
+        if any(text == owed.command for owed in self._owed):
+            return
+        if now is not None and _matches(text, now.prefixes):
+            if line.dropped:
+                self._flag(f"overlong:{line.dropped}")
+            if len(now.lines) < self._max_lines:
+                now.lines.append(text)
+            else:
+                now.too_many += 1
+        elif any(_matches(text, owed.prefixes) for owed in self._owed) and len(self._stray) < self._max_lines:
+            self._stray.append(text)
+        else:
+            events.append(Unsolicited(text, line.dropped))
+
+    def _is_echo(self, text: str, now: _Open) -> bool:
+        # rubbish from before may stand in front of the echo on the same line
+        upper, command = text.upper(), now.command.upper()
+        if now.echoed or not (upper == command or (len(command) > 6 and upper.endswith(command))):
+            return False
+        now.echoed = self._echo_seen = True
+        self._flag("echo" if len(text) == len(now.command) else "echo_with_rubbish")
+        if self._owed and now.lines:  # they came before our echo, so they are not ours
+            self._stray += now.lines
+            now.lines.clear()
+        return True
+
+    def _final(self, status: Status, code: str | None, events: list[Event]) -> None:
+        now = self._open
+        if now is None or self._is_owed_final(now, status):
+            if now is not None:  # before the echo of our command: not ours
+                self._stray += now.lines
+                now.lines.clear()
+            events.append(Late(tuple(self._stray), status, code))
+            self._stray.clear()
+            del self._owed[:1]
+            return
+        if self._stray:
+            events.append(Late(tuple(self._stray), "cut"))
+            self._stray.clear()
+        if self._owed and not now.lines:
+            self._flag("ambiguous")
+        if now.too_many:
+            self._flag(f"too_many_lines:{now.too_many}")
+        events.append(Answer(now.command, tuple(now.lines), status, code, tuple(now.flags)))
+        self._open = None
+
+    def _is_owed_final(self, now: _Open, status: Status) -> bool:
+        """Whether a final result ends an owed answer (a modem works off its commands in order)."""
+        if not self._owed:
+            return False
+        if self._echo_seen and not now.echoed:
+            return True
+        if now.lines:
+            return False
+        return bool(self._stray) or (status == "ok" and now.prefixes != ())
+
+    def _flag(self, flag: str) -> None:
+        if self._open is not None and flag not in self._open.flags:
+            self._open.flags.append(flag)
+
+
+class TranscriptFramer:
+    r"""Answers in captured text: an echoed command opens one, a final result or the next echo ends it.
+
+    Examples
+    --------
+    >>> framer = TranscriptFramer()
+    >>> [a.command for a in framer.feed(b"ATI\nQuectel\nOK\nAT\nOK\n")]
+    ['ATI', 'AT']
+    """
+
+    def __init__(self, *, max_line_bytes: int = MAX_LINE_BYTES, max_lines: int = MAX_LINES) -> None:
+        self._buffer = LineBuffer(max_line_bytes)
+        self._max_lines = max_lines
+        self._command: str | None = None
+        self._lines: list[str] = []
+        self._flags: list[str] = []
+
+    def feed(self, data: bytes) -> list[Event]:
+        """Events that these bytes complete, in their order."""
+        events: list[Event] = []
+        for line in self._buffer.feed(data):
+            self._line(line, events)
+        return events
+
+    def close(self) -> list[Event]:
+        """Events of what was left unfinished."""
+        events: list[Event] = []
+        for line in self._buffer.flush():
+            self._line(line, events)
+        self._end("cut", None, events)
+        return events
+
+    def _line(self, line: Line, events: list[Event]) -> None:
+        if line.dropped:
+            self._flags.append(f"overlong:{line.dropped}")
+        pieces = unglue(line.text) if not line.dropped else (line.text,)
+        if len(pieces) > 1:
+            self._flags.append("glued")
+        for text in pieces:
+            final = final_result(text)
+            if final is not None:
+                self._end(final[0], final[1], events, even_empty=True)
+            elif _ECHO.match(text):
+                self._end("cut", None, events)
+                self._command = text
+            elif self._command is None and is_unsolicited(text):
+                events.append(Unsolicited(text))
+            elif len(self._lines) < self._max_lines:
+                self._lines.append(text)
+
+    def _end(self, status: Status, code: str | None, events: list[Event], *, even_empty: bool = False) -> None:
+        if even_empty or self._command is not None or self._lines:
+            flags = tuple(dict.fromkeys(self._flags))
+            events.append(Answer(self._command, tuple(self._lines), status, code, flags))
+        self._command = None
+        self._lines, self._flags = [], []
+
+
+def frame_transcript(data: bytes) -> list[Event]:
+    """All events of a captured transcript."""
+    framer = TranscriptFramer()
+    return [*framer.feed(data), *framer.close()]

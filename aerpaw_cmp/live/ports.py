@@ -1,0 +1,312 @@
+"""Serial ports: find the modem's AT port, open it for us alone, say who else holds it.
+
+The port is opened with ``termios`` directly. pyserial empties the input queue when it opens (answers that wait
+there would be lost), insists on a DTR ioctl that some USB paths refuse, and reports an unplugged cable by three
+unrelated exceptions (its issues 401 and 417); here it is always :class:`PortGoneError`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import fcntl
+import grp
+import os
+import pwd
+import select
+import stat
+import termios
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+from ..errors import AerpawCmpError, InputError
+
+QUECTEL_VENDOR = "2c7c"
+AT_INTERFACES = ("02", "03")
+"""Of 2c7c:0800: 00 is DIAG, 01 NMEA, 02 and 03 take AT commands (ModemManager's 77-mm-quectel-port-types.rules)."""
+
+_GONE = {errno.ENOENT, errno.ENXIO, errno.EIO, errno.ENODEV, errno.ENOTCONN, errno.ESHUTDOWN}
+
+
+class PortGoneError(Exception):
+    """The port is not there (any more); it may come back."""
+
+
+@dataclass(frozen=True, slots=True)
+class PortInfo:
+    """A serial port and how it was found.
+
+    Parameters
+    ----------
+    path : Path
+        What to open; a stable name if there is one.
+    device : Path
+        The node it leads to now.
+    how : str
+        ``given``, ``by-id``, ``usb``, ``node``.
+    interface : str or None
+        USB interface number, two hex digits.
+    product : str or None
+        ``vendor:product`` of the USB device.
+    """
+
+    path: Path
+    device: Path
+    how: str
+    interface: str | None = None
+    product: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Holder:
+    """A process that has the port open."""
+
+    pid: int
+    name: str
+
+
+@dataclass(frozen=True, slots=True)
+class Roots:
+    """Where the system keeps devices; tests give their own tree."""
+
+    dev: Path = Path("/dev")
+    sys: Path = Path("/sys")
+
+
+def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
+    """``(vendor:product, interface)`` of a tty by sysfs."""
+    device = roots.sys / "class/tty" / tty / "device"
+    if not device.exists():
+        return None
+    for folder in (device.resolve(), *device.resolve().parents):
+        number = folder / "bInterfaceNumber"
+        if number.exists():
+            usb = folder.parent
+            try:
+                product = (usb / "idVendor").read_text().strip() + ":" + (usb / "idProduct").read_text().strip()
+                return product, number.read_text().strip()
+            except OSError:
+                return None
+    return None
+
+
+def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
+    """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
+    roots = roots or Roots()
+    found: list[PortInfo] = []
+    for interface in AT_INTERFACES:
+        for link in sorted((roots.dev / "serial/by-id").glob(f"*[Qq]uectel*-if{interface}*")):
+            if link.exists():
+                usb = _usb_of(link.resolve().name, roots)
+                found.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
+    known = {port.device for port in found}
+    ttys = sorted((roots.sys / "class/tty").glob("ttyUSB*"), key=lambda p: (len(p.name), p.name))
+    for interface in AT_INTERFACES:
+        for tty in ttys:
+            usb = _usb_of(tty.name, roots)
+            node = roots.dev / tty.name
+            if usb and usb[0].startswith(QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
+                found.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
+    for name in ("mhi_DUN", "smd11"):
+        if (roots.dev / name).exists():
+            found.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
+    return found
+
+
+def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
+    """The port to open now.
+
+    A given ``/dev/ttyUSB*`` that a by-id name leads to is followed by that name, so that it is found again when the
+    modem comes back under another number.
+
+    Raises
+    ------
+    PortGoneError
+        If it is not there.
+    """
+    roots = roots or Roots()
+    if port is None:
+        found = find_candidates(roots)
+        if not found:
+            raise PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
+        return found[0]
+    path = Path(port)
+    if not path.exists():
+        raise PortGoneError(f"{path} is not there")
+    usb = _usb_of(path.resolve().name, roots) or _usb_of(path.name, roots)
+    interface, product = (usb[1], usb[0]) if usb else (None, None)
+    by_id = roots.dev / "serial/by-id"
+    if path.parent == roots.dev and by_id.is_dir():
+        for link in sorted(by_id.iterdir()):
+            if link.resolve() == path.resolve():
+                return PortInfo(link, path.resolve(), "by-id", interface, product)
+    return PortInfo(path, path.resolve(), "given", interface, product)
+
+
+def holders(path: Path) -> list[Holder]:
+    """Other processes that have the port open, by ``/proc`` (as far as we may look)."""
+    try:
+        wanted = path.stat().st_rdev
+    except OSError:
+        return []
+    found: dict[int, Holder] = {}
+    for process in Path("/proc").iterdir():
+        if not process.name.isdigit() or int(process.name) == os.getpid():
+            continue
+        with contextlib.suppress(OSError):
+            for fd in (process / "fd").iterdir():
+                with contextlib.suppress(OSError):
+                    target = fd.stat()
+                    # the master of a pseudo-terminal has another device number, so only openers of the port count
+                    if stat.S_ISCHR(target.st_mode) and target.st_rdev == wanted:
+                        name = (process / "comm").read_text().strip()
+                        found[int(process.name)] = Holder(int(process.name), name)
+    return sorted(found.values(), key=lambda h: h.pid)
+
+
+def _busy(path: Path, others: list[Holder]) -> InputError:
+    who = ", ".join(f"{h.name} (process {h.pid})" for h in others) or "a process that we may not look at"
+    if any(h.name.startswith("ModemManager") for h in others):
+        cause = (
+            "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
+            'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'
+        )
+    elif others:
+        cause = f"another program or another tap reads it; end it with 'kill {others[0].pid}'"
+    else:
+        cause = f"see 'sudo fuser -v {path}'"
+    return InputError(f"the port is held by {who}", expected="a port for the tap alone", cause=cause, path=path)
+
+
+def _denied(path: Path) -> InputError:
+    state = path.stat()
+    try:
+        owner, group = pwd.getpwuid(state.st_uid).pw_name, grp.getgrgid(state.st_gid).gr_name
+    except KeyError:
+        owner, group = str(state.st_uid), str(state.st_gid)
+    return InputError(
+        f"no permission to open the port (owner {owner}, group {group}, mode {stat.S_IMODE(state.st_mode):o})",
+        expected=f"a user of group {group!r}",
+        cause=f"run 'sudo usermod -aG {group} $USER' and log in again",
+        path=path,
+    )
+
+
+class SerialPort:
+    """An open port: raw, non-blocking, locked for us.
+
+    Use :meth:`open`. Every method raises :class:`PortGoneError` when the device is gone.
+    """
+
+    def __init__(self, fd: int, path: Path) -> None:
+        self._fd = fd
+        self.path = path
+
+    @classmethod
+    def open(cls, path: Path, baud: int = termios.B115200) -> SerialPort:
+        """Open a port for us alone.
+
+        Raises
+        ------
+        PortGoneError
+            If it is not there or vanishes meanwhile.
+        InputError
+            If we may not open it, another process holds it, or it is no serial port.
+        """
+        try:
+            others = holders(path)
+            if others:
+                raise _busy(path, others)
+            fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
+        except OSError as error:
+            raise cls._open_error(path, error) from None
+        try:
+            fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.ioctl(fd, termios.TIOCEXCL)
+            make_raw(fd, baud)
+            others = holders(path)  # again: someone may have come between
+            if others:
+                raise _busy(path, others)
+        except (OSError, termios.error, AerpawCmpError) as error:
+            os.close(fd)
+            if isinstance(error, AerpawCmpError):
+                raise
+            raise cls._open_error(path, error) from None
+        return cls(fd, path)
+
+    @staticmethod
+    def _open_error(path: Path, error: OSError | termios.error) -> Exception:
+        number = error.args[0]
+        if number in _GONE:
+            return PortGoneError(f"{path} is gone ({os.strerror(number)})")
+        if number in (errno.EBUSY, errno.EWOULDBLOCK):
+            return _busy(path, holders(path))
+        if number in (errno.EACCES, errno.EPERM):
+            return _denied(path)
+        return InputError(
+            f"cannot be opened as a serial port ({os.strerror(number)})",
+            expected="a serial port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+            cause="the name of something else",
+            path=path,
+        )
+
+    def fileno(self) -> int:
+        """File descriptor, for ``select``."""
+        return self._fd
+
+    def read(self, limit: int = 65_536) -> bytes:
+        """What is there now; ``b""`` if nothing."""
+        try:
+            data = os.read(self._fd, limit)
+        except BlockingIOError:
+            return b""
+        except OSError as error:
+            raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
+        if not data:  # with VMIN=1 an empty read is a hang-up
+            raise PortGoneError(f"{self.path} is gone (hung up)")
+        return data
+
+    def write(self, data: bytes, timeout_s: float = 1.0) -> None:
+        """Write all of it within the time; a port that takes nothing for so long counts as gone."""
+        deadline = time.monotonic() + timeout_s
+        while data:
+            try:
+                data = data[os.write(self._fd, data) :]
+            except BlockingIOError:
+                poller = select.poll()
+                poller.register(self._fd, select.POLLOUT)
+                if not poller.poll(max(0.0, deadline - time.monotonic()) * 1e3):
+                    raise PortGoneError(f"{self.path} takes no bytes") from None
+            except OSError as error:
+                raise PortGoneError(f"{self.path} is gone ({error.strerror})") from None
+
+    def close(self) -> None:
+        """Give the port back; harmless if it is gone."""
+        if self._fd >= 0:
+            with contextlib.suppress(OSError, termios.error):
+                fcntl.ioctl(self._fd, termios.TIOCNXCL)
+            os.close(self._fd)
+            self._fd = -1
+
+
+def make_raw(fd: int, baud: int) -> None:
+    """No echo, no line editing, 8N1, no flow control; what waits in the queue stays."""
+    iflag, oflag, cflag, lflag, _, _, cc = termios.tcgetattr(fd)
+    iflag &= ~(
+        termios.IGNBRK
+        | termios.BRKINT
+        | termios.PARMRK
+        | termios.ISTRIP
+        | termios.INLCR
+        | termios.IGNCR
+        | termios.ICRNL
+        | termios.IXON
+        | termios.IXOFF
+    )
+    oflag &= ~termios.OPOST
+    lflag &= ~(termios.ECHO | termios.ECHONL | termios.ICANON | termios.ISIG | termios.IEXTEN)
+    cflag &= ~(termios.CSIZE | termios.PARENB | termios.CSTOPB | termios.CRTSCTS)
+    cflag |= termios.CS8 | termios.CREAD | termios.CLOCAL
+    cc[termios.VMIN], cc[termios.VTIME] = 1, 0
+    termios.tcsetattr(fd, termios.TCSANOW, [iflag, oflag, cflag, lflag, baud, baud, cc])

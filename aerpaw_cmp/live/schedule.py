@@ -1,0 +1,43 @@
+"""Which query is due when."""
+
+from __future__ import annotations
+
+from collections import Counter
+
+
+class Schedule:
+    """When to ask what. The first name goes first whenever it is due; the others by age.
+
+    Parameters
+    ----------
+    periods_ns : mapping
+        Name to period.
+    """
+
+    def __init__(self, periods_ns: dict[str, int]) -> None:
+        self._periods = periods_ns
+        self._first = next(iter(periods_ns))
+        self._due: dict[str, int] = {}
+        self.missed: Counter[str] = Counter()
+
+    def reset(self, now_ns: int) -> None:
+        """Start anew: all due now."""
+        self._due = dict.fromkeys(self._periods, now_ns)
+
+    def next(self, now_ns: int) -> tuple[str, int]:
+        """Name and due time of the next poll."""
+        if self._due[self._first] <= now_ns:
+            return self._first, self._due[self._first]
+        name = min(self._due, key=lambda n: self._due[n])
+        return name, self._due[name]
+
+    def started(self, name: str, now_ns: int) -> None:
+        """A poll begins; slots that passed meanwhile are missed."""
+        period = self._periods[name]
+        skipped = max(0, (now_ns - self._due[name]) // period)
+        self.missed[name] += skipped
+        self._due[name] += (skipped + 1) * period
+
+    def slots(self, duration_ns: int) -> dict[str, int]:
+        """Polls that a gap of this length cost."""
+        return {name: duration_ns // period for name, period in self._periods.items()}

@@ -1,0 +1,198 @@
+"""What a session of the tap is told, what it shows and how it ended."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from ..errors import UsageError
+from .log import LogSettings
+from .modem import OTHER_QUERIES, RI_QUERY, query_of
+from .ports import Roots
+
+
+@dataclass(frozen=True, slots=True)
+class TapSettings:
+    """What the tap does; the defaults suit a flight.
+
+    Parameters
+    ----------
+    folder : Path
+        Where the log segments go (``-o``); made if missing.
+    port : str, optional
+        The serial port; None: the first AT port of a Quectel modem.
+    ri_hz : float
+        Rate of ``nr5g_csi`` [Hz].
+    other_hz : float
+        Rate of each query in ``queries`` [Hz].
+    queries : tuple of str
+        Names in :data:`~aerpaw_cmp.live.modem.QUERIES`.
+    pause_s : float
+        Rest between an answer and the next command [s].
+    answer_timeout_s : float
+        An answer later than this is a ``late`` record [s].
+    probe_timeout_s : float
+        Each of the two probes of a newly opened port waits so long [s].
+    silent_s : float
+        Without any final result for so long, the port is opened anew [s].
+    enable_csi : bool
+        Switch CSI reporting on, and back on exit (the only command that writes).
+    no_csi_alarm_s : float, optional
+        Alarm when no rank came for so long [s].
+    no_csi_exit : bool
+        End with exit code 1 on that alarm instead of going on.
+    status_s : float
+        Interval of the status calls [s].
+    duration_s : float, optional
+        End by itself after so long [s].
+    wait_for_port_s : float
+        At the start, wait so long for the port to appear [s].
+    reconnect_min_s, reconnect_max_s : float
+        Back-off after a loss [s].
+    replay : Path, optional
+        Tap a simulated modem that plays this transcript or tap log, instead of a port.
+    log : LogSettings
+        Durability and rotation.
+    roots : Roots
+        Where devices are looked for.
+    """
+
+    folder: Path
+    port: str | None = None
+    ri_hz: float = 2.0
+    other_hz: float = 1.0
+    queries: tuple[str, ...] = OTHER_QUERIES
+    pause_s: float = 0.02
+    answer_timeout_s: float = 2.0
+    probe_timeout_s: float = 1.0
+    silent_s: float = 10.0
+    enable_csi: bool = False
+    no_csi_alarm_s: float | None = None
+    no_csi_exit: bool = False
+    status_s: float = 1.0
+    duration_s: float | None = None
+    wait_for_port_s: float = 0.0
+    reconnect_min_s: float = 0.1
+    reconnect_max_s: float = 2.0
+    replay: Path | None = None
+    log: LogSettings = field(default_factory=LogSettings)
+    roots: Roots = field(default_factory=Roots)
+
+    def __post_init__(self) -> None:
+        for name in ("ri_hz", "answer_timeout_s", "probe_timeout_s", "silent_s", "status_s", "reconnect_min_s"):
+            if not 0 < getattr(self, name) < 1e6:
+                raise UsageError(f"{name} is {getattr(self, name)}", expected="a positive number")
+        for name in ("other_hz", "pause_s", "wait_for_port_s"):
+            if not 0 <= getattr(self, name) < 1e6:
+                raise UsageError(f"{name} is {getattr(self, name)}", expected="zero or a positive number")
+        if self.no_csi_alarm_s is not None and not self.no_csi_alarm_s > 0:
+            raise UsageError(f"no_csi_alarm_s is {self.no_csi_alarm_s}", expected="a positive number of seconds")
+        for name in self.queries:
+            query_of(name)
+        if RI_QUERY in self.queries:
+            raise UsageError(f"{RI_QUERY!r} stands in queries", expected="it only at its own rate, ri_hz")
+
+
+@dataclass(frozen=True, slots=True)
+class TapStatus:
+    """What the terminal shows.
+
+    Parameters
+    ----------
+    elapsed_s : float
+    connected : bool
+    rank : int or None
+        Of the last answer; None: no CSI.
+    rsrp_dbm, sinr_db : int or None
+        NR, last known.
+    ri_rate_hz : float
+        Answers with status ok over the last 10 s.
+    gaps, records, bytes_written : int
+    disk_free_bytes : int or None
+    missed : int
+        Poll slots that passed unused while connected.
+    predicted_rank : int or None
+        By the replay at the present pose.
+    predicts : bool
+        Whether predictions are made at all.
+    alarm : bool
+        No CSI for longer than asked: ring the bell.
+    message : str
+        Something to be read once (a loss, a fault, an advice); empty on regular calls.
+    """
+
+    elapsed_s: float
+    connected: bool
+    rank: int | None
+    rsrp_dbm: int | None
+    sinr_db: int | None
+    ri_rate_hz: float
+    gaps: int
+    records: int
+    bytes_written: int
+    disk_free_bytes: int | None
+    missed: int = 0
+    predicted_rank: int | None = None
+    predicts: bool = False
+    alarm: bool = False
+    message: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class TapSummary:
+    """How a session ended.
+
+    Parameters
+    ----------
+    reason : str
+        ``SIGINT``, ``SIGTERM``, ``SIGHUP``, ``duration``, ``no_csi`` or what the caller's stop said.
+    exit_code : int
+        0; 1 if the no-CSI alarm ended it or records were lost to the disk.
+    segments : tuple of Path
+    answers : mapping
+        Query to ``{status: count}``.
+    rates_hz, missed : mapping
+        Query to achieved rate, and to poll slots passed unused while connected.
+    gaps : int
+    gap_s, duration_s : float
+    records, lost_records, redacted : int
+    """
+
+    reason: str
+    exit_code: int
+    segments: tuple[Path, ...]
+    answers: dict[str, dict[str, int]]
+    rates_hz: dict[str, float]
+    missed: dict[str, int]
+    gaps: int
+    gap_s: float
+    duration_s: float
+    records: int
+    lost_records: int
+    redacted: int
+    alarms: int = 0
+
+
+def format_status(status: TapStatus) -> str:
+    """One line for the terminal; nothing in it comes from the modem as text."""
+    if not status.connected:
+        head = "NO PORT"
+    elif status.rank is None:
+        head = "rank -"
+    else:
+        head = f"rank {status.rank}"
+    if status.predicts:
+        predicted = "-" if status.predicted_rank is None else str(status.predicted_rank)
+        head += f" (predicted {predicted})"
+    parts = [
+        head,
+        "RSRP " + ("-" if status.rsrp_dbm is None else f"{status.rsrp_dbm} dBm"),
+        "SINR " + ("-" if status.sinr_db is None else f"{status.sinr_db} dB"),
+        f"{status.ri_rate_hz:.1f} Hz",
+        f"{status.gaps} gap{'' if status.gaps == 1 else 's'}",
+        f"{status.bytes_written / 2**20:.1f} MiB",
+        "disk ?" if status.disk_free_bytes is None else f"disk {status.disk_free_bytes / 2**30:.1f} GiB",
+    ]
+    if status.alarm:
+        parts.append("NO CSI")
+    return "  ".join(parts)

@@ -1,0 +1,56 @@
+"""A request to end that wakes whoever waits."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import signal
+import threading
+from collections.abc import Iterator
+
+
+class Stop:
+    """A request to end, from a signal or another thread; wakes the waiting tap."""
+
+    def __init__(self) -> None:
+        self._read, self._write = os.pipe2(os.O_NONBLOCK | os.O_CLOEXEC)
+        self.reason = ""
+        self.count = 0
+
+    def __call__(self, reason: str = "stop") -> None:
+        """Ask for the end; a second time: at once."""
+        self.reason = self.reason or reason
+        self.count += 1
+        with contextlib.suppress(OSError):
+            os.write(self._write, b"x")
+
+    def fileno(self) -> int:
+        """Readable once asked."""
+        return self._read
+
+    def hush(self) -> None:
+        """Forget the wake-up, not the request."""
+        with contextlib.suppress(OSError):
+            os.read(self._read, 64)
+
+    def close(self) -> None:
+        """Close the pipe."""
+        os.close(self._read)
+        os.close(self._write)
+
+    @contextlib.contextmanager
+    def on_signals(self) -> Iterator[None]:
+        """SIGINT, SIGTERM and SIGHUP ask for the end (in the main thread only)."""
+        if threading.current_thread() is not threading.main_thread():
+            yield
+            return
+        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        before = [(number, signal.signal(number, self._on_signal)) for number in signals]
+        try:
+            yield
+        finally:
+            for number, handler in before:
+                signal.signal(number, handler)
+
+    def _on_signal(self, number: int, _frame: object) -> None:
+        self(signal.Signals(number).name)

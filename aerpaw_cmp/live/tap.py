@@ -1,0 +1,698 @@
+"""The tap: polls the modem, writes every answer down, survives what happens in a field.
+
+One thread, one command in flight. A record is in the kernel's hands before the next command goes out. The port may
+vanish and come back under another number, the disk may fill, the clock may step, signals may come: each leaves its
+own record, and the polling goes on.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import re
+import select
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from .. import __version__
+from ..errors import InputError
+from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
+from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
+from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
+from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
+from .predict import Predict, PredictionWorker
+from .schedule import Schedule
+from .session import TapSettings, TapStatus, TapSummary, format_status
+from .stop import Stop
+
+__all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
+
+CLOCK_STEP_NS = 50_000_000
+"""A jump of the wall clock against the monotonic one beyond this is recorded."""
+RATE_WINDOW_S = 10.0
+NOISE_LINES_PER_S = 50
+
+
+_NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
+
+
+def not_a_modem(path: Path, heard: bytes) -> InputError:
+    """The error for a port that does not answer ``AT``, by what was heard on it."""
+    expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
+    if _NMEA.search(heard):
+        found, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
+    elif heard.count(0x7E) >= 1 and sum(b < 9 or b > 126 for b in heard) > len(heard) // 10:
+        found, cause = "the port speaks HDLC frames: it is a DIAG port", "interface 00 was given, or the numbers moved"
+    elif heard:
+        excerpt = ascii(Redactor().clean(heard[:40].decode("latin-1"), cut=True))
+        found, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
+    else:
+        found, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
+    return InputError(found, expected=expected, cause=cause, path=path)
+
+
+class Tap:
+    """One session of the tap; see :func:`run_tap`."""
+
+    def __init__(
+        self,
+        settings: TapSettings,
+        *,
+        on_status: Callable[[TapStatus], None] | None = None,
+        stop: Stop,
+        predict: Predict | None = None,
+        clock: Clock | None = None,
+    ) -> None:
+        self._settings = settings
+        self._on_status = on_status
+        self._stop = stop
+        self._clock = clock or Clock()
+        self._worker = None if predict is None else PredictionWorker(predict)
+        self._session = uuid.uuid4().hex
+        self._framer = Framer()
+        self._redactor = Redactor()
+        self._log = SegmentLog(settings.folder, self._header, settings.log, self._clock, self._say)
+        periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
+        if settings.other_hz > 0:
+            periods |= {name: int(1e9 / settings.other_hz) for name in settings.queries}
+        self._schedule = Schedule(periods)
+        self._port: SerialPort | None = None
+        self._info: PortInfo | None = None
+        self._heard: bytearray | None = None
+        self._early: list[Record] = []
+        self._log_open = False
+        self._in_step = True
+        self._initialise_again = False
+        self._csi_before: tuple[int, int] | None = None
+        self._csi_changed = False
+        self._answers: dict[str, Counter[str]] = {}
+        self._ri_times: deque[int] = deque()
+        self._last: dict[str, Any] = {"rank": None, "rsrp_dbm": None, "sinr_db": None, "predicted": None}
+        self._gap_open: tuple[int, int, str] | None = None
+        self._gaps, self._gap_ns, self._alarms, self._alarm = 0, 0, 0, False
+        self._noise = Counter[str]()
+        self._said: set[str] = set()
+        now = self._clock.mono_ns()
+        self._start_ns = self._last_final_ns = self._last_csi_ns = self._status_ns = self._rest_until_ns = now
+        self._noise_ns = now
+        self._offset_ns = self._clock.utc_ns() - now
+
+    # the session ------------------------------------------------------------------------------------------
+
+    def run(self) -> TapSummary:
+        """Connect, poll until asked to stop, end cleanly."""
+        try:
+            self._first_connection()
+        except BaseException:
+            if self._worker is not None:
+                self._worker.close()
+            raise
+        try:
+            if not self._stop.count:
+                self._log.open()
+                self._log_open = True
+                for record in self._early:
+                    self._log.append(record)
+                self._early.clear()
+                if clock_synchronised() is False:
+                    self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
+                self._poll_until_stopped()
+        finally:
+            summary = self._finish()
+        return summary
+
+    def _first_connection(self) -> None:
+        deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
+        while not self._stop.count:
+            try:
+                self._connect()
+                return
+            except (PortGoneError, InputError) as error:
+                if self._clock.mono_ns() >= deadline:
+                    if isinstance(error, InputError):
+                        raise
+                    raise InputError(
+                        str(error),
+                        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+                        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
+                    ) from None
+            self._wait(0.2)
+
+    def _poll_until_stopped(self) -> None:
+        while not self._stop.count:
+            try:
+                if self._port is None:
+                    self._reconnect()
+                else:
+                    self._initialise()
+                    self._schedule.reset(self._clock.mono_ns())
+                while not self._stop.count:
+                    self._poll_once()
+            except PortGoneError as gone:
+                self._lost(str(gone))
+
+    def _poll_once(self) -> None:
+        now = self._clock.mono_ns()
+        if now - self._last_final_ns > self._settings.silent_s * 1e9:
+            raise PortGoneError(f"the modem answers nothing for {self._settings.silent_s:g} s")
+        if not self._in_step:
+            self._resynchronise()
+            return
+        if self._initialise_again:
+            self._initialise()
+        name, due = self._schedule.next(now)
+        start = max(due, self._rest_until_ns)
+        if start > now:
+            self._wait((start - now) / 1e9)
+            return
+        self._schedule.started(name, now)
+        decoded = self._exchange(name)[1]
+        if name == RI_QUERY:
+            self._advise(decoded)
+
+    def _finish(self) -> TapSummary:
+        if self._port is not None and self._csi_changed and self._csi_before is not None and self._stop.count < 2:
+            with contextlib.suppress(PortGoneError):
+                self._exchange("csi_ctrl", csi_write(*self._csi_before))
+        self._close_port()
+        if self._gap_open is not None:
+            self._close_gap("the session ended in the gap")
+        if self._worker is not None:
+            self._worker.close()
+            self._log_predictions()
+        self._flush_noise()
+        duration_s = (self._clock.mono_ns() - self._start_ns) / 1e9
+        answers = {name: dict(counts) for name, counts in self._answers.items()}
+        rates = {name: round(counts["ok"] / max(duration_s, 1e-9), 4) for name, counts in self._answers.items()}
+        record = {
+            "kind": "end",
+            "reason": self._stop.reason or "error",
+            "answers": answers,
+            "rates_hz": rates,
+            "missed": dict(self._schedule.missed),
+            "gaps": self._gaps,
+            "gap_s": self._gap_ns / 1e9,
+            "duration_s": duration_s,
+            "redacted": self._redactor.count,
+            **self._now(),
+        }
+        if self._log_open:
+            self._log.append(record)
+            self._log.close()
+        return TapSummary(
+            reason=record["reason"],
+            exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
+            segments=tuple(self._log.paths),
+            answers=answers,
+            rates_hz=rates,
+            missed=record["missed"],
+            gaps=self._gaps,
+            gap_s=record["gap_s"],
+            duration_s=duration_s,
+            records=self._log.records,
+            lost_records=self._log.lost,
+            redacted=self._redactor.count,
+            alarms=self._alarms,
+        )
+
+    # the port ---------------------------------------------------------------------------------------------
+
+    def _connect(self) -> None:
+        """Open and probe the first port that answers."""
+        first_error: PortGoneError | InputError | None = None
+        for info in self._ports_to_try():
+            try:
+                self._open_and_probe(info)
+                return
+            except (PortGoneError, InputError) as error:
+                self._close_port()
+                first_error = first_error or error
+        assert first_error is not None
+        raise first_error
+
+    def _ports_to_try(self) -> list[PortInfo]:
+        """At the start what the user named, or every AT port; after a loss the same interface, wherever it is now."""
+        roots, last = self._settings.roots, self._info
+        if last is None:
+            named = self._settings.port
+            found = find_candidates(roots) if named is None else []
+            return found or [find_port(named, roots)]
+        found = []
+        try:
+            now = find_port(last.path, roots)
+            if now.interface == last.interface:  # else the number now belongs to another port of the modem
+                found.append(now)
+        except PortGoneError:
+            pass
+        if last.product is not None:
+            known = {port.device for port in found}
+            others = [p for p in find_candidates(roots) if p.product == last.product and p.device not in known]
+            found += sorted(others, key=lambda port: port.interface != last.interface)
+        if not found:
+            raise PortGoneError(f"{last.path} is not there")
+        return found
+
+    def _open_and_probe(self, info: PortInfo) -> None:
+        self._framer = Framer()
+        self._port = SerialPort.open(info.path)
+        self._heard = bytearray()
+        try:
+            for _ in range(2):
+                answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
+                if answer.status not in ("timeout", "lost"):
+                    for event in self._framer.settle():
+                        self._other(event)
+                    self._in_step = True
+                    self._info = info
+                    self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
+                    return
+            raise not_a_modem(info.path, bytes(self._heard))
+        finally:
+            self._heard = None
+
+    def _close_port(self) -> None:
+        if self._port is not None:
+            self._port.close()
+            self._port = None
+
+    def _lost(self, reason: str) -> None:
+        self._close_port()
+        if self._gap_open is not None:
+            return
+        self._gaps += 1
+        self._gap_open = (self._clock.utc_ns(), self._clock.mono_ns(), reason)
+        self._record({"kind": "gap", "state": "open", "reason": self._redactor.clean(reason), **self._now()})
+        self._log.sync()
+        self._say(f"lost: {reason}; looking for it")
+
+    def _reconnect(self) -> None:
+        """Look for the port with back-off until it answers, then set the modem up again."""
+        pause, told = self._settings.reconnect_min_s, ""
+        while not self._stop.count:
+            self._wait(pause)
+            pause = min(2 * pause, self._settings.reconnect_max_s)
+            try:
+                self._connect()
+                break
+            except (PortGoneError, InputError) as error:
+                if isinstance(error, InputError) and str(error) != told:
+                    told = str(error)
+                    self._say(told)
+        if self._port is None:
+            return
+        self._initialise()
+        self._close_gap(f"the port is back as {self._info.device if self._info else '?'}")
+        self._schedule.reset(self._clock.mono_ns())
+
+    def _close_gap(self, text: str) -> None:
+        if self._gap_open is None:
+            return
+        (from_utc, from_mono, reason), self._gap_open = self._gap_open, None
+        now = self._now()
+        self._gap_ns += now["mono_ns"] - from_mono
+        record = {
+            "kind": "gap",
+            "state": "closed",
+            "reason": self._redactor.clean(reason),
+            "from_utc_ns": from_utc,
+            "to_utc_ns": now["utc_ns"],
+            "duration_ns": now["mono_ns"] - from_mono,
+            "missed": self._schedule.slots(now["mono_ns"] - from_mono),
+            "port": self._port_record(),
+        }
+        self._record({**record, **now})
+        self._log.sync()
+        self._say(text)
+
+    # the modem --------------------------------------------------------------------------------------------
+
+    def _initialise(self) -> None:
+        """Identity and CSI switch, at the start and after every return of the modem."""
+        self._initialise_again = False
+        self._exchange("identity")
+        self._exchange("firmware")
+        answer, decoded = self._exchange("csi_ctrl")
+        state = (decoded.values.get("lte"), decoded.values.get("nr5g"))
+        if self._settings.enable_csi and state != (1, 1):
+            if None not in state and self._csi_before is None:
+                self._csi_before = (int(state[0] or 0), int(state[1] or 0))
+            answer, _ = self._exchange("csi_ctrl", csi_write(1, 1))
+            self._csi_changed = answer.status == "ok"
+            if not self._csi_changed:
+                self._say("the modem refused to switch CSI reporting on")
+            elif self._csi_before is None:
+                self._say("CSI reporting was switched on; its old state is unknown and will not be restored")
+        elif state[1] == 0:
+            self._say("CSI reporting is off, so no rank will come: run with --enable-csi")
+
+    def _resynchronise(self) -> None:
+        """After a time-out: a bare ``AT``, so that a late answer is not taken for the next one."""
+        answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
+        if answer.status != "timeout":
+            self._in_step = True
+            for event in self._framer.settle():
+                self._other(event)
+
+    def _advise(self, decoded: Decoded) -> None:
+        if decoded.values.get("rank") is not None:
+            self._last_csi_ns = self._clock.mono_ns()
+            self._alarm = False
+
+    # one exchange -----------------------------------------------------------------------------------------
+
+    def _exchange(
+        self, name: str, command: str | None = None, *, timeout_s: float | None = None
+    ) -> tuple[Answer, Decoded]:
+        """Send one command and wait for its end; the record is written before this returns.
+
+        Raises
+        ------
+        PortGoneError
+            After the record of what had come.
+        """
+        assert self._port is not None
+        query = QUERIES[name]
+        text = command or query.text
+        data = encode(text, allow_csi=self._settings.enable_csi)
+        self._drain()
+        sent_utc, sent = self._clock.utc_ns(), self._clock.mono_ns()
+        timeout_ns = int((timeout_s or self._settings.answer_timeout_s) * 1e9)
+        self._framer.send(text, query.prefixes if command is None else ())
+        gone: PortGoneError | None = None
+        try:
+            self._port.write(data)
+            answer, last = self._await(sent + timeout_ns)
+        except PortGoneError as error:
+            gone, answer, last = error, self._framer.give_up("lost"), self._clock.mono_ns()
+        decoded = self._record_exchange(name, command is None, answer, sent_utc, sent, last)
+        if gone is not None:
+            raise gone
+        return answer, decoded
+
+    def _await(self, deadline: int) -> tuple[Answer, int]:
+        """The answer in flight, and the monotonic time of its last byte."""
+        stopped_at = 0
+        while True:
+            now = self._clock.mono_ns()
+            if self._stop.count and not stopped_at:
+                stopped_at = now
+                deadline = min(deadline, now + 1_000_000_000)
+            if now >= deadline or self._stop.count > 1:
+                self._in_step = False
+                return self._framer.give_up(), now
+            if self._select((deadline - now) / 1e9):
+                last = self._clock.mono_ns()
+                answer = self._read()
+                if answer is not None:
+                    self._last_final_ns = last
+                    return answer, last
+            self._tick()
+
+    def _read(self) -> Answer | None:
+        """Take what the port has; everything but the answer in flight is recorded here."""
+        assert self._port is not None
+        data = self._port.read()
+        if self._heard is not None:
+            self._heard += data[: 4096 - len(self._heard)]
+        answer = None
+        for event in self._framer.feed(data):
+            if isinstance(event, Answer):
+                answer = event
+            else:
+                self._other(event)
+        return answer
+
+    def _drain(self) -> None:
+        """What came while nothing was in flight is not part of the next answer."""
+        while self._select(0.0) and self._port is not None:
+            self._read()
+
+    def _record_exchange(self, name: str, query: bool, answer: Answer, sent_utc: int, sent: int, last: int) -> Decoded:
+        lines = [self._redactor.clean(line) for line in answer.lines]
+        decoded = decode(name, lines) if query and lines else Decoded()
+        pause = int(self._settings.pause_s * 1e9)
+        self._rest_until_ns = last + pause
+        record: Record = {
+            "kind": "exchange",
+            "query": name,
+            "command": answer.command,
+            "sent_utc_ns": sent_utc,
+            "sent_mono_ns": sent,
+            "last_utc_ns": sent_utc + last - sent,  # a clock step inside an exchange is its own record
+            "last_mono_ns": last,
+            "status": answer.status,
+            "lines": lines,
+            "decoded": decoded.values,
+            "flags": [*answer.flags, *decoded.flags],
+        }
+        if answer.code is not None:
+            record["code"] = self._redactor.clean(answer.code)
+        if answer.partial:
+            record["partial"] = self._redactor.clean(answer.partial[:1000], cut=True)
+        self._record(record)
+        self._answers.setdefault(name, Counter())[answer.status] += 1
+        self._note(name, answer, decoded, record)
+        return decoded
+
+    def _note(self, name: str, answer: Answer, decoded: Decoded, record: Record) -> None:
+        """Keep what the status line shows, and ask for a prediction."""
+        if name == RI_QUERY:
+            self._last["rank"] = decoded.values.get("rank")
+            if answer.status == "ok":
+                self._ri_times.append(record["last_mono_ns"])
+                if self._worker is not None:
+                    middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
+                    self._worker.ask(middle, record.get("n", -1), decoded.values.get("rank"))
+            elif answer.status in ("error", "cme"):
+                self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
+        elif name == "servingcell":
+            nr = decoded.values.get("nr") or {}
+            self._last["rsrp_dbm"], self._last["sinr_db"] = nr.get("rsrp_dbm"), nr.get("sinr_db")
+
+    def _other(self, event: Event) -> None:
+        """Record a line or an answer that belongs to no command in flight."""
+        if isinstance(event, Late):
+            lines = [self._redactor.clean(line) for line in event.lines]
+            self._record({"kind": "late", "lines": lines, "status": event.status, "code": event.code, **self._now()})
+        elif isinstance(event, Unsolicited):
+            self._noise["lines"] += 1
+            if self._noise["lines"] > NOISE_LINES_PER_S and not is_unsolicited(event.text):
+                self._noise["bytes"] += len(event.text) + event.dropped
+                self._noise["not_kept"] += 1
+                return
+            text = self._redactor.clean(event.text, cut=event.dropped > 0)
+            self._record({"kind": "unsolicited", "lines": [text], "dropped_bytes": event.dropped, **self._now()})
+            if event.text in ("RDY", "APP RDY"):
+                self._initialise_again = True
+
+    # waiting ----------------------------------------------------------------------------------------------
+
+    def _select(self, timeout_s: float) -> bool:
+        """Whether the port has bytes, waiting at most so long; a stop request ends the waiting."""
+        poller = select.poll()
+        if not self._stop.count:
+            poller.register(self._stop.fileno(), select.POLLIN)
+        if self._port is not None:
+            poller.register(self._port.fileno(), select.POLLIN)
+        # wake for the regular duties too
+        ready = poller.poll(max(0.0, min(timeout_s, self._settings.status_s)) * 1e3)
+        return any(fd != self._stop.fileno() for fd, _ in ready)
+
+    def _wait(self, duration_s: float) -> None:
+        """Wait, and take what the modem says unasked meanwhile."""
+        deadline = self._clock.mono_ns() + int(duration_s * 1e9)
+        while not self._stop.count:
+            left = deadline - self._clock.mono_ns()
+            if left <= 0:
+                return
+            if self._select(left / 1e9):
+                self._read()
+            self._tick()
+
+    def _tick(self) -> None:
+        """Regular duties: clock, disk, alarm, status, end of the set time."""
+        now = self._clock.mono_ns()
+        if self._log_open:
+            self._log.tick()
+            self._log_predictions()
+        offset = self._clock.utc_ns() - now
+        if abs(offset - self._offset_ns) > CLOCK_STEP_NS:
+            self._record({"kind": "clock", "step_ns": offset - self._offset_ns, **self._now()})
+        self._offset_ns = offset
+        if now - self._noise_ns > 1_000_000_000:
+            self._noise_ns = now
+            self._flush_noise()
+        if now - self._status_ns >= self._settings.status_s * 1e9:
+            self._status_ns = now
+            self._check_alarm(now)
+            self._show("")
+        if self._settings.duration_s is not None and now - self._start_ns > self._settings.duration_s * 1e9:
+            self._settings_end()
+
+    def _settings_end(self) -> None:
+        if not self._stop.count:
+            self._stop("duration")
+
+    def _check_alarm(self, now: int) -> None:
+        limit = self._settings.no_csi_alarm_s
+        if limit is None or now - self._last_csi_ns <= limit * 1e9:
+            return
+        if not self._alarm:
+            self._alarm = True
+            self._alarms += 1
+            self._record({"kind": "alarm", "reason": f"no CSI for {limit:g} s", **self._now()})
+            self._say(f"no CSI for {limit:g} s: is data flowing, and CSI reporting on (--enable-csi)?")
+        if self._settings.no_csi_exit and not self._stop.count:
+            self._stop("no_csi")
+
+    def _flush_noise(self) -> None:
+        if self._noise["not_kept"]:
+            self._record(
+                {"kind": "noise", "lines": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
+            )
+        self._noise.clear()
+
+    def _log_predictions(self) -> None:
+        if self._worker is None:
+            return
+        for result in self._worker.results():
+            self._last["predicted"] = result.get("predicted")
+            if result.get("error"):
+                self._say_once(f"the prediction failed: {result['error']}")
+            self._record({"kind": "prediction", **result})
+
+    # telling ----------------------------------------------------------------------------------------------
+
+    def _say_once(self, text: str) -> None:
+        if text not in self._said:
+            self._said.add(text)
+            self._say(text)
+
+    def _say(self, text: str) -> None:
+        self._show(self._redactor.clean(text))
+
+    def _show(self, message: str) -> None:
+        if self._on_status is None:
+            return
+        now = self._clock.mono_ns()
+        while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
+            self._ri_times.popleft()
+        window_s = min(RATE_WINDOW_S, max(1.0, (now - self._start_ns) / 1e9))
+        status = TapStatus(
+            elapsed_s=(now - self._start_ns) / 1e9,
+            connected=self._port is not None,
+            rank=self._last["rank"],
+            rsrp_dbm=self._last["rsrp_dbm"],
+            sinr_db=self._last["sinr_db"],
+            ri_rate_hz=len(self._ri_times) / window_s,
+            gaps=self._gaps,
+            records=self._log.records,
+            bytes_written=self._log.bytes_written,
+            disk_free_bytes=self._log.free_bytes(),
+            missed=sum(self._schedule.missed.values()),
+            predicted_rank=self._last["predicted"],
+            predicts=self._worker is not None,
+            alarm=self._alarm,
+            message=message,
+        )
+        try:
+            self._on_status(status)
+        except Exception:
+            self._on_status = None  # a broken terminal must not end the log
+
+    def _record(self, record: Record) -> None:
+        if self._log_open:
+            self._log.append(record)
+        elif len(self._early) < 10_000:
+            self._early.append(record)
+
+    def _now(self) -> Record:
+        return {"utc_ns": self._clock.utc_ns(), "mono_ns": self._clock.mono_ns()}
+
+    def _port_record(self) -> Record:
+        if self._info is None:
+            return {}
+        clean = self._redactor.clean
+        return {
+            "path": clean(str(self._info.path)),
+            "device": str(self._info.device),
+            "how": self._info.how,
+            "interface": self._info.interface,
+            "product": self._info.product,
+        }
+
+    def _header(self) -> Record:
+        settings = self._settings
+        return {
+            "kind": "header",
+            "schema": SCHEMA,
+            "session": self._session,
+            "tool": f"aerpaw-cmp {__version__}",
+            "boot_id": boot_id(),
+            "clock_synchronised": clock_synchronised(),
+            "ri_base": "one",
+            "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._clock.utc_ns() / 1e9)),
+            "port": self._port_record(),
+            "settings": {
+                "ri_hz": settings.ri_hz,
+                "other_hz": settings.other_hz,
+                "queries": list(settings.queries),
+                "pause_s": settings.pause_s,
+                "answer_timeout_s": settings.answer_timeout_s,
+                "sync_interval_s": settings.log.sync_interval_s,
+                "enable_csi": settings.enable_csi,
+            },
+            **self._now(),
+        }
+
+
+def run_tap(
+    settings: TapSettings,
+    *,
+    on_status: Callable[[TapStatus], None] | None = None,
+    stop: Stop | None = None,
+    predict: Predict | None = None,
+    clock: Clock | None = None,
+) -> TapSummary:
+    """Tap the modem until a signal, ``stop`` or the set time ends it.
+
+    Parameters
+    ----------
+    settings : TapSettings
+    on_status : callable, optional
+        Called about once per ``settings.status_s`` and at once when there is a message; :func:`format_status`
+        makes a line of it.
+    stop : Stop, optional
+        Ends the session when called (from any thread).
+    predict : callable, optional
+        ``predict(utc_ns) -> rank or None`` of the replay at the pose of that moment; runs in its own thread.
+    clock : Clock, optional
+
+    Returns
+    -------
+    TapSummary
+        With the exit code.
+
+    Raises
+    ------
+    InputError
+        If the port cannot be used or the folder cannot be written to, at the start.
+    """
+    own = stop is None
+    stop = stop or Stop()
+    try:
+        with contextlib.ExitStack() as stack:
+            stack.enter_context(stop.on_signals())
+            if settings.replay is not None:
+                from .simulator import ModemSimulator, replay_settings
+
+                simulator = stack.enter_context(ModemSimulator(replay_settings(settings.replay)))
+                settings = dataclasses.replace(settings, port=str(simulator.port), replay=None)
+            return Tap(settings, on_status=on_status, stop=stop, predict=predict, clock=clock).run()
+    finally:
+        if own:
+            stop.close()

@@ -1,0 +1,262 @@
+"""The log of ``aerpaw-cmp tap``: JSON lines, each with the CRC-32 of what stands before its checksum.
+
+Specification (schema ``aerpaw-cmp-tap/1``). Each line is one object with ``kind`` and the number ``n`` of the record
+in its session; its last key is ``"crc"``: eight hex digits, CRC-32 of the bytes before ``,"crc":"``. Times are
+integers [ns]: UTC since 1970 and the monotonic clock.
+
+``header``      first line of every segment: ``schema session segment boot_id port settings ri_base``
+``exchange``    ``query command sent_utc_ns last_utc_ns`` (and ``_mono_``) ``status lines decoded flags``
+``late unsolicited noise``  what belonged to no command
+``gap``         ``state`` ``open`` at the loss, ``closed`` at the return, with ``from_utc_ns to_utc_ns missed``
+``clock disk alarm prediction``  what else happened
+``rotate end``  last line of a segment, and of the last one
+
+An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``), or as a
+companion of these. Everything else that is sound counts as comment. The time of a record is the middle between
+command and last byte; ``uncertainty_s`` is half of that span. RSRP and SINR beside a rank are those of the last
+``servingcell`` within 2 s.
+"""
+
+from __future__ import annotations
+
+import json
+import zlib
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.readers import Reader, ReadOptions
+from aerpaw_cmp.records import Attribute, ReadResult, RejectedLine, Stream
+
+SCHEMA = "aerpaw-cmp-tap/1"
+_CRC = b',"crc":"'
+COMPANION_S = 2.0
+"""RSRP and SINR older than this do not stand beside a rank."""
+
+
+def sniff(head: bytes) -> bool:
+    """Whether the first line is a header of the tap."""
+    first = head.lstrip(b"\0\r\n \t").split(b"\n", 1)[0]
+    return first.startswith(b'{"kind":"header"') and b'"schema":"aerpaw-cmp-tap/' in first
+
+
+def decode_line(line: bytes) -> dict[str, Any]:
+    """One record.
+
+    Raises
+    ------
+    ValueError
+        With the reason, if the line is torn or damaged.
+    """
+    body, mark, tail = line.strip().rpartition(_CRC)
+    if not mark or len(tail) != 10 or not tail.endswith(b'"}'):
+        raise ValueError("torn line: it does not end with a checksum")
+    if b"%08x" % zlib.crc32(body) != tail[:8]:
+        raise ValueError("damaged line: its checksum does not fit")
+    try:
+        record = json.loads(body + b"}")
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(record, dict) or not isinstance(record.get("kind"), str):
+        raise ValueError("not a record of the tap")
+    if record["kind"] == "exchange":
+        for key in ("sent_utc_ns", "last_utc_ns"):
+            if type(record.get(key)) is not int or not 0 <= record[key] < 2**62:
+                raise ValueError(f"exchange without {key}")
+    return record
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Records of one segment.
+
+    Raises
+    ------
+    InputError
+        If the schema is a later one than we know.
+    """
+    records, rejected, blank = _records(data)
+    lines = len(records) + len(rejected) + blank
+    exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
+    header = next((record for _, record in records if record["kind"] == "header"), {})
+    if header and header.get("schema") != SCHEMA:
+        raise InputError(
+            f"the log has schema {header.get('schema')!r}", expected=SCHEMA, cause="it was written by another version"
+        )
+    common: dict[str, Attribute] = {"clock": "utc"}
+    for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
+        if value is not None:
+            common[name] = value
+    rsrp = _rsrp_frame(exchanges)
+    streams = []
+    for query, name in (("nr5g_csi", "nr5g"), ("lte_csi", "lte")):
+        frame = _rank_frame([item for item in exchanges if item[1].get("query") == query])
+        if len(frame) and (name == "nr5g" or frame["rank"].notna().any()):
+            if name == "nr5g":
+                frame = _beside(frame, rsrp)
+            ri_base = str(header.get("ri_base", "one"))
+            streams.append(
+                Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
+            )
+    if len(rsrp):
+        streams.append(
+            Stream("rss", "nr5g_rsrp", rsrp, {**common, "unit": "dBm", "channel": options.channel or "nr5g_rsrp"})
+        )
+    comments = len(records) - len(exchanges)
+    return ReadResult(
+        "tap_jsonl",
+        tuple(streams),
+        lines,
+        len(exchanges),
+        blank + comments,
+        tuple(rejected),
+        _warnings(records, rejected),
+    )
+
+
+def _records(data: bytes) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
+    """Sound records with their line numbers, rejected lines, number of blank lines."""
+    lines = data.split(b"\n")
+    unterminated = lines[-1] != b""
+    if not unterminated:
+        lines.pop()
+    records: list[tuple[int, dict[str, Any]]] = []
+    rejected: list[RejectedLine] = []
+    blank = 0
+    for number, line in enumerate(lines, 1):
+        if not line.strip():
+            blank += 1
+            continue
+        try:
+            records.append((number, decode_line(line)))
+        except ValueError as error:
+            reason = f"torn tail: {error}" if unterminated and number == len(lines) else str(error)
+            rejected.append(RejectedLine(number, reason, line[:2000].decode("utf-8", errors="replace")[:500]))
+    return records, rejected, blank
+
+
+def _time(record: dict[str, Any]) -> tuple[int, float]:
+    """Middle of the exchange [ns] and half its span [s]."""
+    sent, last = int(record["sent_utc_ns"]), int(record["last_utc_ns"])
+    return (sent + last) // 2, (last - sent) / 2e9
+
+
+def _mapping(value: Any) -> dict[str, Any]:
+    return value if isinstance(value, dict) else {}
+
+
+def _int(value: Any) -> int:
+    return value if type(value) is int and abs(value) < 2**62 else 0
+
+
+def _flags(record: dict[str, Any]) -> list[str]:
+    flags = record.get("flags")
+    return [str(flag) for flag in flags] if isinstance(flags, list) else []
+
+
+def _frame(columns: dict[str, list[Any]]) -> pd.DataFrame:
+    content: dict[str, Any] = {
+        "time": np.array(columns.pop("time", []), dtype="int64").astype("datetime64[ns]"),
+        "line": np.array(columns.pop("line", []), dtype=np.int64),
+        "flag": pd.Series(columns.pop("flag", []), dtype=object),
+    }
+    for name, values in columns.items():
+        content[name] = np.array(
+            [v if type(v) in (int, float) and abs(v) < 1e9 else np.nan for v in values], dtype=np.float64
+        )
+    frame: pd.DataFrame = pd.DataFrame(content)
+    return frame
+
+
+def _rank_frame(items: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
+    """Rank answers; a failed exchange is a row without rank, flagged with its status."""
+    columns: dict[str, list[Any]] = defaultdict(list)
+    for number, record in items:
+        values = _mapping(record.get("decoded"))
+        flags = _flags(record)
+        if record.get("status") != "ok":
+            flags.append(f"status:{record.get('status')}")
+        time_ns, uncertainty_s = _time(record)
+        columns["time"].append(time_ns)
+        columns["line"].append(number)
+        columns["flag"].append(";".join(flags))
+        for name in ("rank", "ri_raw", "mcs", "cqi", "pmi"):
+            columns[name].append(values.get(name))
+        columns["uncertainty_s"].append(uncertainty_s)
+    return _frame(columns)
+
+
+def _rsrp_frame(exchanges: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
+    """RSRP and SINR of the NR serving cell."""
+    columns: dict[str, list[Any]] = defaultdict(list)
+    for number, record in exchanges:
+        if record.get("query") != "servingcell":
+            continue
+        values = _mapping(_mapping(record.get("decoded")).get("nr"))
+        if not values:
+            continue
+        time_ns, uncertainty_s = _time(record)
+        columns["time"].append(time_ns)
+        columns["line"].append(number)
+        columns["flag"].append(";".join(_flags(record)))
+        columns["rss_db"].append(values.get("rsrp_dbm"))
+        columns["sinr_db"].append(values.get("sinr_db"))
+        columns["uncertainty_s"].append(uncertainty_s)
+    return _frame(columns)
+
+
+def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame) -> pd.DataFrame:
+    """RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
+    rsrp_dbm, sinr_db = np.full(len(rank), np.nan), np.full(len(rank), np.nan)
+    if len(rsrp):
+        times = rsrp["time"].to_numpy()
+        order = np.argsort(times, kind="stable")
+        at = np.searchsorted(times[order], rank["time"].to_numpy(), side="right") - 1
+        last = order[np.maximum(at, 0)]
+        age_s = (rank["time"].to_numpy() - times[last]) / np.timedelta64(1, "s")
+        fresh = (at >= 0) & (age_s <= COMPANION_S)
+        rsrp_dbm = np.where(fresh, rsrp["rss_db"].to_numpy()[last], np.nan)
+        sinr_db = np.where(fresh, rsrp["sinr_db"].to_numpy()[last], np.nan)
+    rank["rsrp_dbm"], rank["sinr_db"] = rsrp_dbm, sinr_db
+    return rank
+
+
+def _warnings(records: list[tuple[int, dict[str, Any]]], rejected: list[RejectedLine]) -> tuple[str, ...]:
+    """Gaps, clock steps, lost and missing records, torn tail, missing end."""
+    found: list[str] = []
+    open_gap = None
+    for _, record in records:
+        kind = record["kind"]
+        if kind == "gap" and record.get("state") == "closed":
+            seconds = _int(record.get("duration_ns")) / 1e9
+            found.append(f"gap of {seconds:.1f} s: {record.get('reason', '')}")
+            open_gap = None
+        elif kind == "gap":
+            open_gap = record
+        elif kind == "clock":
+            found.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
+        elif kind == "disk":
+            found.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
+    if open_gap is not None:
+        found.append(f"the log ends inside a gap: {open_gap.get('reason', '')}")
+    numbers = sorted({int(record["n"]) for _, record in records if isinstance(record.get("n"), int)})
+    missing = numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
+    if missing:
+        found.append(f"{missing} record numbers are missing in this segment")
+    if rejected and rejected[-1].reason.startswith("torn tail"):
+        found.append("the last line is torn (power loss or kill while writing)")
+    if not any(record["kind"] in ("end", "rotate") for _, record in records):
+        found.append("no end record: the session was cut")
+    return tuple(found)
+
+
+READER = Reader(
+    name="tap_jsonl",
+    title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
+    kinds=("rank", "rss"),
+    sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...',
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,393 @@
+"""Each bad input of the tap: one message, the right exit code, within the promised time."""
+
+from __future__ import annotations
+
+import os
+import pty
+import subprocess
+import sys
+import time
+import tty
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.live.log import LogSettings
+from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
+from aerpaw_cmp.live.session import TapSettings
+from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
+from aerpaw_cmp.live.tap import run_tap
+
+
+@pytest.mark.parametrize(
+    ("kind", "message"),
+    [
+        ("gps", "it is a GPS port"),
+        ("diag", "it is a DIAG port"),
+        ("silent", "nothing answers on the port"),
+        ("rubbish", "no answer|DIAG"),
+    ],
+)
+def test_wrong_device_within_two_probes(modem, tmp_path, kind, message):
+    sim = modem(kind=kind)
+    settings = TapSettings(tmp_path / "log", str(sim.port))
+    assert 2 * settings.probe_timeout_s < 3.0  # the default recognises it within 3 s
+    settings = TapSettings(tmp_path / "log", str(sim.port), probe_timeout_s=0.3)
+    with pytest.raises(InputError, match=message) as caught:
+        run_tap(settings)
+    assert "expected an answer to 'AT'" in str(caught.value)
+    assert caught.value.exit_code == 3
+    assert not (tmp_path / "log").exists()
+
+
+def test_no_port(tmp_path):
+    with pytest.raises(InputError, match="is not there; expected the modem's AT port"):
+        run_tap(TapSettings(tmp_path / "log", str(tmp_path / "ttyUSB9")))
+    roots = Roots(tmp_path, tmp_path)
+    with pytest.raises(InputError, match="no AT port of a Quectel modem"):
+        run_tap(TapSettings(tmp_path / "log", roots=roots))
+
+
+def test_a_port_that_comes_later(tap, tmp_path):
+    link = tmp_path / "modem"
+    session = tap(link, wait_for_port_s=10.0)
+    time.sleep(0.3)
+    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.0))) as sim:
+        session.wait(lambda: len(sim.journal) > 5)
+        assert session.end().exit_code == 0
+
+
+@pytest.mark.parametrize("content", ["a file", "a folder"])
+def test_not_a_serial_port(tmp_path, content):
+    path = tmp_path / "port"
+    path.write_text("x") if content == "a file" else path.mkdir()
+    with pytest.raises(InputError, match="cannot be opened as a serial port"):
+        run_tap(TapSettings(tmp_path / "log", str(path)))
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
+def test_no_permission_names_the_group(modem, tmp_path):
+    import grp
+
+    sim = modem()
+    sim.node.chmod(0o660)
+    os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
+        "from aerpaw_cmp.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
+        "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    done = subprocess.run(
+        [sys.executable, "-c", code, sim.node], env=environment, text=True, capture_output=True, check=False
+    )
+    assert done.returncode == 3, done.stderr
+    assert "no permission to open the port (owner root, group dialout, mode 660)" in done.stdout
+    assert "usermod -aG dialout" in done.stdout
+
+
+def test_the_port_vanishes_during_open(monkeypatch):
+    # between open() and the terminal settings: the master is closed there, as an unplugged cable does
+    master, slave = pty.openpty()
+    path = Path(os.ttyname(slave))
+    os.close(slave)
+    from aerpaw_cmp.live import ports
+
+    real = ports.make_raw
+    monkeypatch.setattr(ports, "make_raw", lambda fd, baud: (os.close(master), real(fd, baud)))
+    with pytest.raises(PortGoneError, match="is gone"):
+        SerialPort.open(path)
+    with pytest.raises(PortGoneError):
+        SerialPort.open(path)
+
+
+def test_reading_and_writing_a_gone_port():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    path = Path(os.ttyname(slave))
+    os.close(slave)
+    port = SerialPort.open(path)
+    assert port.read() == b""
+    os.write(master, b"abc")
+    time.sleep(0.05)
+    assert port.read() == b"abc"
+    os.close(master)
+    with pytest.raises(PortGoneError):
+        port.read()
+    with pytest.raises(PortGoneError):
+        port.write(b"AT\r")
+    port.close()
+    port.close()
+
+
+def test_a_port_that_takes_no_bytes():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    port = SerialPort.open(Path(os.ttyname(slave)))
+    with pytest.raises(PortGoneError, match="takes no bytes"):
+        port.write(b"x" * 10_000_000, timeout_s=0.1)
+    port.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_what_waits_in_the_queue_at_open_is_not_lost():
+    master, slave = pty.openpty()
+    tty.setraw(slave)
+    os.write(master, b"\r\nRDY\r\n")
+    port = SerialPort.open(Path(os.ttyname(slave)))
+    time.sleep(0.05)
+    assert port.read() == b"\r\nRDY\r\n"
+    port.close()
+    os.close(master)
+    os.close(slave)
+
+
+def test_two_taps_on_one_port(modem, child, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.005))
+    first = child(sim.port)
+    until = time.monotonic() + 15
+    while len(sim.journal) < 5:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+    second = child(sim.port, folder=str(tmp_path / "second"))
+    _, err = second.communicate(timeout=20)
+    assert second.returncode == 3
+    assert f"process {first.pid}" in err
+    assert "Traceback" not in err
+    assert first.poll() is None
+    count = len(sim.journal)
+    until = time.monotonic() + 10
+    while len(sim.journal) < count + 5:
+        assert time.monotonic() < until
+        time.sleep(0.02)
+
+
+def test_two_taps_in_one_process(modem, tap, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) > 5)
+    with pytest.raises(InputError, match="the port is held"):
+        run_tap(TapSettings(tmp_path / "second", str(sim.port)))
+    session.end()
+
+
+def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_path):
+    sim = modem()
+    # a copy of 'sleep' under its name: holders are shown by the kernel's name of the process
+    program = tmp_path / "ModemManager"
+    program.write_bytes(Path(os.path.realpath("/bin/sleep")).read_bytes())
+    program.chmod(0o755)
+    with sim.node.open("rb", buffering=0) as node:
+        process = subprocess.Popen([program, "30"], stdin=node)
+    try:
+        until = time.monotonic() + 10
+        while not any(h.pid == process.pid and h.name == "ModemManager" for h in holders(sim.node)):
+            assert time.monotonic() < until
+            time.sleep(0.02)
+        with pytest.raises(InputError, match="systemctl stop ModemManager") as caught:
+            run_tap(TapSettings(tmp_path / "log", str(sim.port)))
+        assert "ID_MM_DEVICE_IGNORE" in str(caught.value)
+        assert f"process {process.pid}" in str(caught.value)
+    finally:
+        process.kill()
+        process.wait()
+
+
+def test_ten_megabyte_line(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0, huge_line_every=20))
+    session = tap(sim.port, answer_timeout_s=5.0)
+    session.wait(lambda: len(sim.journal) >= 25, timeout=30)
+    session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    huge = [r for r in records if r["kind"] == "unsolicited" and r["dropped_bytes"]]
+    assert [r["dropped_bytes"] + len(r["lines"][0]) for r in huge] == [10_000_000] * len(huge)
+    assert huge
+    assert len(huge[0]["lines"][0]) <= 65_536
+    assert tools.all_kept(sim, tmp_path / "log")
+
+
+def test_rubbish_without_end_is_counted_not_kept(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) >= 5)
+    sim._write(b"junk\r\n" * 5000)
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 5)
+    session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    kept = sum(r["kind"] == "unsolicited" and r["lines"] == ["junk"] for r in records)
+    counted = sum(r["lines"] for r in records if r["kind"] == "noise")
+    assert kept <= 200
+    assert kept + counted == 5000
+
+
+def test_a_modem_of_another_make(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0, error_every=1))
+    session = tap(sim.port)
+    session.wait(lambda: any("is it an RM5xxQ?" in text for text in session.said))
+    session.end()
+    assert all(r["code"] == "14" for r in tools.exchanges(tmp_path / "log", "nr5g_csi"))
+
+
+def test_an_output_folder_that_is_a_file(modem, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    (tmp_path / "log").write_text("x")
+    with pytest.raises(InputError, match="cannot write a log here"):
+        run_tap(TapSettings(tmp_path / "log", str(sim.port)))
+    # and the port is free again
+    assert run_tap(TapSettings(tmp_path / "log2", str(sim.port), duration_s=0.2, status_s=0.1)).exit_code == 0
+
+
+def test_a_folder_with_an_earlier_log(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    (tmp_path / "log").mkdir()
+    old = tmp_path / "log" / "tap_20200101T000000Z_1_0001.jsonl"
+    old.write_bytes(b"old\n")
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) > 5)
+    session.end()
+    assert old.read_bytes() == b"old\n"
+    assert len(list((tmp_path / "log").iterdir())) == 2
+
+
+# finding the port, in a made-up /dev and /sys ---------------------------------------------------------------
+
+
+def usb_tree(root, numbers):
+    """Four ttys of one modem, like the kernel shows them."""
+    for interface, number in enumerate(numbers):
+        device = root / f"sys/devices/usb1/1-1/1-1:1.{interface}"
+        (device / f"ttyUSB{number}").mkdir(parents=True)
+        (device / "bInterfaceNumber").write_text(f"0{interface}\n")
+        entry = root / f"sys/class/tty/ttyUSB{number}"
+        entry.mkdir(parents=True)
+        (entry / "device").symlink_to(device / f"ttyUSB{number}")
+        (root / "dev").mkdir(exist_ok=True)
+        (root / f"dev/ttyUSB{number}").touch()
+    (root / "sys/devices/usb1/1-1/idVendor").write_text("2c7c\n")
+    (root / "sys/devices/usb1/1-1/idProduct").write_text("0800\n")
+    return Roots(root / "dev", root / "sys")
+
+
+def test_the_at_port_is_found_by_interface_not_by_number(tmp_path):
+    roots = usb_tree(tmp_path, [7, 3, 5, 11])
+    assert [(p.path.name, p.how, p.interface, p.product) for p in find_candidates(roots)] == [
+        ("ttyUSB5", "usb", "02", "2c7c:0800"),
+        ("ttyUSB11", "usb", "03", "2c7c:0800"),
+    ]
+
+
+def test_the_by_id_name_comes_first_and_is_followed(tmp_path):
+    roots = usb_tree(tmp_path, [0, 1, 2, 3])
+    by_id = tmp_path / "dev/serial/by-id"
+    by_id.mkdir(parents=True)
+    for interface in range(4):
+        (by_id / f"usb-Quectel_RM502Q-AE-if0{interface}-port0").symlink_to(tmp_path / f"dev/ttyUSB{interface}")
+    first = find_port(None, roots)
+    assert (first.path.name, first.device.name, first.how) == ("usb-Quectel_RM502Q-AE-if02-port0", "ttyUSB2", "by-id")
+    given = find_port(tmp_path / "dev/ttyUSB2", roots)
+    assert given.path == first.path
+
+
+def test_the_second_at_port_is_taken_when_the_first_is_held(modem, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0), link=tmp_path / "dev/serial/by-id/usb-Quectel_X-if03-port0")
+    other = modem(link=tmp_path / "dev/serial/by-id/usb-Quectel_X-if02-port0")
+    with other.node.open("rb", buffering=0) as node:
+        process = subprocess.Popen(["sleep", "30"], stdin=node)
+    try:
+        settings = TapSettings(
+            tmp_path / "log", roots=Roots(tmp_path / "dev", tmp_path / "sys"), duration_s=0.5, status_s=0.1, ri_hz=20
+        )
+        summary = run_tap(settings)
+        assert summary.answers["nr5g_csi"]["ok"] >= 3
+        assert len(sim.journal) > 3
+    finally:
+        process.kill()
+        process.wait()
+
+
+def rewire(roots, wires):
+    """Numbers of a modem's ttys, each leading to a pseudo-terminal: ``{number: (interface, node)}``."""
+    import shutil
+
+    for folder in (roots.dev, roots.sys):
+        shutil.rmtree(folder, ignore_errors=True)
+    roots.dev.mkdir(parents=True)
+    for number, (interface, node) in wires.items():
+        device = roots.sys / f"devices/usb1/1-1/1-1:1.{interface}"
+        (device / f"ttyUSB{number}").mkdir(parents=True)
+        (device / "bInterfaceNumber").write_text(f"{interface:02d}\n")
+        entry = roots.sys / f"class/tty/ttyUSB{number}"
+        entry.mkdir(parents=True)
+        (entry / "device").symlink_to(device / f"ttyUSB{number}")
+        (roots.dev / f"ttyUSB{number}").symlink_to(node)
+    (roots.sys / "devices/usb1/1-1/idVendor").write_text("2c7c\n")
+    (roots.sys / "devices/usb1/1-1/idProduct").write_text("0800\n")
+
+
+def test_numbers_that_swap_are_followed_by_the_interface(modem, tap, tools, tmp_path):
+    # without by-id names: ttyUSB2 was the AT port and comes back as the GPS port, the AT port as ttyUSB5
+    roots = Roots(tmp_path / "dev", tmp_path / "sys")
+    sim = modem(link=None, faults=Faults(latency_s=0.0))
+    gps = modem(link=None, kind="gps")
+    rewire(roots, {1: (1, gps.node), 2: (2, sim.node)})
+    session = tap(roots.dev / "ttyUSB2", roots=roots, reconnect_min_s=0.02, reconnect_max_s=0.05)
+    session.wait(lambda: len(sim.journal) > 20)
+    sim.unplug()
+    gps.unplug()
+    gps.replug()
+    sim.replug()
+    rewire(roots, {2: (1, gps.node), 5: (2, sim.node)})
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 20)
+    session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    (closed,) = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
+    assert closed["port"]["path"] == str(roots.dev / "ttyUSB5")
+    assert not [h for r in records for h in r.get("lines", []) if isinstance(h, str) and h.startswith("$GP")]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A real file system of 256 KiB; skips where mounting is not allowed."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", folder], capture_output=True, check=False
+    )
+    if done.returncode:
+        pytest.skip("mounting is not allowed here; RLIMIT_FSIZE and /dev/full stand in for it in the other tests")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+def test_a_real_disk_that_fills_up_and_has_room_again(modem, tap, tools, small_disk):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port, folder=small_disk / "log", log=LogSettings(retry_s=0.05))
+    session.wait(lambda: len(sim.journal) > 10)
+    filler = small_disk / "filler"
+    with filler.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(b"x" * 512)
+        except OSError:
+            pass
+    session.wait(lambda: any("the disk is full" in text for text in session.said))
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 40)  # it goes on polling
+    filler.unlink()
+    session.wait(lambda: any("takes records again; 0 were lost" in text for text in session.said))
+    assert session.end().lost_records == 0
+    records, bad = tools.records_of(small_disk / "log")
+    assert not bad
+    assert tools.all_kept(sim, small_disk / "log")
+    assert sum(r["kind"] == "disk" for r in records) == 1
+
+
+def test_a_read_only_disk(modem, small_disk, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with pytest.raises(InputError, match=r"Read-only file system.*the disk is mounted read-only"):
+        run_tap(TapSettings(small_disk / "log", str(sim.port)))

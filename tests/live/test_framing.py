@@ -1,0 +1,223 @@
+"""Framing: the same events however the bytes are cut, a bounded buffer, nothing lost."""
+
+from __future__ import annotations
+
+import os
+from itertools import pairwise
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.live.framing import (
+    Answer,
+    Framer,
+    Late,
+    TranscriptFramer,
+    Unsolicited,
+    frame_transcript,
+    unglue,
+)
+
+CSI = ('AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',))
+QENG = ('AT+QENG="servingcell"', ("+QENG:",))
+
+# rebuilt in the layouts of real transcripts, with invented values
+TRANSCRIPTS = {
+    "crlf with echo": b'AT+QNWCFG="nr5g_csi"\r\r\n+QNWCFG: "nr5g_csi",11,2,9,7\r\n\r\nOK\r\n',
+    "lf only": b'AT+QNWCFG="lte_csi"\n+QNWCFG: "lte_csi",5,1,6,3\n\nAT+QNWCFG="nr5g_csi"\n+QNWCFG: "nr5g_csi",3,1,4,5 \n',
+    "cr only": b"AT+QRSRP\r+QRSRP: -90,-91,-92,-93,NR5G\rOK\r",
+    "errors": b"AT+CFUN=1\r\n+CME ERROR: 0\r\nAT+X\r\nERROR\r\nAT+CMGS=1\r\n+CMS ERROR: 301\r\n",
+    "chained": b'at+qnwinfo;+qeng="servingcell"\n+QNWINFO: "TDD NR5G","99999","NR5G BAND 78",633984\n\n+QENG: "servingcell","SEARCH"\n',
+    "glued": b'AT+QCAINFO\n+QCAINFO: "PCC",633984,12,"NR5G BAND 78",9\n+QCAINFO: "SCC",1300,2,"NR5G BAND 3",1,9,0,-,-+QCAINFO: "SCC",520000,11,"NR5G BAND 41",1,8,0,-,-\nOK\n',
+    "unsolicited": b'\r\nRDY\r\n\r\n+QIND: "csq",20,99\r\nATI\r\nQuectel\r\nRM502Q-AE\r\nRevision: X\r\n\r\nOK\r\n',
+    "binary": bytes(range(256)) + b"\r\nAT\r\nOK\r\n" + b"\xff\xfe\0\0",
+    "operator": b'AT+QSPN\r\n+QSPN: "TOKYO OK","OK","",0,"99999"\r\nOK\r\n',
+}
+
+
+def every_cut(data, feed_all):
+    whole = feed_all([data])
+    assert feed_all([data[i : i + 1] for i in range(len(data))]) == whole
+    for cut in range(len(data) + 1):
+        assert feed_all([data[:cut], data[cut:]]) == whole, f"cut at byte {cut}"
+    return whole
+
+
+def framed(pieces):
+    framer = TranscriptFramer()
+    return [event for piece in pieces for event in framer.feed(piece)] + framer.close()
+
+
+@pytest.mark.parametrize("name", TRANSCRIPTS)
+def test_transcripts_at_every_cut(name):
+    assert every_cut(TRANSCRIPTS[name], framed)
+
+
+@pytest.mark.field
+def test_recorded_transcripts_at_every_cut():
+    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
+    if not root:
+        pytest.skip("AERPAW_CMP_FIELD_DATA is unset")
+    files = sorted(Path(root, "modem").glob("at_*.txt"))
+    assert len(files) >= 11
+    for path in files:
+        data = path.read_bytes()
+        events = every_cut(data, framed)
+        assert every_cut(data.replace(b"\n", b"\r\n"), framed) == events
+        # nothing is lost: every line but echoes, finals and blanks stands in an event
+        kept = "".join("".join(e.lines) for e in events if isinstance(e, Answer)).replace(" ", "")
+        for line in data.decode("latin-1").split("\n"):
+            if line.startswith("+Q"):
+                assert line.strip().replace(" ", "") in kept, path.name
+
+
+def test_transcript_meaning():
+    answers = {name: [e for e in frame_transcript(data) if isinstance(e, Answer)] for name, data in TRANSCRIPTS.items()}
+    assert [(a.status, a.code) for a in answers["errors"]] == [("cme", "0"), ("error", None), ("cms", "301")]
+    assert answers["lf only"][1].lines == ('+QNWCFG: "nr5g_csi",3,1,4,5',)
+    assert answers["lf only"][1].status == "cut"
+    assert len(answers["glued"][0].lines) == 3
+    assert "glued" in answers["glued"][0].flags
+    assert answers["operator"][0].lines == ('+QSPN: "TOKYO OK","OK","",0,"99999"',)
+    assert answers["unsolicited"][0].lines == ("Quectel", "RM502Q-AE", "Revision: X")
+    assert frame_transcript(TRANSCRIPTS["unsolicited"])[:2] == [Unsolicited("RDY"), Unsolicited('+QIND: "csq",20,99')]
+
+
+def live(pieces, command=CSI):
+    framer = Framer()
+    framer.send(*command)
+    return [event for piece in pieces for event in framer.feed(piece)]
+
+
+@pytest.mark.parametrize(
+    "echo", [b"", b'AT+QNWCFG="nr5g_csi"\r\r\n', b'at+qnwcfg="nr5g_csi"\r\n', b'\x80\x81AT+QNWCFG="nr5g_csi"\r']
+)
+@pytest.mark.parametrize("end", [b"\r\n", b"\n", b"\r", b"\r\r\n", b"\n\r\n\n"])
+@pytest.mark.parametrize("final", [("OK", "ok", None), ("+CME ERROR: 14", "cme", "14"), ("ERROR", "error", None)])
+def test_live_answer_at_every_cut(echo, end, final):
+    text, status, code = final
+    data = echo + end + b'+QNWCFG: "nr5g_csi",13,2,8,896' + end + b'+CEREG: 1,"1F"' + end + text.encode() + end
+    events = every_cut(data, live)
+    assert events[0] == Unsolicited('+CEREG: 1,"1F"')
+    assert events[1].lines == ('+QNWCFG: "nr5g_csi",13,2,8,896',)
+    assert (events[1].status, events[1].code) == (status, code)
+    assert any(flag.startswith("echo") for flag in events[1].flags) == bool(echo)
+
+
+def test_answer_of_another_query_is_not_taken():
+    events = live([b'+QNWCFG: "lte_csi",1,1,1,1\r\n+QNWCFG: "nr5g_csi",2,2,2,2\r\nOK\r\n'])
+    assert events[0] == Unsolicited('+QNWCFG: "lte_csi",1,1,1,1')
+    assert events[1].lines == ('+QNWCFG: "nr5g_csi",2,2,2,2',)
+
+
+def test_ok_glued_to_the_last_field():
+    assert live([b'+QNWCFG: "nr5g_csi",2,2,2,2OK\r\n'])[0].status == "ok"
+    assert unglue('+QSPN: "TOKYO') == ('+QSPN: "TOKYO',)
+
+
+def test_late_answer_is_kept_and_not_taken_for_the_next():
+    framer = Framer()
+    framer.send(*CSI)
+    framer.feed(b'\r\n+QNWCFG: "nr5g')
+    answer = framer.give_up()
+    assert (answer.status, answer.partial) == ("timeout", '+QNWCFG: "nr5g')
+    framer.send(*QENG)
+    events = framer.feed(b'_csi",13,2,8,896\r\n\r\nOK\r\n\r\n+QENG: "servingcell","SEARCH"\r\n\r\nOK\r\n')
+    assert events[0] == Late(('+QNWCFG: "nr5g_csi",13,2,8,896',), "ok")
+    assert events[1].lines == ('+QENG: "servingcell","SEARCH"',)
+
+
+def test_late_answer_to_the_same_query_is_told_by_the_echo():
+    framer = Framer()
+    for values in (b"1,1,1,1", b"2,2,2,2"):
+        framer.send(*CSI)
+        echo = b'AT+QNWCFG="nr5g_csi"\r\r\n'
+        if values == b"1,1,1,1":
+            framer.feed(echo)
+            framer.give_up()
+        else:
+            late = b'+QNWCFG: "nr5g_csi",1,1,1,1\r\n\r\nOK\r\n'
+            events = framer.feed(late + echo + b'+QNWCFG: "nr5g_csi",2,2,2,2\r\nOK\r\n')
+    assert isinstance(events[0], Late)
+    assert events[-1].lines == ('+QNWCFG: "nr5g_csi",2,2,2,2',)
+
+
+def test_late_answer_with_nothing_in_flight():
+    framer = Framer()
+    framer.send(*CSI)
+    framer.give_up()
+    assert framer.feed(b'+QNWCFG: "nr5g_csi",1,1,1,1\r\nOK\r\n') == [Late(('+QNWCFG: "nr5g_csi",1,1,1,1',), "ok")]
+
+
+def test_bare_ok_of_a_late_answer_does_not_end_the_next():
+    framer = Framer()
+    framer.send(*CSI)
+    framer.give_up()
+    framer.send(*QENG)
+    events = framer.feed(b'OK\r\n+QENG: "servingcell","SEARCH"\r\nOK\r\n')
+    assert events[0] == Late((), "ok")
+    assert events[1].lines == ('+QENG: "servingcell","SEARCH"',)
+
+
+def test_ten_megabytes_without_line_end_stay_bounded():
+    framer = Framer()
+    framer.send(*CSI)
+    for _ in range(160):
+        assert framer.feed(b"x" * 65_536) == []
+        assert framer.buffered <= 65_536
+    events = framer.feed(b'\r\n+QNWCFG: "nr5g_csi",13,2,8,896\r\nOK\r\n')
+    assert isinstance(events[0], Unsolicited)
+    assert len(events[0].text) + events[0].dropped == 160 * 65_536
+    assert events[1].lines == ('+QNWCFG: "nr5g_csi",13,2,8,896',)
+
+
+def test_endless_answer_stays_bounded():
+    framer = Framer(max_lines=10)
+    framer.send(*CSI)
+    for _ in range(100):
+        framer.feed(b'+QNWCFG: "nr5g_csi",13,2,8,896\r\n' * 100)
+    (answer,) = framer.feed(b"OK\r\n")
+    assert len(answer.lines) == 10
+    assert "too_many_lines:9990" in answer.flags
+
+
+def test_two_commands_in_flight_are_refused():
+    framer = Framer()
+    framer.send(*CSI)
+    with pytest.raises(ValueError, match="still in flight"):
+        framer.send(*QENG)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=8))
+def test_any_bytes_in_any_pieces(data, cuts):
+    places = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
+    pieces = [data[a:b] for a, b in pairwise(places)]
+    assert framed(pieces) == framed([data])
+    assert live(pieces) == live([data])
+
+
+@settings(max_examples=100, deadline=None)
+@given(
+    st.lists(
+        st.sampled_from([b"OK", b"ERROR", b"RDY", b'+QNWCFG: "nr5g_csi",1,2,3,4', b'+QENG: "x"', b"junk"]), max_size=20
+    )
+)
+def test_every_line_comes_out_once(lines):
+    framer = Framer()
+    framer.send(*CSI)
+    events = framer.feed(b"".join(line + b"\r\n" for line in lines))
+    if framer._open is not None:
+        events.append(framer.give_up())
+    events += framer.settle()
+    kept = 0
+    for event in events:
+        if isinstance(event, Unsolicited):
+            kept += 1
+        elif isinstance(event, Late):
+            kept += len(event.lines) + (event.status != "cut")
+        else:
+            kept += len(event.lines) + (event.status not in ("timeout", "lost"))
+    assert kept == len(lines)

@@ -1,0 +1,381 @@
+"""The durable log: checksums, rotation, a full disk that comes back, a kill, and its reader."""
+
+from __future__ import annotations
+
+import errno
+import os
+import signal
+import subprocess
+import sys
+import zlib
+from pathlib import Path
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.live import log as log_module
+from aerpaw_cmp.live.log import (
+    Clock,
+    LogSettings,
+    SegmentLog,
+    decode_record,
+    encode_record,
+    read_log,
+)
+from aerpaw_cmp.readers import ReadOptions
+from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
+
+
+def header():
+    return {"kind": "header", "schema": SCHEMA, "ri_base": "one"}
+
+
+def make(folder, **values):
+    said = []
+    log = SegmentLog(folder, header, LogSettings(**values), on_fault=said.append)
+    log.open()
+    return log, said
+
+
+def test_round_trip_and_rotation(tmp_path):
+    log, _ = make(tmp_path / "a/b", segment_bytes=2000)
+    for i in range(100):
+        assert log.append({"kind": "x", "i": i, "text": '"\x00\xff,"crc":"00000000"}'})
+    log.close()
+    assert len(log.paths) > 3
+    bad = []
+    records = list(read_log(tmp_path / "a/b", bad))
+    assert not bad
+    assert [r["i"] for r in records if r["kind"] == "x"] == list(range(100))
+    assert [r["n"] for r in records] == list(range(len(records)))
+    assert [r["segment"] for r in records if r["kind"] == "header"] == list(range(1, len(log.paths) + 1))
+    results = [READER.read(path.read_bytes(), ReadOptions()) for path in log.paths]
+    assert all(READER.sniff(path.read_bytes()) for path in log.paths)
+    # each segment but the last says that it goes on
+    assert [r.warnings for r in results] == [()] * (len(results) - 1) + [("no end record: the session was cut",)]
+
+
+def test_a_second_session_never_writes_into_the_first(tmp_path):
+    first, _ = make(tmp_path)
+    before = first.path.read_bytes()
+    with pytest.raises(InputError, match="cannot write a log here"):
+        make(tmp_path)  # same second, same process: the same name
+    assert first.path.read_bytes() == before
+    first.close()
+
+
+@settings(max_examples=200, deadline=None)
+@given(
+    st.dictionaries(
+        st.text(max_size=10),
+        st.one_of(st.integers(), st.text(max_size=30), st.none(), st.lists(st.text(max_size=5))),
+        max_size=5,
+    )
+)
+def test_any_record_survives_and_both_readers_agree(content):
+    record = {"kind": "x", **{k: v for k, v in content.items() if k not in ("kind", "crc")}}
+    line = encode_record(record)
+    assert line.count(b"\n") == 1
+    assert decode_record(line) == record == decode_line(line)
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.integers(0, 10_000), st.integers(0, 7))
+def test_any_flipped_bit_or_cut_is_seen(place, bit):
+    line = encode_record({"kind": "exchange", "sent_utc_ns": 1, "last_utc_ns": 2, "lines": ["+QNWCFG: 1,2"], "n": 7})[
+        :-1
+    ]
+    damaged = bytearray(line)
+    damaged[place % len(line)] ^= 1 << bit
+    for decoder in (decode_record, decode_line):
+        if bytes(damaged) != line:
+            with pytest.raises(ValueError):
+                decoder(bytes(damaged))
+        with pytest.raises(ValueError):
+            decoder(line[: place % len(line)])
+
+
+FULL_DISK = """
+import resource, signal, sys
+from pathlib import Path
+from aerpaw_cmp.live.log import LogSettings, SegmentLog
+signal.signal(signal.SIGXFSZ, signal.SIG_IGN)  # then a write beyond the limit is short, or fails with EFBIG
+said = []
+log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header", "schema": "aerpaw-cmp-tap/1"},
+                 LogSettings(retry_s=0.0, backlog_records=int(sys.argv[2])), on_fault=said.append)
+log.open()
+written = [log.append({"kind": "x", "i": i}) for i in range(20)]
+soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+resource.setrlimit(resource.RLIMIT_FSIZE, (log.path.stat().st_size + 30, hard))
+written += [log.append({"kind": "x", "i": i}) for i in range(20, 60)]
+resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+written += [log.append({"kind": "x", "i": i}) for i in range(60, 80)]
+log.close()
+assert written == [True] * 20 + [False] * 40 + [True] * 20, written
+assert len(said) == 2, said
+print(*said, sep="\\n")
+print(log.lost)
+"""
+
+
+def run_child(code, *arguments):
+    root = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    return subprocess.run(
+        [sys.executable, "-c", code, *map(str, arguments)], env=environment, text=True, capture_output=True, check=False
+    )
+
+
+def test_a_full_disk_is_told_at_once_and_nothing_is_lost_when_it_has_room_again(tmp_path):
+    # RLIMIT_FSIZE in a child makes the kernel give short writes and then errors, as a full disk does
+    done = run_child(FULL_DISK, tmp_path, 1000)
+    assert done.returncode == 0, done.stderr
+    first, second, lost = done.stdout.splitlines()
+    assert "the log cannot be written" in first
+    assert "records wait in memory" in first
+    assert "takes records again; 0 were lost" in second
+    assert lost == "0"
+    bad = []
+    records = list(read_log(tmp_path, bad))
+    assert not bad  # the short write was taken back
+    assert [r["i"] for r in records if r["kind"] == "x"] == list(range(80))
+    (disk,) = [r for r in records if r["kind"] == "disk"]
+    assert disk["lost"] == 0
+
+
+def test_what_memory_cannot_hold_is_counted(tmp_path):
+    done = run_child(FULL_DISK, tmp_path, 25)
+    assert done.returncode == 0, done.stderr
+    records = list(read_log(tmp_path))
+    kept = [r["i"] for r in records if r["kind"] == "x"]
+    (disk,) = [r for r in records if r["kind"] == "disk"]
+    assert kept == sorted(kept)
+    assert disk["lost"] == 80 - len(kept) == 15 + 1
+    assert any(
+        "record numbers are missing" in w
+        for w in READER.read(next(tmp_path.iterdir()).read_bytes(), ReadOptions()).warnings
+    )
+
+
+def test_dev_full_says_no_space(tmp_path):
+    log, said = make(tmp_path)
+    os.dup2(os.open("/dev/full", os.O_WRONLY), log._fd)
+    assert not log.append({"kind": "x"})
+    assert "the disk is full" in said[0]
+    assert log.fault.reason == os.strerror(errno.ENOSPC)
+    log.close()
+
+
+def test_after_an_io_error_of_the_sync_a_new_segment_begins(tmp_path, monkeypatch):
+    log, said = make(tmp_path, retry_s=0.0)
+    log.append({"kind": "x", "i": 0})
+    real = os.fdatasync
+
+    def failing(fd):
+        monkeypatch.setattr(log_module.os, "fdatasync", real)
+        raise OSError(errno.EIO, "Input/output error")
+
+    monkeypatch.setattr(log_module.os, "fdatasync", failing)
+    log.sync()
+    log.append({"kind": "x", "i": 1})
+    log.close()
+    assert "failing disk or card" in said[0]
+    assert len(log.paths) == 2
+    assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == [0, 1]
+
+
+def test_sync_interval(tmp_path, monkeypatch):
+    synced = []
+    real = os.fdatasync
+    monkeypatch.setattr(log_module.os, "fdatasync", lambda fd: (synced.append(fd), real(fd))[1])
+    log, _ = make(tmp_path, sync_interval_s=0.0)
+    at_start = len(synced)
+    for i in range(5):
+        log.append({"kind": "x", "i": i})
+    assert len(synced) == at_start + 5
+    log.close()
+
+
+def test_the_interval_is_kept_by_a_steady_writer(tmp_path, monkeypatch):
+    # a clock of our own: 10 s in steps of 0.1 s at an interval of 1 s ask for 9 or 10 syncs
+    now = [0]
+    asked = []
+    log = SegmentLog(tmp_path, header, LogSettings(sync_interval_s=1.0), Clock(lambda: now[0], lambda: now[0]))
+    log.open()
+    monkeypatch.setattr(log._syncer, "request", asked.append)
+    for i in range(100):
+        now[0] += 100_000_000
+        log.append({"kind": "x", "i": i})
+    log.close()
+    assert 9 <= len(asked) <= 10
+
+
+@pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
+def test_a_folder_of_another_user(tmp_path):
+    folder = tmp_path / "theirs"
+    folder.mkdir(mode=0o755)
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.log import SegmentLog\n"
+        "os.setuid(65534)\nSegmentLog(Path(sys.argv[1]), dict).open()"
+    )
+    for part in (tmp_path, *tmp_path.parents):
+        if part == Path("/tmp"):
+            break
+        part.chmod(0o755)
+    done = run_child(code, folder)
+    assert "InputError" in done.stderr
+    assert "Permission denied" in done.stderr
+    assert "belongs to another user" in done.stderr
+
+
+def test_a_file_in_place_of_the_folder(tmp_path):
+    (tmp_path / "log").write_text("x")
+    with pytest.raises(InputError, match="part of the path is a file"):
+        make(tmp_path / "log")
+    with pytest.raises(InputError, match="part of the path is a file"):
+        make(tmp_path / "log" / "deeper")
+
+
+KILLED = """
+import sys
+from pathlib import Path
+from aerpaw_cmp.live.log import SegmentLog
+log = SegmentLog(Path(sys.argv[1]), lambda: {"kind": "header"})
+log.open()
+i = 0
+while True:
+    log.append({"kind": "x", "i": i})
+    print(i, flush=True)
+    i += 1
+"""
+
+
+def test_sigkill_loses_nothing_acknowledged(tmp_path):
+    root = Path(__file__).resolve().parents[2]
+    environment = os.environ | {"PYTHONPATH": str(root)}
+    for round_number in range(5):
+        folder = tmp_path / str(round_number)
+        process = subprocess.Popen([sys.executable, "-c", KILLED, folder], stdout=subprocess.PIPE, env=environment)
+        seen = [process.stdout.readline() for _ in range(37 * (round_number + 1))]
+        process.send_signal(signal.SIGKILL)
+        rest = process.communicate()[0].splitlines()
+        acknowledged = int([*seen, *rest][-1])
+        bad = []
+        kept = [r["i"] for r in read_log(folder, bad) if r["kind"] == "x"]
+        assert kept[: acknowledged + 1] == list(range(acknowledged + 1))
+        assert len(bad) <= 1
+        assert all(b.torn_tail for b in bad)
+
+
+# the reader --------------------------------------------------------------------------------------------------
+
+
+def exchange(n, second, query, decoded, **more):
+    start = 1_800_000_000_000_000_000 + int(second * 1e9)
+    record = {
+        "kind": "exchange",
+        "query": query,
+        "command": "AT",
+        "sent_utc_ns": start,
+        "last_utc_ns": start + 40_000_000,
+    }
+    return encode_record({**record, "status": "ok", "lines": [], "decoded": decoded, "flags": [], "n": n, **more})
+
+
+def sample():
+    return b"".join(
+        [
+            encode_record({**header(), "n": 0}),
+            exchange(1, 0.0, "servingcell", {"rat": "NR5G-SA", "nr": {"rsrp_dbm": -80, "sinr_db": 20}}),
+            exchange(2, 0.5, "nr5g_csi", {"rank": 2, "ri_raw": 2, "mcs": 9, "cqi": 8, "pmi": 1}),
+            exchange(3, 1.0, "nr5g_csi", {"rank": None, "ri_raw": 0}, flags=["no_csi"]),
+            exchange(4, 9.0, "nr5g_csi", {"rank": 3, "ri_raw": 3}),
+            exchange(5, 9.5, "nr5g_csi", {}, status="timeout"),
+            encode_record({"kind": "gap", "state": "closed", "reason": "gone", "duration_ns": 6_000_000_000, "n": 6}),
+            encode_record({"kind": "end", "n": 7}),
+        ]
+    )
+
+
+def test_reader():
+    result = READER.read(sample(), ReadOptions(node="LW1"))
+    assert (result.lines, result.accepted, result.blank, len(result.rejected)) == (8, 5, 3, 0)
+    assert result.warnings == ("gap of 6.0 s: gone",)
+    rank, rss = result.streams
+    assert dict(rank.attributes) == {"clock": "utc", "node": "LW1", "ri_base": "one", "channel": "nr5g"}
+    frame = rank.frame
+    assert frame["rank"].tolist()[::2] == [2.0, 3.0]
+    assert frame["rank"].isna().tolist() == [False, True, False, True]
+    assert frame["flag"].tolist() == ["", "no_csi", "", "status:timeout"]
+    assert frame["line"].tolist() == [3, 4, 5, 6]
+    assert str(frame["time"][0]) == "2027-01-15 08:00:00.520000"  # the middle of the exchange
+    assert frame["uncertainty_s"].tolist() == [0.02] * 4
+    assert frame["rsrp_dbm"].isna().tolist() == [
+        False,
+        False,
+        True,
+        True,
+    ]  # the serving cell is too old for the last two
+    assert (rss.frame["rss_db"].tolist(), rss.attributes["unit"]) == ([-80.0], "dBm")
+
+
+def test_reader_at_every_cut():
+    data = sample()
+    ends = [i for i, b in enumerate(data) if b == 10]
+    for cut in range(len(data)):
+        result = READER.read(data[:cut], ReadOptions())
+        whole = sum(end < cut for end in ends)
+        # a last line that lacks nothing but its line end is sound
+        assert result.accepted + result.blank in (whole, whole + (cut in ends))
+        assert len(result.rejected) <= 1
+        assert all(line.reason.startswith("torn tail") for line in result.rejected)
+
+
+@pytest.mark.parametrize(
+    "tail", [b"\0" * 512, b"\xff\xfe", b'{"kind":"exchange"', b"[1,2]", b'{"kind":7,"crc":"00000000"}']
+)
+def test_reader_counts_bad_tails(tail):
+    result = READER.read(sample() + tail, ReadOptions())
+    assert len(result.rejected) == 1
+    assert result.accepted == 5
+    assert any("torn" in w for w in result.warnings)
+    middle = READER.read(sample() + tail + b"\n" + exchange(8, 10, "nr5g_csi", {"rank": 1, "ri_raw": 1}), ReadOptions())
+    assert (len(middle.rejected), middle.accepted) == (1, 6)
+
+
+def signed(text):
+    return text + b',"crc":"%08x"}\n' % zlib.crc32(text)
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        signed(b'{"kind":"exchange","n":1'),
+        signed(b'{"kind":"exchange","sent_utc_ns":1e400,"last_utc_ns":2'),
+        signed(b'{"kind":"exchange","sent_utc_ns":true,"last_utc_ns":2'),
+        signed(b'{"kind":"exchange","sent_utc_ns":99999999999999999999999,"last_utc_ns":2'),
+        signed(b'{"kind":"x","a":' + b"[" * 100_000 + b"]" * 100_000),
+        signed(b'{"no":"kind"'),
+        signed(b'{"kind":"exchange","sent_utc_ns":1,"last_utc_ns":2,"query":"nr5g_csi","decoded":[1],"flags":3'),
+        signed(b'{"kind":"exchange","sent_utc_ns":1,"last_utc_ns":2,"query":"servingcell","decoded":{"nr":[1]}'),
+        signed(b'{"kind":"gap","state":"closed","duration_ns":"x"'),
+        signed(b'{"kind":"clock","step_ns":{}'),
+        signed(
+            b'{"kind":"exchange","sent_utc_ns":1,"last_utc_ns":2,"query":"nr5g_csi","decoded":{"rank":1'
+            + b"0" * 400
+            + b"}"
+        ),
+    ],
+)
+def test_reader_survives_crafted_records(line):
+    result = READER.read(encode_record({**header(), "n": 0}) + line, ReadOptions())
+    assert result.lines == 2
+
+
+def test_reader_refuses_a_later_schema():
+    data = encode_record({"kind": "header", "schema": "aerpaw-cmp-tap/2", "n": 0})
+    assert READER.sniff(data)
+    with pytest.raises(InputError, match="another version"):
+        READER.read(data, ReadOptions())

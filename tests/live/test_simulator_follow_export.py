@@ -1,0 +1,229 @@
+"""The simulated modem, the followed telemetry and the CSV export."""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.live import simulator
+from aerpaw_cmp.live.export import COLUMNS, export_csv
+from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
+from aerpaw_cmp.live.log import encode_record
+from aerpaw_cmp.live.modem import decode
+from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
+from aerpaw_cmp.readers import Reader
+from aerpaw_cmp.records import COLUMNS as RECORD_COLUMNS
+from aerpaw_cmp.records import ReadResult, Stream
+
+TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
++QNWCFG: "nr5g_csi",21,3,9,11
+
+OK
+AT+QNWCFG="nr5g_csi"
++QNWCFG: "nr5g_csi",5,1,4,2
+
+OK
+at+qnwinfo;+qeng="servingcell"
++QNWINFO: "TDD NR5G","99999","NR5G BAND 78",633984
++QENG: "servingcell","NOCONN","NR5G-SA","TDD",999,99,0002A4001,77,1F,633984,78,12,-80,-11,25,1,-
+
+OK
+"""
+
+
+def test_transcript_as_a_modem(tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_bytes(TRANSCRIPT)
+    modem = load_recorded(path)
+    ranks = [decode("nr5g_csi", modem.reply('AT+QNWCFG="nr5g_csi"')[:-1]).values["rank"] for _ in range(4)]
+    assert ranks == [3, 1, 3, 1]
+    assert decode("servingcell", modem.reply('AT+QENG="servingcell"')[:-1]).values["nr"]["rsrp_dbm"] == -80
+    assert modem.reply("AT+QNWINFO")[-1] == "OK"
+    assert modem.reply("AT+QRSRP") == ("ERROR",)
+    assert modem.reply("AT") == ("OK",)
+
+
+@pytest.mark.field
+def test_recorded_transcripts_as_modems():
+    root = os.environ.get("AERPAW_CMP_FIELD_DATA")
+    if not root:
+        pytest.skip("AERPAW_CMP_FIELD_DATA is unset")
+    modem = load_recorded(Path(root, "modem/at_csi_teltonika_5568.txt"))
+    ranks = [decode("nr5g_csi", modem.reply('AT+QNWCFG="nr5g_csi"')[:-1]).values["rank"] for _ in range(2)]
+    assert ranks == [2, 2]
+
+
+def test_tap_of_a_transcript(tap, tools, tmp_path):
+    path = tmp_path / "t.txt"
+    path.write_bytes(TRANSCRIPT)
+    session = tap(None, replay=path)
+    session.wait(lambda: (tmp_path / "log").exists() and len(tools.exchanges(tmp_path / "log", "nr5g_csi")) >= 4)
+    session.end()
+    ranks = [r["decoded"]["rank"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
+    assert ranks[:4] == [3, 1, 3, 1]
+
+
+def test_ranks_of_another_log_as_a_modem(tmp_path, monkeypatch):
+    def read(data, options):
+        rows = [line.split(",") for line in data.decode().split()]
+        times = pd.Timestamp("2026-01-01") + pd.to_timedelta([float(row[0]) for row in rows], unit="s")
+        ranks = [float(row[1]) for row in rows]
+        frame = pd.DataFrame({"time": times, "line": range(len(rows)), "flag": "", "rank": ranks, "ri_raw": ranks})
+        return ReadResult("r", (Stream("rank", "r", frame),), len(rows), len(rows), 0)
+
+    reader = Reader("r", "", ("rank",), "", lambda _head: True, read)
+    monkeypatch.setattr(simulator, "identify", lambda _data: reader)
+    path = tmp_path / "rank.csv"
+    path.write_text("10,1\n12,4\n14,nan\n15,2\n")
+    modem = load_source(path)
+    ranks = [modem._rank(t) for t in (0.0, 1.9, 2.0, 3.9, 4.5, 5.0, 5.9, 6.1)]
+    assert ranks == [1, 1, 4, 4, 0, 2, 2, 1]  # and again from the start
+
+
+@pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no answer here\n"])
+def test_nothing_to_replay(tmp_path, content):
+    path = tmp_path / "t.txt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match="no answer to any known command"):
+        load_source(path)
+    with pytest.raises(InputError):
+        load_source(tmp_path / "missing.txt")
+
+
+def test_simulator_cleans_up(tmp_path):
+    link = tmp_path / "by-id/modem"
+    with ModemSimulator(ModemSimSettings(link=link)) as modem:
+        node = modem.node
+        assert link.resolve() == node
+        modem.unplug()
+        assert not link.exists()
+        modem.replug()
+        assert link.resolve() == modem.node != node
+    assert not link.is_symlink()
+    with pytest.raises(UsageError):
+        ModemSimSettings(kind="toaster")
+
+
+def test_simulator_never_removes_a_file_in_place_of_its_link(tmp_path):
+    path = tmp_path / "precious"
+    path.write_text("x")
+    with pytest.raises(UsageError, match="not a link"):
+        ModemSimulator(ModemSimSettings(link=path))
+    assert path.read_text() == "x"
+
+
+# telemetry ---------------------------------------------------------------------------------------------------
+
+
+def read_lines(data, options):
+    rows = [line.split(",") for line in data.decode().splitlines()]
+    content = {
+        "time": pd.to_datetime([row[0] for row in rows]).astype("datetime64[ns]"),
+        "line": range(len(rows)),
+        "flag": "",
+    }
+    for name in RECORD_COLUMNS["telemetry"]:
+        content[name] = np.zeros(len(rows))
+    content["altitude_m"] = [float(row[1]) for row in rows]
+    return ReadResult("t", (Stream("telemetry", "t", pd.DataFrame(content)),), len(rows), len(rows), 0)
+
+
+LINES = Reader("t", "", ("telemetry",), "", lambda _head: True, read_lines)
+
+
+def second(i):
+    return int(pd.Timestamp(f"2026-01-01T00:00:{i:02d}").value)
+
+
+def test_growing_telemetry(tmp_path):
+    path = tmp_path / "t.log"
+    follower = TelemetryFollower(path, reader=LINES, keep_s=5)
+    assert follower.poll() == 0
+    path.write_text("2026-01-01T00:00:00,1\n2026-01-01T00:00:01,2\n2026-01-01T00:0")
+    assert follower.poll() == 2
+    assert follower.latest().altitude_m == 2.0
+    assert follower.poll() == 0
+    with path.open("a") as file:
+        file.write("0:02,3\n")
+    assert follower.poll() == 1
+    assert follower.at(second(1) + 400_000_000).altitude_m == 2.0
+    assert follower.at(second(1) + 600_000_000).altitude_m == 3.0
+    assert follower.at(second(5)) is None
+    assert follower.at(second(4)).altitude_m == 3.0
+    with path.open("a") as file:
+        file.write("2026-01-01T00:00:20,9\n")
+    follower.poll()
+    assert follower.at(second(2)) is None  # forgotten
+    path.write_text("2026-01-01T00:00:30,4\n")  # a new flight under the old name
+    assert follower.poll() == 1
+    assert follower.latest().altitude_m == 4.0
+    predict = predict_along(follower, lambda sample: round(sample.altitude_m))
+    assert predict(second(30)) == 4
+    assert predict(second(40)) is None
+
+
+def test_long_telemetry_is_read_from_its_end(tmp_path):
+    path = tmp_path / "t.log"
+    path.write_text("".join(f"2026-01-01T00:00:{i % 60:02d},{i}\n" for i in range(6000)))
+    follower = TelemetryFollower(path, reader=LINES, keep_s=1e6)
+    assert 2000 < follower.poll() < 3000
+    assert follower.latest().altitude_m == 5999.0
+
+
+# export ------------------------------------------------------------------------------------------------------
+
+
+def test_export(modem, tap, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) > 25)
+    session.end()
+    summary = export_csv(tmp_path / "log", tmp_path / "out.csv")
+    with (tmp_path / "out.csv").open() as file:
+        rows = list(csv.DictReader(file))
+    assert len(rows) == summary.rows
+    assert tuple(rows[0]) == COLUMNS
+    ranks = [row["rank"] for row in rows if row["query"] == "nr5g_csi"]
+    assert ranks
+    assert set(ranks) <= {"1", "2", "3", "4"}
+    assert next(row["rsrp_dbm"] for row in rows if row["query"] == "servingcell").startswith("-")
+    assert all(row["rsrp_rx3_dbm"] for row in rows if row["query"] == "qrsrp")
+    assert all(row["sinr_rx0_db"] for row in rows if row["query"] == "qsinr")
+
+
+def test_export_holds_no_formula(tmp_path):
+    evil = '=cmd|"/C calc"!A0'
+    record = {
+        "kind": "exchange",
+        "query": "servingcell",
+        "sent_utc_ns": 1,
+        "last_utc_ns": 2,
+        "status": "ok",
+        "lines": [evil],
+        "n": 1,
+    }
+    record |= {"decoded": {"state": evil, "rat": "@SUM(1)"}, "flags": ["+1+1", evil]}
+    (tmp_path / "tap_x.jsonl").write_bytes(encode_record(record) + b"torn")
+    summary = export_csv(tmp_path, tmp_path / "out.csv")
+    assert (summary.rows, len(summary.bad_lines)) == (1, 1)
+    with (tmp_path / "out.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert not [v for v in row.values() if v[:1] in ("=", "+", "@", "-", "\t")]
+
+
+def test_export_of_nothing(tmp_path):
+    with pytest.raises(InputError, match="no tap log"):
+        export_csv(tmp_path, tmp_path / "out.csv")
+    with pytest.raises(InputError, match="no such file"):
+        export_csv(tmp_path / "x", tmp_path / "out.csv")
+    (tmp_path / "tap_x.jsonl").write_bytes(encode_record({"kind": "exchange", "n": 0}))
+    with pytest.raises(InputError, match="lacks what its kind"):
+        export_csv(tmp_path, tmp_path / "out.csv")
+    with pytest.raises(InputError, match="cannot be written"):
+        export_csv(tmp_path, tmp_path / "no/out.csv")

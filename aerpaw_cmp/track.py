@@ -463,6 +463,28 @@ class LagFit:
     curve_lag_s: FloatArray = field(repr=False)
     curve_rmse_db: FloatArray = field(repr=False)
 
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json; NaN becomes None, the curve is left out."""
+        names = {
+            "lag_s": self.lag_s,
+            "lag_ci95_s": list(self.interval_s),
+            "drift_ms_per_min": self.drift_s_per_s * 60e3,
+            "drift_ci95_ms_per_min": [60e3 * v for v in self.drift_interval_s_per_s],
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "window_s": self.window_s,
+            "n": self.n,
+            "rmse_db": self.rmse_db,
+            "rmse_unshifted_db": self.rmse_unshifted_db,
+        }
+
+        def known(value: Any) -> Any:
+            if isinstance(value, list):
+                return [known(item) for item in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        return {name: known(value) for name, value in names.items()}
+
     def apply(self, times: AnyArray) -> AnyArray:
         """Radio times (datetime64 or seconds, the first sample first) on the telemetry clock."""
         array = np.asarray(times)
@@ -746,13 +768,13 @@ def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
 
 
 def _likelihood_ratios(cost: FloatArray, whitened: FloatArray) -> FloatArray:
-    """Log-likelihood ratio (times two) by which every lag is worse than the best one."""
+    """Log-likelihood ratio (times two) by which every lag, and last a constant, is worse than the best lag."""
     sums = _blocks(whitened - whitened.mean())
     long_run = float(np.mean(sums**2)) * len(sums) / len(whitened)
     # correlation that AR(1) left over takes evidence away; anticorrelation does not add any
     size = len(whitened) * min(1.0, float(whitened.var()) / long_run) if long_run > 0 else len(whitened)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = size * np.log(cost / np.nanmin(cost))
+        ratio = size * np.log(cost / np.min(cost[:-1]))
     return np.asarray(np.where(np.isfinite(cost), np.nan_to_num(ratio, nan=0.0, posinf=np.inf), np.inf))
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from pathlib import Path
 
@@ -273,6 +274,7 @@ def test_a_planted_lag_comes_back_within_a_tenth_of_a_second(lag):
     assert fit.interval_s[0] - 0.02 <= lag <= fit.interval_s[1] + 0.02
     assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
     np.testing.assert_allclose(fit.apply(t), t + lag, atol=0.1)
+    assert json.loads(json.dumps(fit.as_dict(), allow_nan=False))["drift_ci95_ms_per_min"] == [None, None]
 
 
 @pytest.mark.parametrize("drift_ms_per_min", [-5.0, 2.0, 5.0])
@@ -321,6 +323,22 @@ def test_a_periodic_flight_has_rivals():
     fit = estimate_lag(t, 5 * np.sin(2 * np.pi * t / 8.0) + noise, lambda x: 5 * np.sin(2 * np.pi * x / 8.0))
     assert fit.verdict == "ambiguous"
     assert "other lags" in fit.reason
+
+
+def test_a_prediction_that_explains_nothing_is_not_trusted():
+    rng = np.random.default_rng(8)
+    knots = np.cumsum(rng.normal(0, 1, 700))
+    knots -= np.interp(np.arange(700), [0, 699], [knots[0], knots[-1]])
+
+    def level(x):
+        return np.interp(x, np.arange(-200, 500), knots * 3)
+
+    t = np.arange(0, 300, 0.1)
+    weak = 0.3 * level(t + 1.0) + rng.normal(0, 1, len(t))  # ten decibels were predicted where three are seen
+    fit = estimate_lag(t, weak, level)
+    assert fit.verdict == "ambiguous"
+    assert "no more than a constant" in fit.reason
+    assert estimate_lag(t, weak / 0.3, level).verdict == "ok"
 
 
 def test_a_lag_outside_the_window_is_not_passed_off_as_a_result():

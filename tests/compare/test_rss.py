@@ -14,6 +14,7 @@ from aerpaw_cmp.compare.rss import (
     channel_difference,
     compare_rss,
     error_spans,
+    link_geometry,
     local_mean_db,
     residual_tables,
     same_footing,
@@ -174,6 +175,28 @@ def test_fading_averages_out_on_the_same_footing():
 # --- residuals ---
 
 
+def test_link_geometry_in_the_antenna_frames():
+    from aerpaw_cmp.replay.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+
+    tower = np.array([10.0, -5.0, 10.0])
+    rng = np.random.default_rng(9)
+    position = tower + rng.normal(0, 100, (50, 3))
+    rotation = rotation_from_aircraft(*rng.uniform(-30, 30, (3, 50)))
+    mount = rotation_from_yaw_pitch_roll(np.radians(45.0), 0.0, 0.0)
+    uav_mount = rotation_from_yaw_pitch_roll(np.radians(315.0), 0.0, np.radians(90.0))
+    found = link_geometry(tower, position, rotation, tower_mount=mount, uav_mount=uav_mount)
+    # boresight 45 deg counter-clockwise from east is the bearing 45 deg: an azimuth of 0 in the antenna frame
+    bearing = (45.0 - found["azimuth_deg"] + 180) % 360 - 180
+    np.testing.assert_allclose(found["tower_azimuth_deg"], bearing, atol=1e-9)
+    np.testing.assert_allclose(found["tower_elevation_deg"], found["elevation_deg"], atol=1e-9)
+    for i in range(50):  # one by one, from the definition v_site = R_body R_mount v_device
+        device = (rotation[i] @ uav_mount).T @ (tower - position[i])
+        assert found["uav_azimuth_deg"][i] == pytest.approx(np.degrees(np.arctan2(device[1], device[0])))
+        assert found["uav_elevation_deg"][i] == pytest.approx(np.degrees(np.arcsin(device[2] / np.linalg.norm(device))))
+    level = link_geometry(tower, position, rotation_from_aircraft(np.zeros(50), np.zeros(50), np.full(50, 30.0)))
+    np.testing.assert_allclose(level["heading_deg"], 30.0)
+
+
 def test_bins_hold_every_pair_once():
     rng = np.random.default_rng(4)
     quantity, residual = rng.uniform(0, 100, 1000), rng.normal(size=1000)
@@ -184,6 +207,7 @@ def test_bins_hold_every_pair_once():
     assert pooled == pytest.approx(np.sqrt(np.nanmean(residual**2)))
     assert np.nansum(bins.n * bins.mean_db) == pytest.approx(np.nansum(residual))
     assert bins.explained < 0.05
+    json.dumps(bins.as_dict(), allow_nan=False)
 
 
 def test_bins_show_what_explains_the_residual():
@@ -224,6 +248,8 @@ def test_largest_error_spans_are_found_with_their_cause():
     assert first.start_s == pytest.approx(50, abs=1.0)
     assert first.end_s == pytest.approx(60, abs=1.0)
     assert first.position_m == pytest.approx((55, 0, 40), abs=1.0)
+    assert first.geometry["foliage_m"] == 25.0
+    json.dumps([span.as_dict() for span in spans], allow_nan=False)
     assert "foliage" in first.cause
     assert "more loss" in first.cause
     assert "fade" in second.cause
@@ -267,6 +293,7 @@ def test_two_channels_part_where_the_geometry_says():
     assert found.spans[0].start_s == pytest.approx(100, abs=1)
     assert found.share_parted == pytest.approx(0.05, abs=0.005)
     assert found.interval_std_db[0] < found.std_db < found.interval_std_db[1]
+    json.dumps(found.as_dict(), allow_nan=False)
     assert channel_difference(time, one, np.full(len(time), NAN)).n == 0
 
 

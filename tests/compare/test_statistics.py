@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from aerpaw_cmp.compare.statistics import (
+    _correlation_of_residual,
     autocovariance,
     bootstrap_means,
     correlation,
@@ -132,6 +133,17 @@ def test_correlation():
     assert np.isnan(correlation([1, 1, 1], [1, 2, 3]))
     assert np.isnan(correlation([1], [1]))
     assert correlation([1e8, 1e8 + 1, 1e8 + 2], [1, 2, 3]) == pytest.approx(1.0)
+
+
+def test_correlation_from_moments_of_the_residual_is_the_correlation():
+    rng = np.random.default_rng(10)
+    s = rng.normal(-80, 6, 300)
+    m = 0.4 * s + rng.normal(0, 2, 300)  # a residual that goes with the simulation
+    d, centred = (s - m) - (s - m).mean(), s - s.mean()
+    found = _correlation_of_residual(s.var(), np.array([np.mean(d * centred)]), np.array([d.var()]))
+    assert found[0] == pytest.approx(np.corrcoef(m, s)[0, 1])
+    low, high = error_intervals(m, s).correlation
+    assert 0.5 < low < found[0] < high < 0.95
 
 
 def test_repeatability_floor_of_two_passes():

@@ -84,6 +84,11 @@ def _message(error: BaseException) -> tuple[str, int]:
 
     if isinstance(error, AerpawCmpError):
         return f"aerpaw-cmp: {error}", error.exit_code
+    if callable(wording := getattr(error, "format_message", None)):
+        # a wrong option or argument; known by its method, since typer may bring its own copy of click
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "aerpaw-cmp"
+        return f"{command}: {wording().rstrip('.')}; '{command} --help' tells the options", 2
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
         return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
     kind = type(error).__name__
@@ -132,6 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return BROKEN_PIPE
     except Exception as error:
+        if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
+            return INTERRUPTED
         if debug:
             import traceback
 

@@ -10,7 +10,7 @@ import platform
 import shutil
 import sys
 from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from importlib import metadata
 from pathlib import Path
 from typing import Any, Literal
@@ -51,11 +51,15 @@ class Check:
 
 def checks() -> list[Check]:
     """All checks, in the order in which a newcomer meets them. Takes a few seconds: LLVM is tried, not believed."""
+    gpu = gpu_check()
+    compilers = list(llvm_checks())
+    if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
+        compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
     return [
         python_check(),
         *package_checks(),
-        *llvm_checks(),
-        gpu_check(),
+        *compilers,
+        gpu,
         cores_check(),
         memory_check(),
         disk_check(Path.cwd()),
@@ -125,7 +129,8 @@ def llvm_checks() -> Iterator[Check]:
         if trial.ok:
             yield Check("LLVM", "ok", f"{name}, tried: two paths traced in a child process, lengths right")
         elif not trial.blames_library:
-            yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", "make setup")
+            remedy = llvm.install_line() if trial.missing else "make setup"
+            yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", remedy)
         else:
             remedy = "none needed, another one works" if works else llvm.install_line()
             yield Check("LLVM", "warn" if works else "fail", f"{name}: {trial.reason}", remedy)

@@ -126,7 +126,7 @@ def ingest(
     skipped: list[Skipped] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
         place = Path(path)
-        if not place.is_dir():
+        if not _is_folder(place):
             files.append(read_file(place, options=options, reader=chosen))
             continue
         found, left = _folder(place, options, chosen)
@@ -139,6 +139,13 @@ def ingest(
                 path=place,
             )
     return Ingested(files, skipped)
+
+
+def _is_folder(place: Path) -> bool:
+    try:
+        return place.is_dir()
+    except (OSError, ValueError):
+        return False  # an impossible path: read_bytes says so
 
 
 def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:

@@ -37,6 +37,9 @@ FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
 
 TRIAL_TIMEOUT_S = 300.0
 
+APT_RUNTIME = "libatomic1"
+"""Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have."""
+
 _FOLDERS = (
     "/usr/lib/*-linux-gnu",
     "/lib/*-linux-gnu",
@@ -102,13 +105,15 @@ class Library:
 class Trial:
     """What a child process made of one library, or of one GPU variant (``library`` is None).
 
-    ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start.
+    ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start, and
+    ``missing`` then names the shared library that Dr.Jit itself lacks, if that was the cause.
     """
 
     library: Library | None
     ok: bool
     reason: str = ""
     blames_library: bool = True
+    missing: str = ""
 
 
 def version_in_name(name: str) -> tuple[int, ...] | None:
@@ -181,8 +186,15 @@ def _too_old(version: Sequence[int]) -> str:
     return ""
 
 
+def _missing_library(text: str) -> str:
+    match = re.search(r"(lib\S+\.so[.\d]*)(?:: cannot open shared object file|$)", text, flags=re.MULTILINE)
+    return match[1] if match else ""
+
+
 def _failure(child: subprocess.CompletedProcess[str]) -> str:
     """Why a child failed, in one line: the signal that ended it and what it said last."""
+    if missing := _missing_library(child.stderr):
+        return f"Dr.Jit cannot be loaded, the system has no {missing}"
     lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
     said = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
     how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
@@ -236,18 +248,22 @@ def try_library(
     told = answer.get("llvm")
     if isinstance(told, list) and told:
         library = Library(library.path, tuple(int(part) for part in told))
-    reason = reason or _too_old(library.version)
-    return Trial(library, not reason, reason, blames_library="No module named" not in reason)
+    return _verdict(library, reason or _too_old(library.version))
 
 
 def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = TRIAL_TIMEOUT_S) -> Trial:
     """Trace two paths with another Mitsuba variant (``cuda_ad_mono_polarized``) in a child process."""
-    reason, _ = _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)
-    return Trial(None, not reason, reason, blames_library="No module named" not in reason)
+    return _verdict(None, _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)[0])
 
 
-def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] = try_library) -> list[Trial]:
-    """Try libraries in order until one works; the trials made, the working one last."""
+def _verdict(library: Library | None, reason: str) -> Trial:
+    missing = _missing_library(reason) if reason.startswith("Dr.Jit cannot be loaded") else ""
+    return Trial(library, not reason, reason, not missing and "No module named" not in reason, missing)
+
+
+def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
+    """Try libraries in order (by default with :func:`try_library`) until one works; the trials made, that one last."""
+    attempt = attempt or try_library
     trials: list[Trial] = []
     for library in libraries:
         trials.append(attempt(library))
@@ -378,13 +394,13 @@ def install_line() -> str:
     families = _os_families()
     if families & {"debian", "ubuntu"}:
         package = next(iter(_offered_by_apt()), "libllvm19")
-        return f"sudo apt-get update && sudo apt-get install -y {package}"
+        return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
     if families & {"fedora", "rhel", "centos"}:
-        return "sudo dnf install -y llvm-libs"
+        return "sudo dnf install -y llvm-libs libatomic"
     if families & {"arch"}:
         return "sudo pacman -S --needed llvm-libs"
     if families & {"suse", "opensuse"}:
-        return "sudo zypper install -y libLLVM19"
+        return "sudo zypper install -y libLLVM19 libatomic1"
     if families & {"darwin"}:
         return "brew install llvm"
     return f"export {LIBRARY_VARIABLE}=/path/to/libLLVM.so  # any LLVM of {MINIMUM_MAJOR} or newer"
@@ -403,15 +419,15 @@ def root_prefix() -> list[str] | None:
     return [sudo] if sys.stdin is not None and sys.stdin.isatty() else None
 
 
-def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] = try_library) -> Trial | None:
+def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | None = None) -> Trial | None:
     """Install the distribution's newest LLVM runtime with apt, trying older ones if its trial fails.
 
     Parameters
     ----------
     say : callable
         Told each command before it runs.
-    attempt : callable
-        The trial.
+    attempt : callable, optional
+        The trial; :func:`try_library` by default.
 
     Returns
     -------
@@ -431,13 +447,19 @@ def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] = tr
             say(done.stdout.strip()[-1000:])
         return done.returncode == 0
 
+    def apt_install(*packages: str) -> Trial | None:
+        if not apt_get("install", "-y", "-qq", "--no-install-recommends", *packages):
+            return None
+        trials = first_that_works(candidates(), attempt)
+        return trials[-1] if trials else None
+
     apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
+    # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
+    wanted: list[tuple[str, ...]] = [(APT_RUNTIME,)] if candidates() else []
+    wanted += [(package, APT_RUNTIME) for package in _offered_by_apt()]
     last: Trial | None = None
-    for package in _offered_by_apt():
-        if apt_get("install", "-y", "-qq", "--no-install-recommends", package):
-            trials = first_that_works(candidates(), attempt)
-            if trials:
-                last = trials[-1]
-                if last.ok or not last.blames_library:
-                    break
+    for packages in wanted:
+        last = apt_install(*packages) or last
+        if last is not None and last.ok:
+            break
     return last

@@ -133,6 +133,9 @@ def _nanoseconds(times: ArrayLike | pd.Series) -> AnyArray:
 
 _NAT = np.iinfo(np.int64).min
 
+_SAME_S = 1e-6
+"""Instants nearer than this are one: epoch seconds as floats carry 0.2 microseconds [s]."""
+
 
 def _forward_rows(stamp: AnyArray) -> tuple[BoolArray, int, int]:
     """Rows of a strictly increasing clock, and how many are duplicates and backward.
@@ -296,6 +299,8 @@ class Track:
         code[~timed] = REASONS.index("no time")
         valid = code == 0
         n = len(t)
+        if len(self):
+            t = np.clip(t, self._time_s[0], self._time_s[-1])
         position = np.full((n, 3), np.nan)
         rotation = np.full((n, 3, 3), np.nan)
         velocity = np.full((n, 3), np.nan)
@@ -317,8 +322,8 @@ class Track:
             code[:] = REASONS.index("no telemetry")
             return code
         code[_in_gap(t, self._time_s, self.maximum_gap_s)] = REASONS.index("telemetry gap")
-        code[t < self._time_s[0]] = REASONS.index("before telemetry")
-        code[t > self._time_s[-1]] = REASONS.index("after telemetry")
+        code[t < self._time_s[0] - _SAME_S] = REASONS.index("before telemetry")
+        code[t > self._time_s[-1] + _SAME_S] = REASONS.index("after telemetry")
         return code
 
     def _positions(self, t: FloatArray) -> FloatArray:
@@ -355,7 +360,7 @@ def _in_gap(t: FloatArray, at: FloatArray, limit_s: float) -> BoolArray:
     """Whether an instant lies strictly inside an interval longer than the limit."""
     right = np.clip(np.searchsorted(at, t, side="left"), 0, len(at) - 1)
     left = np.maximum(right - 1, 0)
-    exact = at[right] == t
+    exact = np.minimum(np.abs(at[right] - t), np.abs(at[left] - t)) <= _SAME_S
     return np.asarray((at[right] - at[left] > limit_s) & ~exact)
 
 
@@ -407,6 +412,9 @@ _RIVAL = 10.83
 _SCANNED = 6000
 """The search runs on at most this many samples; the refinement on all."""
 
+_NEAR_EDGE = 0.86
+"""A best lag beyond this share of the window may be the slope of a valley outside it."""
+
 _FEWEST = 30
 """Fewer samples tell nothing about a lag."""
 
@@ -454,6 +462,28 @@ class LagFit:
     window_s: float
     curve_lag_s: FloatArray = field(repr=False)
     curve_rmse_db: FloatArray = field(repr=False)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json; NaN becomes None, the curve is left out."""
+        names = {
+            "lag_s": self.lag_s,
+            "lag_ci95_s": list(self.interval_s),
+            "drift_ms_per_min": self.drift_s_per_s * 60e3,
+            "drift_ci95_ms_per_min": [60e3 * v for v in self.drift_interval_s_per_s],
+            "verdict": self.verdict,
+            "reason": self.reason,
+            "window_s": self.window_s,
+            "n": self.n,
+            "rmse_db": self.rmse_db,
+            "rmse_unshifted_db": self.rmse_unshifted_db,
+        }
+
+        def known(value: Any) -> Any:
+            if isinstance(value, list):
+                return [known(item) for item in value]
+            return None if isinstance(value, float) and not np.isfinite(value) else value
+
+        return {name: known(value) for name, value in names.items()}
 
     def apply(self, times: AnyArray) -> AnyArray:
         """Radio times (datetime64 or seconds, the first sample first) on the telemetry clock."""
@@ -646,8 +676,12 @@ def _fit_lag(
     near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row])), phi, least))
     start = np.array([near, rates[row]])[: 2 if drifting else 1]
     (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
-    ratio = _likelihood_ratios(table.min(axis=0), _whitened(residual(float(lags[column]), float(rates[row])), phi))
-    verdict, reason, interval = _judge(lag, width, ratio, lags, limit_s)
+    # last entry: a constant instead of the prediction
+    cost = np.append(table.min(axis=0), _cost(np.where(np.isfinite(residual(lag, rate)), ms, np.nan), phi, least))
+    ratio = _likelihood_ratios(cost, _whitened(residual(float(lags[column]), float(rates[row])), phi))
+    verdict, reason, interval = _judge(lag, width, ratio[:-1], lags, limit_s)
+    if verdict == "ok" and ratio[-1] <= _RIVAL:
+        verdict, reason = "ambiguous", "at its best lag the prediction explains no more than a constant"
     nan = float("nan")
     return LagFit(
         lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
@@ -734,13 +768,13 @@ def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
 
 
 def _likelihood_ratios(cost: FloatArray, whitened: FloatArray) -> FloatArray:
-    """Log-likelihood ratio (times two) by which every lag is worse than the best one."""
+    """Log-likelihood ratio (times two) by which every lag, and last a constant, is worse than the best lag."""
     sums = _blocks(whitened - whitened.mean())
     long_run = float(np.mean(sums**2)) * len(sums) / len(whitened)
     # correlation that AR(1) left over takes evidence away; anticorrelation does not add any
     size = len(whitened) * min(1.0, float(whitened.var()) / long_run) if long_run > 0 else len(whitened)
     with np.errstate(divide="ignore", invalid="ignore"):
-        ratio = size * np.log(cost / np.nanmin(cost))
+        ratio = size * np.log(cost / np.min(cost[:-1]))
     return np.asarray(np.where(np.isfinite(cost), np.nan_to_num(ratio, nan=0.0, posinf=np.inf), np.inf))
 
 
@@ -762,8 +796,8 @@ def _judge(
             else "the interval is too wide"
         )  # fmt: skip
         return "ambiguous", why, interval
-    if abs(lag) > float(lags[-1]) - (lags[1] - lags[0]):
-        return "failed", "the best lag lies at the edge of the window: look for a clock error of another kind", interval
+    if abs(lag) > _NEAR_EDGE * float(lags[-1]):
+        return "failed", "the best lag lies near the edge of the window: widen it, or look at the clocks", interval
     return "ok", "", interval
 
 

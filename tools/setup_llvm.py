@@ -30,12 +30,14 @@ def main() -> int:
         say(f"{trial.library.label if trial.library else ''}: {trial.reason or 'works'}")
     if trials and trials[-1].ok:
         return 0
-    if not trials or trials[-1].blames_library:
-        say(f"{llvm.explain(trials)}. Trying to install one.")
+    if not trials or trials[-1].blames_library or trials[-1].missing:
+        say(f"{llvm.explain(trials)}. Installing what is missing, if this user may.")
         installed = llvm.install(say)
         if installed is not None and installed.ok and installed.library is not None:
             say(f"{installed.library.label}: works")
             return 0
+        if installed is not None:
+            say(llvm.explain([installed]))
     say(f"No usable LLVM of version {llvm.MINIMUM_MAJOR} or newer. Please run this line, then the same make command:")
     say(f"    {llvm.install_line()}")
     return 1

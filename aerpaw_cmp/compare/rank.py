@@ -65,7 +65,7 @@ def singular_values(h: ArrayLike) -> FloatArray:
         part = flat[start : start + step]
         good = np.isfinite(part).all(axis=(1, 2))
         result[start : start + step][good] = np.linalg.svd(_scaled(part[good]), compute_uv=False)
-    return result.reshape(*lead, -1)
+    return result.reshape(*lead, min(rows, columns))
 
 
 def _scaled(matrix: ComplexArray) -> ComplexArray:
@@ -345,7 +345,7 @@ class KCurve:
     best_k_agreement, best_k_total_variation : float
         Where the best value is reached (the middle, on the log scale, of the best run of K); NaN without a pair.
     best_k_interval, best_k_total_variation_interval : (low, high)
-        Central 95 % of the best K over the bootstrap replicates.
+        Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
     at_edge : bool
         The best agreement is reached at an end of the grid.
     """
@@ -389,24 +389,25 @@ def k_curve(
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
         return KCurve(grid, nothing, nothing, float("nan"), NO_INTERVAL, float("nan"), NO_INTERVAL, False)
-    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1)
+    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
     equal = (ranks == ri[:, None]).astype(np.float64)
-    apart = [(ranks == r).astype(np.float64) - (ri == r)[:, None] for r in range(1, MAX_RANK + 1)]
     length = memory(equal.mean(axis=1)).block_length
-    drawn = np.split(
-        bootstrap_means(np.hstack([equal, *apart]), length, replicates=replicates, seed=seed), 1 + MAX_RANK, axis=1
-    )
-    agree, vary = equal.mean(axis=0), 0.5 * sum(np.abs(part.mean(axis=0)) for part in apart)
-    varied = 0.5 * np.sum([np.abs(part) for part in drawn[1:]], axis=0)
-    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-np.asarray(vary)[None], grid)[0]
+    agree = equal.mean(axis=0)
+    drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
+    vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
+    for rank in range(1, MAX_RANK + 1):  # the same seed draws the same blocks each time
+        apart = (ranks == rank).astype(np.float64) - (ri == rank)[:, None]
+        vary += 0.5 * np.abs(apart.mean(axis=0))
+        varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
+    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
     return KCurve(
         grid,
         agree,
-        np.asarray(vary),
+        vary,
         float(best),
-        _central(_middle_of_best(drawn[0], grid)),
+        _central(_middle_of_best(drawn, grid), grid),
         float(best_tv),
-        _central(_middle_of_best(-varied, grid)),
+        _central(_middle_of_best(-varied, grid), grid),
         bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
     )
 
@@ -421,9 +422,12 @@ def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
     return np.asarray(np.sqrt(k[first] * k[end]))
 
 
-def _central(values: FloatArray) -> Interval:
+def _central(values: FloatArray, k: FloatArray) -> Interval:
+    """Central 95 % of best values, one grid step wider on either side: nothing finer was tried."""
     low, high = np.quantile(values, [0.025, 0.975])
-    return float(low), float(high)
+    first = max(0, int(np.searchsorted(k, low * (1 + 1e-9))) - 2)
+    last = min(len(k) - 1, int(np.searchsorted(k, high * (1 - 1e-9))) + 1)
+    return float(min(k[first], low)), float(max(k[last], high))
 
 
 def condition_number_rank(h: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
@@ -483,6 +487,35 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
     return np.where(alive, best, 0).astype(np.int64)
 
 
+def profile_by_rank(measured: ArrayLike, sigma: ArrayLike) -> dict[int, FloatArray]:
+    """Singular-value profiles behind each measured rank: what the channel was where the RI was 2.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        RI; NaN where none.
+    sigma : array_like, (n, m)
+        Singular values, descending.
+
+    Returns
+    -------
+    dict of int to ndarray, (3, m)
+        Lower quartile, median, upper quartile of ``20 log10 (sigma_i / sigma_1)`` [dB] where the RI was that rank. A
+        threshold rule with K explains a rank r if the median of column r lies above ``-20 log10 K`` and that of
+        column r + 1 below.
+    """
+    ri, profile = _ranks(measured), np.asarray(sigma, dtype=np.float64)
+    alive = (ri >= 1) & (profile[:, 0] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio_db = 20.0 * np.log10(profile / profile[:, :1])
+    result = {}
+    for rank in np.unique(ri[alive]).astype(int):
+        rows = np.sort(ratio_db[alive & (ri == rank)], axis=0)
+        # order statistics, not interpolation: ratios of rank-deficient channels are minus infinity
+        result[int(rank)] = rows[np.round(np.array([0.25, 0.5, 0.75]) * (len(rows) - 1)).astype(int)]
+    return result
+
+
 @dataclass(frozen=True, slots=True)
 class Staleness:
     """How long the modem's report was held.
@@ -526,7 +559,8 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, Array
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (others or {}).values())]
     if len(columns) > 1:
-        fresh = known & _changes(columns)
+        told = np.any([np.isfinite(c) for c in columns[1:]], axis=0)  # a row without further numbers proves nothing
+        fresh = known & (_changes(columns) | ~told)
     else:
         fresh = known & _period_starts(ri)
     constant = all(np.ptp(c[np.isfinite(c)]) == 0 for c in columns if np.isfinite(c).any())

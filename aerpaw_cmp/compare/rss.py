@@ -335,6 +335,66 @@ def same_footing(
 # --- where the residual comes from ---------------------------------------------------------------------------------
 
 
+def link_geometry(
+    tower_m: ArrayLike,
+    position_m: FloatArray,
+    rotation: FloatArray | None = None,
+    *,
+    tower_mount: FloatArray | None = None,
+    uav_mount: FloatArray | None = None,
+) -> dict[str, FloatArray]:
+    """What the residual may depend on, for every pose.
+
+    Parameters
+    ----------
+    tower_m : (3,)
+        Array centre, east-north-up [m].
+    position_m : (n, 3)
+        UAV [m].
+    rotation : (n, 3, 3), optional
+        Aircraft body to east-north-up.
+    tower_mount, uav_mount : (3, 3), optional
+        Rotation of each array in its carrier (site axes; aircraft body); by default the identity.
+
+    Returns
+    -------
+    dict of str to ndarray (n,)
+        ``distance_m``, ``elevation_deg`` and ``azimuth_deg`` of the UAV from the tower (clockwise from north),
+        ``tower_azimuth_deg`` and ``tower_elevation_deg`` in the tower's array frame (azimuth from its boresight
+        towards its left), ``height_m``; with ``rotation`` also ``heading_deg``, ``uav_azimuth_deg`` and
+        ``uav_elevation_deg`` of the tower in the UAV's array frame.
+
+    Examples
+    --------
+    >>> found = link_geometry([0, 0, 10], np.array([[100.0, 0.0, 110.0]]))
+    >>> found["azimuth_deg"].round(6).tolist(), found["elevation_deg"].round(6).tolist()
+    ([90.0], [45.0])
+    """
+    place = np.asarray(position_m, dtype=np.float64)
+    ray = place - np.asarray(tower_m, dtype=np.float64)
+    found = {
+        "distance_m": np.linalg.norm(ray, axis=1),
+        "elevation_deg": np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))),
+        "azimuth_deg": np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360.0,
+        "height_m": place[:, 2],
+    }
+    seen = ray @ (np.eye(3) if tower_mount is None else tower_mount)
+    found["tower_azimuth_deg"], found["tower_elevation_deg"] = _direction_deg(seen)
+    if rotation is not None:
+        body = np.einsum("nji,nj->ni", rotation, -ray)
+        found["uav_azimuth_deg"], found["uav_elevation_deg"] = _direction_deg(
+            body @ (np.eye(3) if uav_mount is None else uav_mount)
+        )
+        found["heading_deg"] = np.degrees(np.arctan2(rotation[:, 0, 0], rotation[:, 1, 0])) % 360.0
+    return found
+
+
+def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Azimuth from x towards y and elevation above the x-y plane [deg]."""
+    flat = np.hypot(vector[:, 0], vector[:, 1])
+    return np.degrees(np.arctan2(vector[:, 1], vector[:, 0])), np.degrees(np.arctan2(vector[:, 2], flat))
+
+
 @dataclass(frozen=True, slots=True)
 class ResidualBins:
     """Residual against one quantity.
@@ -360,6 +420,10 @@ class ResidualBins:
     low_db: FloatArray
     high_db: FloatArray
     explained: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json and tables."""
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike | int = 12) -> ResidualBins:
@@ -436,7 +500,9 @@ class ErrorSpan:
     position_m : tuple of float
         Mean east, north, up of the span [m]; empty if no positions were given.
     cause : str
-        Likely cause, from the geometry; ``"unknown"`` if nothing stands out.
+        Likely cause, by rules of thumb from the geometry.
+    geometry : mapping of str to float
+        Median of each context quantity in the span.
     """
 
     start_s: float
@@ -446,6 +512,11 @@ class ErrorSpan:
     worst_db: float
     position_m: tuple[float, ...]
     cause: str
+    geometry: Mapping[str, float] = field(default_factory=dict)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json and tables."""
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
 def error_spans(
@@ -499,6 +570,7 @@ def error_spans(
             ErrorSpan(
                 float(t[a]), float(t[b - 1]), int(b - a), float(part.mean()),
                 float(part[np.argmax(np.abs(part))]), centre, _likely_cause(where, slice(a, b), float(part.mean())),
+                {name: _typical(values[a:b]) for name, values in where.items()},
             )
         )  # fmt: skip
     found.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
@@ -509,9 +581,7 @@ def _likely_cause(context: Mapping[str, Any], span: slice, mean_db: float) -> st
     """The first rule of thumb that the geometry of a span fits, strongest physics first."""
 
     def typical(name: str) -> float:
-        values = np.asarray(context[name][span], dtype=np.float64) if name in context else np.zeros(0)
-        values = values[np.isfinite(values)]
-        return float(np.median(values)) if len(values) else float("nan")
+        return _typical(context[name][span]) if name in context else float("nan")
 
     if typical("height_m") < 5.0:
         return "take-off or landing: the UAV is near the ground and near its own obstacles"
@@ -527,6 +597,13 @@ def _likely_cause(context: Mapping[str, Any], span: slice, mean_db: float) -> st
     if turn > 45.0:
         return f"turn by {turn:.0f} deg: the airframe or the UAV pattern"
     return "unmodelled loss or pattern" if mean_db < 0 else "unmodelled path or pattern"
+
+
+def _typical(values: Any) -> float:
+    """Median without NaN."""
+    known = np.asarray(values, dtype=np.float64)
+    known = known[np.isfinite(known)]
+    return float(np.median(known)) if len(known) else float("nan")
 
 
 def _turn_deg(heading_deg: Any) -> float:
@@ -563,6 +640,11 @@ class ChannelDifference:
     share_parted: float
     interval_std_db: Interval
     spans: list[ErrorSpan]
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json and tables."""
+        names = {name: getattr(self, name) for name in self.__slots__ if name != "spans"}
+        return dict(plain({**names, "spans": [span.as_dict() for span in self.spans]}))
 
 
 def channel_difference(

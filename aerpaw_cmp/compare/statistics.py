@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import FloatArray
+from ..units import FloatArray, IntArray, wrap_degrees
 
 REPLICATES = 1000
 """Bootstrap replicates."""
@@ -249,9 +249,12 @@ def interval(
     with np.errstate(divide="ignore", invalid="ignore"):
         value = float(np.asarray(forward(np.asarray(estimate))) if forward else estimate)
         drawn = np.asarray(forward(replicates) if forward else replicates, dtype=np.float64)
+    if not np.isfinite(value):  # at the end of its scale (RMSE 0, correlation 1): the spread itself must do
+        low, high = np.nanquantile(np.append(replicates, estimate), [0.025, 0.975])
+        return float(low), float(high)
     good = drawn[np.isfinite(drawn)]
-    if len(good) < 2 or not np.isfinite(value):
-        return (estimate, estimate) if len(good) else NO_INTERVAL
+    if len(good) < 2:
+        return NO_INTERVAL
     centre = value - (float(good.mean()) - value)
     reach = known.half_width * _spread(good)
     ends = np.array([centre - reach, centre + reach])
@@ -386,6 +389,47 @@ class Repeatability:
     interval_db: Interval
 
 
+def same_places(
+    position_m: FloatArray,
+    other_position_m: FloatArray,
+    *,
+    radius_m: float = 2.0,
+    heading_deg: FloatArray | None = None,
+    other_heading_deg: FloatArray | None = None,
+    heading_within_deg: float = 20.0,
+) -> tuple[IntArray, IntArray]:
+    """Samples of two passes at the same places: flights of one route laid over each other.
+
+    Parameters
+    ----------
+    position_m, other_position_m : (n, 3), (m, 3)
+        Places [m]; rows with NaN pair with nothing.
+    radius_m : float
+        A sample pairs with the nearest one of the other pass within this distance [m].
+    heading_deg, other_heading_deg : (n,), (m,), optional
+        Where given, the headings of a pair agree within ``heading_within_deg``.
+
+    Returns
+    -------
+    (here, there) : each (pairs,) int
+        Indices into both passes.
+    """
+    from scipy.spatial import cKDTree
+
+    here = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+    there = np.flatnonzero(np.isfinite(other_position_m).all(axis=1))
+    if not len(here) or not len(there):
+        return here[:0], there[:0]
+    distance, nearest = cKDTree(other_position_m[there]).query(position_m[here], distance_upper_bound=radius_m)
+    paired = np.isfinite(distance)
+    here, there = here[paired], there[nearest[paired]]
+    if heading_deg is not None and other_heading_deg is not None:
+        turn = wrap_degrees(other_heading_deg[there] - heading_deg[here])
+        same = np.abs(turn) <= heading_within_deg
+        here, there = here[same], there[same]
+    return here, there
+
+
 def repeatability(
     position_m: FloatArray,
     level_db: FloatArray,
@@ -397,32 +441,20 @@ def repeatability(
     other_heading_deg: FloatArray | None = None,
     heading_within_deg: float = 20.0,
 ) -> Repeatability:
-    """Repeatability floor of two passes (two flights, or two parts of one).
+    """Repeatability floor of two passes (two flights, or two parts of one); arguments as in :func:`same_places`.
 
-    Parameters
-    ----------
-    position_m, other_position_m : (n, 3), (m, 3)
-        Places [m]; rows with NaN are left out, as are NaN levels.
-    level_db, other_level_db : (n,), (m,)
-        Levels [dB].
-    radius_m : float
-        A sample pairs with the nearest one of the other pass within this distance [m].
-    heading_deg, other_heading_deg : (n,), (m,), optional
-        Where given, headings of a pair agree within ``heading_within_deg``.
+    ``level_db`` (n,) and ``other_level_db`` (m,) are the levels [dB]; NaN is left out.
     """
-    from scipy.spatial import cKDTree
-
-    here = np.flatnonzero(np.isfinite(position_m).all(axis=1) & np.isfinite(level_db))
-    there = np.flatnonzero(np.isfinite(other_position_m).all(axis=1) & np.isfinite(other_level_db))
-    if not len(here) or not len(there):
-        return Repeatability(float("nan"), float("nan"), 0, NO_INTERVAL)
-    distance, nearest = cKDTree(other_position_m[there]).query(position_m[here], distance_upper_bound=radius_m)
-    paired = np.isfinite(distance)
-    here, there = here[paired], there[nearest[paired]]
-    if heading_deg is not None and other_heading_deg is not None:
-        turn = (other_heading_deg[there] - heading_deg[here] + 180.0) % 360.0 - 180.0
-        same = np.abs(turn) <= heading_within_deg
-        here, there = here[same], there[same]
+    heard, other_heard = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
+    here, there = same_places(
+        position_m[heard],
+        other_position_m[other_heard],
+        radius_m=radius_m,
+        heading_deg=None if heading_deg is None else heading_deg[heard],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+        heading_within_deg=heading_within_deg,
+    )
+    here, there = heard[here], other_heard[there]
     if not len(here):
         return Repeatability(float("nan"), float("nan"), 0, NO_INTERVAL)
     difference = other_level_db[there] - level_db[here]

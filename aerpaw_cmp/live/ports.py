@@ -106,8 +106,8 @@ def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
         for tty in ttys:
             usb = _usb_of(tty.name, roots)
             node = roots.dev / tty.name
-            if usb and usb[0].startswith(QUECTEL_VENDOR) and usb[1] == interface and node not in known:
-                found.append(PortInfo(node, node, "usb", interface, usb[0]))
+            if usb and usb[0].startswith(QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
+                found.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
     for name in ("mhi_DUN", "smd11"):
         if (roots.dev / name).exists():
             found.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
@@ -134,13 +134,13 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     path = Path(port)
     if not path.exists():
         raise PortGoneError(f"{path} is not there")
-    usb = _usb_of(path.resolve().name, roots)
+    usb = _usb_of(path.resolve().name, roots) or _usb_of(path.name, roots)
     interface, product = (usb[1], usb[0]) if usb else (None, None)
     by_id = roots.dev / "serial/by-id"
     if path.parent == roots.dev and by_id.is_dir():
         for link in sorted(by_id.iterdir()):
             if link.resolve() == path.resolve():
-                return PortInfo(link, path, "by-id", interface, product)
+                return PortInfo(link, path.resolve(), "by-id", interface, product)
     return PortInfo(path, path.resolve(), "given", interface, product)
 
 

@@ -1,7 +1,7 @@
 """A modem that is not there: a pseudo-terminal that answers like an RM502Q-AE, with faults on request.
 
 It speaks to whatever opens the port, so the tap, a terminal program and the tests all use the same thing. Answers
-come from a simulated flight, from a captured transcript, or from an earlier tap log.
+come from a built-in flight, a captured transcript, an earlier tap log, or the ranks of any log that a reader knows.
 """
 
 from __future__ import annotations
@@ -17,12 +17,14 @@ import select
 import termios
 import threading
 import time
+from bisect import bisect_right
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..errors import InputError, UsageError
+from ..errors import AerpawCmpError, InputError, UsageError
+from ..readers import ReadOptions, identify
 from .framing import Answer, frame_transcript
 from .log import BadLine, read_log
 from .modem import QUERIES
@@ -101,7 +103,7 @@ class ModemSimSettings:
     link : Path, optional
         A symbolic link to the port, kept right when the port changes its number; None: no link.
     source : Path, optional
-        A transcript or tap log to play; None: the simulated flight.
+        What to play: a transcript, a tap log, or a log with ranks that a reader knows; None: a built-in flight.
     kind : {"modem", "gps", "diag", "silent", "rubbish"}
         What hangs on the port.
     faults : Faults
@@ -286,6 +288,54 @@ def load_recorded(path: Path) -> RecordedModem:
     return modem
 
 
+def load_source(path: Path, options: ReadOptions | None = None) -> FlightModem | RecordedModem:
+    """A modem that plays a file: a transcript, a tap log, or the ranks of any log that a reader knows.
+
+    So a flight made by ``aerpaw-cmp simulate`` can be flown again against the tap.
+
+    Parameters
+    ----------
+    path : Path
+    options : ReadOptions, optional
+        For the reader; only time differences matter here, so the zone is UTC by default.
+
+    Raises
+    ------
+    InputError
+        If there is nothing to play in it.
+    """
+    try:
+        return load_recorded(path)
+    except InputError as error:
+        if not path.is_file():
+            raise
+        ranks = _ranks_of(path, options or ReadOptions(timezone="UTC", ri_base="one"))
+        if ranks is None:
+            raise error from None
+        return FlightModem(ranks)
+
+
+def _ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
+    """Rank over time since the start of a log, None if no reader finds ranks in it."""
+    data = path.read_bytes()
+    try:
+        result = identify(data).read(data, options)
+    except AerpawCmpError:
+        return None
+    streams = [stream for stream in result.streams if stream.kind == "rank" and len(stream.frame)]
+    if not streams:
+        return None
+    frame = streams[0].frame.sort_values("time")
+    times = frame["time"].to_numpy().astype("datetime64[ns]").astype("int64")
+    seconds = [float(t - times[0]) / 1e9 for t in times]
+    ranks = [0 if math.isnan(rank) else round(rank) for rank in frame["rank"].to_numpy(dtype="float64").tolist()]
+
+    def rank(elapsed_s: float) -> int:
+        return ranks[max(0, bisect_right(seconds, elapsed_s % (seconds[-1] + 1.0)) - 1)]
+
+    return rank
+
+
 def _final_text(status: str, code: str | None) -> str:
     return f"+{status.upper()} ERROR: {code}" if status in ("cme", "cms") else _FINAL[status]
 
@@ -316,7 +366,7 @@ class ModemSimulator:
         self.settings = settings or ModemSimSettings()
         self._modem: FlightModem | RecordedModem
         if self.settings.source is not None:
-            self._modem = load_recorded(self.settings.source)
+            self._modem = load_source(self.settings.source)
         else:
             self._modem = FlightModem(self.settings.rank or flight_rank, self.settings.csi_on)
         self._random = random.Random(self.settings.faults.seed)
@@ -325,6 +375,7 @@ class ModemSimulator:
         self._stop = threading.Event()
         self._unplugged = threading.Event()
         self._answered = 0
+        self._pending: Served | None = None
         self.journal: list[Served] = []
         self.unplugs: list[int] = []
         self.keep_journal = True
@@ -363,6 +414,7 @@ class ModemSimulator:
         """Pull the cable: the port hangs up and its node goes away."""
         with self._lock:
             self._unplugged.set()
+            self._pending = None  # nobody can tell whether it was read
             self.unplugs.append(time.monotonic_ns())
             old, self._master = self._master, -1
             if self.settings.link is not None:
@@ -478,8 +530,10 @@ class ModemSimulator:
             self._stop.wait(0.05)
 
     def _serve(self, command: str) -> None:
-        if self.journal:
-            self.journal[-1].read = True
+        with self._lock:
+            if self._pending is not None:
+                self._pending.read = True
+                self._pending = None
         if self.settings.kind != "modem" or not command:
             return
         faults = self.settings.faults
@@ -496,14 +550,20 @@ class ModemSimulator:
         data, lines = self._spoil(number, reply)
         if not data:
             return
+        served = Served(number, command, lines, time.monotonic_ns())
+        with self._lock:  # before the bytes go out: who reads them may look here at once
+            self._pending = served
+            if self.keep_journal:
+                self.journal.append(served)
         if faults.bytewise_s > 0:
             sent = all(
                 self._write(data[i : i + 1]) and not self._stop.wait(faults.bytewise_s) for i in range(len(data))
             )
         else:
             sent = self._write(data)
-        if sent and self.keep_journal:
-            self.journal.append(Served(number, command, lines, time.monotonic_ns()))
+        with self._lock:
+            if not sent and self.keep_journal:
+                self.journal.pop()
 
     def _spoil(self, number: int, reply: Reply) -> tuple[bytes, tuple[str, ...]]:
         """Bytes of an answer with the faults of its number, and its lines without final result."""

@@ -21,7 +21,7 @@ from typing import Any
 from .. import __version__
 from ..errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
-from .log import SCHEMA, Clock, Record, SegmentLog, boot_id
+from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
 from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
 from .predict import Predict, PredictionWorker
@@ -105,7 +105,12 @@ class Tap:
 
     def run(self) -> TapSummary:
         """Connect, poll until asked to stop, end cleanly."""
-        self._first_connection()
+        try:
+            self._first_connection()
+        except BaseException:
+            if self._worker is not None:
+                self._worker.close()
+            raise
         try:
             if not self._stop.count:
                 self._log.open()
@@ -113,6 +118,8 @@ class Tap:
                 for record in self._early:
                     self._log.append(record)
                 self._early.clear()
+                if clock_synchronised() is False:
+                    self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
                 self._poll_until_stopped()
         finally:
             summary = self._finish()
@@ -122,7 +129,7 @@ class Tap:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
         while not self._stop.count:
             try:
-                self._connect(self._settings.port)
+                self._connect()
                 return
             except (PortGoneError, InputError) as error:
                 if self._clock.mono_ns() >= deadline:
@@ -214,26 +221,40 @@ class Tap:
 
     # the port ---------------------------------------------------------------------------------------------
 
-    def _connect(self, name: str | Path | None) -> None:
-        """Open the port (or, if it turned into another, the modem's other candidates) and probe it."""
-        ports = [find_port(name, self._settings.roots)] if name is not None else []
-        if name is None or ports[0].product is not None:
-            known = {port.device for port in ports}
-            ports += [port for port in find_candidates(self._settings.roots) if port.device not in known]
-        if not ports:
-            find_port(None, self._settings.roots)  # raises with the reason
+    def _connect(self) -> None:
+        """Open and probe the first port that answers."""
         first_error: PortGoneError | InputError | None = None
-        for info in ports:
+        for info in self._ports_to_try():
             try:
                 self._open_and_probe(info)
                 return
             except (PortGoneError, InputError) as error:
                 self._close_port()
                 first_error = first_error or error
-                if name is not None and self._info is None:
-                    break  # the user named it: do not take another at the start
         assert first_error is not None
         raise first_error
+
+    def _ports_to_try(self) -> list[PortInfo]:
+        """At the start what the user named, or every AT port; after a loss the same interface, wherever it is now."""
+        roots, last = self._settings.roots, self._info
+        if last is None:
+            named = self._settings.port
+            found = find_candidates(roots) if named is None else []
+            return found or [find_port(named, roots)]
+        found = []
+        try:
+            now = find_port(last.path, roots)
+            if now.interface == last.interface:  # else the number now belongs to another port of the modem
+                found.append(now)
+        except PortGoneError:
+            pass
+        if last.product is not None:
+            known = {port.device for port in found}
+            others = [p for p in find_candidates(roots) if p.product == last.product and p.device not in known]
+            found += sorted(others, key=lambda port: port.interface != last.interface)
+        if not found:
+            raise PortGoneError(f"{last.path} is not there")
+        return found
 
     def _open_and_probe(self, info: PortInfo) -> None:
         self._framer = Framer()
@@ -275,8 +296,7 @@ class Tap:
             self._wait(pause)
             pause = min(2 * pause, self._settings.reconnect_max_s)
             try:
-                # the stable name first; a given node that is gone may be back under another number
-                self._connect(self._info.path if self._info is not None else self._settings.port)
+                self._connect()
                 break
             except (PortGoneError, InputError) as error:
                 if isinstance(error, InputError) and str(error) != told:
@@ -613,6 +633,7 @@ class Tap:
             "session": self._session,
             "tool": f"aerpaw-cmp {__version__}",
             "boot_id": boot_id(),
+            "clock_synchronised": clock_synchronised(),
             "ri_base": "one",
             "time": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime(self._clock.utc_ns() / 1e9)),
             "port": self._port_record(),

@@ -275,7 +275,7 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(3.4, 0.9 if not layer.classes else 0.45 + 0.23 * len(layer.classes)), dpi=110)
+    figure = Figure(figsize=(4.2, 0.9 if not layer.classes else 0.35 + 0.18 * len(layer.classes)), dpi=110)
     FigureCanvasAgg(figure)
     figure.patch.set_alpha(0.9)
     figure.suptitle(layer.title, fontsize=9, y=0.98, va="top")

@@ -36,7 +36,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import UsageError
-from ..units import AnyArray, BoolArray, FloatArray, IntArray
+from ..units import BoolArray, FloatArray, IntArray
 from . import neighbours as choose
 
 Correlation = Callable[[FloatArray], FloatArray]
@@ -46,6 +46,7 @@ CONDITION_LIMIT = 1e10
 SHARE_M = 1e-9
 """Targets whose neighbours' offsets agree to this share one set of weights."""
 CHUNK = 2048
+"""Targets solved at once; bounds the memory."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -247,14 +248,13 @@ class OrdinaryKriging:
         variance = np.full(len(targets), np.nan)
         regularised = np.zeros(len(targets), dtype=bool)
         for m in np.unique(count[count > 0]):
-            rows = np.flatnonzero(count == m)
-            index = chosen.index[rows, :m]
-            example, group = _same_geometry(samples, targets[rows], index)
-            for part in _chunks(len(example)):
-                offset = samples[index[example[part]]] - targets[rows[example[part]], None, :]
-                w, v, r = self._solve(offset)
-                for into, what in ((weight, w), (variance, v), (regularised, r)):
-                    _spread(into, rows, int(m), group, part, what)
+            same = np.flatnonzero(count == m)
+            for start in range(0, len(same), CHUNK):
+                rows = same[start : start + CHUNK]
+                offset = samples[chosen.index[rows, :m]] - targets[rows, None, :]
+                example, group = _same_geometry(offset)
+                w, v, r = self._solve(offset[example])
+                weight[rows, :m], variance[rows], regularised[rows] = w[group], v[group], r[group]
         return Weights(chosen.index, weight, variance, regularised)
 
     def _neighbours(self, samples: FloatArray, targets: FloatArray, skip: IntArray | None) -> choose.Neighbours:
@@ -405,31 +405,16 @@ def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, F
     return points[first[order]], mean, place
 
 
-def _same_geometry(samples: FloatArray, targets: FloatArray, index: IntArray) -> tuple[IntArray, IntArray]:
-    """Targets whose neighbours lie at the same offsets: (one target of each group, group of each target)."""
-    alone = np.arange(len(targets)), np.arange(len(targets))
-    if len(targets) < 2:
-        return alone
-    offset = np.round((samples[index] - targets[:, None, :]).reshape(len(targets), -1) / SHARE_M).astype(np.int64)
-    multipliers = np.random.default_rng(0).integers(1, 2**62, offset.shape[1], dtype=np.int64) | 1
-    _, example, group = np.unique(offset @ multipliers, return_index=True, return_inverse=True)
+def _same_geometry(offset_m: FloatArray) -> tuple[IntArray, IntArray]:
+    """Targets whose neighbours lie at the same offsets (t, m, dims): (one of each group, group of each target)."""
+    alone = np.arange(len(offset_m)), np.arange(len(offset_m))
+    offset = np.round(offset_m.reshape(len(offset_m), -1) / SHARE_M).astype(np.int64)
+    # a row is told by one number: the sum with random odd factors, modulo 2^64
+    factors = np.random.default_rng(0).integers(1, 2**62, offset.shape[1], dtype=np.int64) | 1
+    _, example, group = np.unique(offset @ factors, return_index=True, return_inverse=True)
     if not (offset[example[group]] == offset).all():
-        return alone  # a collision of the hash: nothing is shared, the result is the same
+        return alone  # two rows with one number: nothing is shared, the result is the same
     return example, group
-
-
-def _spread(into: AnyArray, rows: IntArray, m: int, group: IntArray, part: slice, what: AnyArray) -> None:
-    """Copy results of the geometries in ``part`` to every target that shares them."""
-    mine = (group >= part.start) & (group < part.stop)
-    if what.ndim == 2:
-        into[rows[mine], :m] = what[group[mine] - part.start]
-    else:
-        into[rows[mine]] = what[group[mine] - part.start]
-
-
-def _chunks(length: int) -> Iterator[slice]:
-    for start in range(0, length, CHUNK):
-        yield slice(start, min(start + CHUNK, length))
 
 
 def _as_points(points_m: ArrayLike) -> FloatArray:

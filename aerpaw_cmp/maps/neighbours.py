@@ -2,16 +2,21 @@
 
 The tie rule. Distances that agree to a micrometre are tied. Tied samples are taken by their offset from the
 target: lower first, then southern first, then western first. On a regular grid the rule gives every inner
-target the same pattern of neighbours, and it does not depend on the order in which samples were given.
+target the same pattern of neighbours, and it does not depend on the order in which samples were given (only samples
+at the same place are taken in that order).
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
 from ..units import FloatArray, IntArray
+
+CHUNK = 4096
+"""Targets per query; bounds the memory."""
 
 TIE_M = 1e-6
 """Distances closer than this are tied; a sample closer than this to a target is at its place."""
@@ -67,7 +72,23 @@ def nearest(
     if len(samples_m) == 0 or len(targets_m) == 0:
         return Neighbours(index, distance)
     tree = cKDTree(samples_m)
-    todo = np.arange(len(targets_m))
+    for start in range(0, len(targets_m), CHUNK):
+        part = np.arange(start, min(start + CHUNK, len(targets_m)))
+        _fill_nearest(tree, targets_m, part, radius_m, skip, index, distance)
+    return Neighbours(index, distance)
+
+
+def _fill_nearest(
+    tree: Any,
+    targets_m: FloatArray,
+    todo: IntArray,
+    radius_m: float,
+    skip: IntArray | None,
+    index: IntArray,
+    distance: FloatArray,
+) -> None:
+    """Fill the rows ``todo`` of index and distance; ask for more candidates where a tie reaches the last one."""
+    samples_m, m = tree.data, index.shape[1]
     # a ring of equal distance holds at most 12 cells on the paper's grid; where a ring is larger, ask again
     wanted = m + 13
     while len(todo):
@@ -91,7 +112,6 @@ def nearest(
         distance[rows, :width] = chosen_distance[complete]
         todo = todo[~complete]
         wanted *= 2
-    return Neighbours(index, distance)
 
 
 def _in_micrometres(distance_m: FloatArray) -> FloatArray:
@@ -99,10 +119,10 @@ def _in_micrometres(distance_m: FloatArray) -> FloatArray:
 
 
 def _tie_order(found: FloatArray, who: IntArray, samples_m: FloatArray, targets_m: FloatArray) -> IntArray:
-    """Order of candidates by distance, then offset (up, north, east)."""
+    """Order of candidates by distance, then offset (up, north, east), then number."""
     offset = _in_micrometres(samples_m[who] - targets_m[:, None, :])
     keys = [offset[:, :, axis] for axis in range(offset.shape[2])]
-    return np.lexsort((*keys, _in_micrometres(found)), axis=-1)
+    return np.lexsort((who, *keys, _in_micrometres(found)), axis=-1)
 
 
 def random_within(

@@ -186,6 +186,43 @@ def vertical_correlation(
     return BinnedCorrelation(*sums.means(), levels, excluded, 0)
 
 
+def fit_vertical_scale(
+    correlation: Callable[[FloatArray], FloatArray],
+    vertical: BinnedCorrelation,
+    bounds: tuple[float, float] = (0.1, 1000.0),
+) -> float:
+    """How many horizontal metres one metre of height is worth: least squares of ``Phi(scale * height)``.
+
+    Parameters
+    ----------
+    correlation : callable
+        Horizontal Phi(distance [m]).
+    vertical : BinnedCorrelation
+        Of :func:`vertical_correlation`.
+    bounds : (low, high)
+        Of the scale.
+
+    Returns
+    -------
+    float
+        For ``OrdinaryKriging(vertical_scale=...)``.
+    """
+    from scipy.optimize import minimize_scalar
+
+    usable = np.isfinite(vertical.correlation) & (vertical.mean_distance_m > 0)
+    if not usable.any():
+        raise UsageError("no two altitudes to compare", expected="maps of at least two altitudes that vary")
+    height, phi = vertical.mean_distance_m[usable], vertical.correlation[usable]
+
+    def cost(log_scale: float) -> float:
+        return float(((np.asarray(correlation(np.exp(log_scale) * height)) - phi) ** 2).sum())
+
+    axis = np.linspace(np.log(bounds[0]), np.log(bounds[1]), 200)
+    best = int(np.argmin([cost(a) for a in axis]))
+    bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
+    return float(np.exp(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-9}).x))
+
+
 # --- pairs ----------------------------------------------------------------------------------------------------------
 
 Block = Callable[[IntArray, IntArray], FloatArray]

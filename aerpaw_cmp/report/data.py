@@ -94,6 +94,45 @@ class Baseline:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """Another way to simulate the same panel, as a row of one table: iso arrays, measured patterns, with trees ...
+
+    ``fitted`` names what was fitted, and on which flight.
+    """
+
+    name: str
+    offset_db: float
+    rmse_db: float
+    rmse_ci95_db: Interval | None = None
+    fitted: str = "offset, on this flight"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelPair:
+    """Difference of two channels of one tower over the same instants.
+
+    Parameters
+    ----------
+    tower, first, second : str
+    time, difference_db : (n,)
+        First minus second, after each one's offset; NaN where one has no signal.
+    simulated_difference_db : (n,), optional
+        The same from the simulation.
+    apart : tuple of ErrorSpan
+        Where they part by more than ``limit_db``.
+    """
+
+    tower: str
+    first: str
+    second: str
+    time: AnyArray
+    difference_db: FloatArray
+    simulated_difference_db: FloatArray | None = None
+    limit_db: float = 10.0
+    apart: tuple[ErrorSpan, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class OffsetCurve:
     """RMSE [dB] against candidate offset [dB], both (m,)."""
 
@@ -150,6 +189,8 @@ class RssPanel:
         Keys of :data:`GEOMETRY` to arrays (n,), for the residual plots.
     line_of_sight : (n,) bool, optional
         For the residual plots.
+    variants : tuple of Variant
+        Other simulations of the same samples, for one table of RMSE.
     extra : mapping
         More numbers for ``metrics.json`` and the table of this panel.
     """
@@ -183,6 +224,7 @@ class RssPanel:
     geometry: Mapping[str, FloatArray] = field(default_factory=dict)
     line_of_sight: BoolArray | None = None
     worst: tuple[ErrorSpan, ...] = ()
+    variants: tuple[Variant, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
 
     @property
@@ -372,7 +414,7 @@ class ReportData:
         UTC, ISO 8601.
     versions : mapping of str to str
     inputs : tuple of InputFile
-    track, waypoints, rss, rank, engine, speed
+    track, waypoints, rss, rank, pairs, engine, speed
         See their classes.
     synthetic : bool
         The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
@@ -398,6 +440,7 @@ class ReportData:
     waypoints: tuple[Waypoint, ...] = ()
     rss: tuple[RssPanel, ...] = ()
     rank: tuple[RankPanel, ...] = ()
+    pairs: tuple[ChannelPair, ...] = ()
     engine: Engine | None = None
     speed: tuple[SpeedRow, ...] = ()
     synthetic: bool = False

@@ -119,7 +119,7 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "warnings": list(data.warnings),
     }
     safe: dict[str, Any] = json_safe(result)
-    _merge(safe, json_safe(data.extra_metrics))
+    merge(safe, json_safe(data.extra_metrics))
     return safe
 
 
@@ -144,6 +144,9 @@ def _rss_metrics(panel: RssPanel) -> dict[str, Any]:
         "unit": panel.unit,
         "fitted": list(panel.fitted),
         "baselines": {b.name: {"offset_db": b.offset_db, "rmse_db": b.rmse_db} for b in panel.baselines},
+        "variants": {
+            v.name: {"offset_db": v.offset_db, "rmse_db": v.rmse_db, "fitted": v.fitted} for v in panel.variants
+        },
         **panel.extra,
     }
 
@@ -216,10 +219,11 @@ def _speed_metrics(row: SpeedRow) -> dict[str, Any]:
     return result
 
 
-def _merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+    """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
     for key, value in other.items():
         if isinstance(value, Mapping) and isinstance(into.get(key), dict):
-            _merge(into[key], value)
+            merge(into[key], value)
         else:
             into[key] = value
 
@@ -324,6 +328,19 @@ def write_atomic(path: Path, content: str | bytes) -> Path:
     return path
 
 
+_OWN_FIGURES = re.compile(
+    r"(trajectory|altitude|speed_against_error"
+    r"|(rss|rss_check|rss_residual|rss_angles|pair|rank_(map|histogram|time|confusion|k))_[A-Za-z0-9._-]+)\.(svg|png)"
+)
+
+
+def remove_stale(folder: Path, kept: set[str]) -> None:
+    """Remove figures of an earlier report that this one no longer has; other files are left alone."""
+    for path in folder.glob("*"):
+        if path.name not in kept and _OWN_FIGURES.fullmatch(path.name):
+            path.unlink()
+
+
 def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     """Write the whole report.
 
@@ -347,7 +364,8 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    written = [write_atomic(folder / "metrics.json", json.dumps(metrics(data), indent=2, ensure_ascii=False) + "\n")]
+    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    written = [write_atomic(folder / "metrics.json", numbers)]
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
         # written even without rows, so that the table of an earlier report never stands beside this one
         written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))
@@ -357,6 +375,7 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
         drawn.append(picture)
         written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
         written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    remove_stale(folder / "figures", {path.name for path in written})
     files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
     page = write_atomic(folder / "report.html", html.page(data, drawn, files))
     return [page, *written]

@@ -17,7 +17,7 @@ import numpy as np
 
 from ..site.site import Site
 from ..units import AnyArray, BoolArray, FloatArray
-from .data import GEOMETRY, RANKS, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
+from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
 from .export import k_key, safe_name
 
 if TYPE_CHECKING:
@@ -184,6 +184,17 @@ def thinned(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -
     base = np.arange(buckets) * per
     index = np.minimum(np.sort(np.stack([base + low, base + high], axis=1), axis=1).ravel(), n - 1)
     return east[index], north[index]
+
+
+def spread_out(count: int, most: int) -> AnyArray:
+    """At most ``most`` indices of ``count``, evenly spread, both ends included.
+
+    Examples
+    --------
+    >>> spread_out(9, 3).tolist(), spread_out(2, 5).tolist(), spread_out(0, 3).tolist()
+    ([0, 4, 8], [0, 1], [])
+    """
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)
 
 
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
@@ -650,6 +661,58 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     ax.plot(middle[full], high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
 
 
+def seen_from_tower(panel: RssPanel) -> Figure:
+    """Where the tower's antenna sees the UAV, in the antenna's own frame, coloured by the residual."""
+    azimuth, elevation = panel.geometry["azimuth_deg"], panel.geometry["elevation_deg"]
+    residual = panel.residual_db
+    good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+    fig = figure((9.2, 3.6))
+    ax = fig.subplots()
+    reach = float(np.percentile(np.abs(residual[good]), 98)) if good.any() else 1.0
+    ax.plot(
+        azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+        rasterized=True, label="not scored",
+    )  # fmt: skip
+    points = ax.scatter(
+        azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
+        rasterized=True, label="sample (colour: residual)",
+    )  # fmt: skip
+    ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
+    ax.set_facecolor("#F4F4F4")
+    ax.set_xlabel("Azimuth in the frame of the tower antenna [deg]")
+    ax.set_ylabel("Elevation [deg]")
+    colour_bar(fig, points, ax, "Measured - simulated [dB]")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
+    return fig
+
+
+def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
+    """First minus second channel over time, measured and simulated, with the limit beyond which they part."""
+    start = start_of(data)
+    seconds = seconds_since(pair.time, start)
+    fig = figure((9.2, 3.2))
+    ax = fig.subplots()
+    ax.plot(
+        seconds, pair.difference_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        label="measured", zorder=3,
+    )  # fmt: skip
+    levels = [pair.difference_db]
+    if pair.simulated_difference_db is not None:
+        ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
+        levels.append(pair.simulated_difference_db)
+    for sign in (-1, 1):
+        ax.axhline(
+            sign * pair.limit_db, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)),
+            label=f"{pair.limit_db:g} dB apart" if sign == 1 else None,
+        )  # fmt: skip
+    draw_waypoints(ax, data, start)
+    robust_limits(ax, levels, around=0.0)
+    ax.set_xlabel(time_label(start))
+    ax.set_ylabel(f"{pair.first} - {pair.second} [dB]")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
+    return fig
+
+
 # --- rank ---------------------------------------------------------------------------------------
 
 
@@ -731,32 +794,53 @@ def at_label(at: RankAtK) -> str:
 
 
 def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
-    """Measured rank and the rank of every K over time, one row each, and the singular values under them."""
+    """Measured rank and the rank of every K over time, one row each; SINR and singular values under them."""
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     rows = 1 + len(panel.simulated)
-    values = panel.singular_ratio_db
-    fig = figure((9.2, 1.15 * rows + (2.4 if values is not None else 0.4)))
-    ratios = [1.0] * rows + ([2.2] if values is not None else [])
+    below = [1.3] * (panel.sinr_db is not None) + [2.2] * (panel.singular_ratio_db is not None)
+    ratios = [1.0] * rows + below
+    fig = figure((9.2, 1.1 * sum(ratios) + 0.5))
     axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
-    series = [("measured", panel.measured)]
-    series += [(f"K = {k_key(at.k)}", np.where(at.rank == 0, np.nan, at.rank)) for at in panel.simulated]
-    for number, (ax, (label, rank)) in enumerate(zip(axes, series, strict=False)):
+    draw_measured_rank(axes[0], seconds, panel)
+    for ax, at in zip(axes[1:], panel.simulated, strict=False):
+        rank = np.where(at.rank == 0, np.nan, at.rank)
         ax.plot(
-            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, label=label,
-            color="#0072B2" if number == 0 else SIMULATED,
+            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, color=SIMULATED,
+            label=f"K = {k_key(at.k)}",
         )  # fmt: skip
-        if number:
-            draw_out_of_coverage(ax, seconds, panel.simulated[number - 1].rank == 0, "Z: no path")
+        draw_out_of_coverage(ax, seconds, at.rank == 0, "Z: no path")
+    for number, ax in enumerate(axes[:rows]):
         draw_waypoints(ax, data, start, names=number == 0)
         ax.set_yticks(RANKS)
         ax.set_ylim(0.5, 4.5)
         ax.set_ylabel("Rank")
         ax.legend(*first_labels(ax, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
-    if values is not None:
-        draw_singular_values(axes[-1], seconds, values, panel)
+    if panel.sinr_db is not None:
+        axes[rows].plot(
+            seconds, panel.sinr_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
+            label="SINR",
+        )  # fmt: skip
+        axes[rows].set_ylabel("SINR [dB]")
+        axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+    if panel.singular_ratio_db is not None:
+        draw_singular_values(axes[-1], seconds, panel.singular_ratio_db, panel)
     axes[-1].set_xlabel(time_label(start))
     return fig
+
+
+def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
+    """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
+    held = np.zeros(len(seconds), dtype=bool) if panel.stale is None else panel.stale
+    for mask, label, colour, size in (
+        (~held, "measured", "#0072B2", 7),
+        (held, "measured, held over", "#9A9A9A", 4),
+    ):
+        if mask.any():
+            ax.plot(
+                seconds[mask], panel.measured[mask], linestyle="none", marker="|", markersize=size, color=colour,
+                rasterized=True, label=label,
+            )  # fmt: skip
 
 
 def first_labels(ax: Axes, count: int) -> tuple[list[Any], list[str]]:
@@ -924,6 +1008,8 @@ def plates(data: ReportData) -> list[Plate]:
     for panel in data.rss:
         if len(panel.time):
             result += _rss_plates(data, panel)
+    for pair in data.pairs:
+        result.append(_pair_plate(data, pair))
     for rank in data.rank:
         if len(rank.time):
             result += _rank_plates(data, rank)
@@ -1012,7 +1098,32 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
                 draw=lambda: residual_against_geometry(panel),
             )
         )
+    if {"azimuth_deg", "elevation_deg"} <= set(panel.geometry):
+        result.append(
+            Plate(
+                name=f"rss_angles_{stem}",
+                section=section,
+                title=f"{panel.name}: from where the antenna sees the UAV",
+                caption="Azimuth and elevation of the UAV in the frame of the tower antenna. Patches of one colour "
+                "point to the antenna pattern or its mounting.",
+                alt=f"Azimuth and elevation at which {panel.name} sees the UAV, coloured by residual.",
+                draw=lambda: seen_from_tower(panel),
+            )
+        )
     return result
+
+
+def _pair_plate(data: ReportData, pair: ChannelPair) -> Plate:
+    words = f"{pair.first} against {pair.second}"
+    return Plate(
+        name=f"pair_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
+        section=f"pair/{pair.tower}/{pair.first}/{pair.second}",
+        title=f"{pair.tower}: {words}",
+        caption="Difference of two channels of one tower, recorded at the same instants. What one place and one path "
+        "cannot explain, antennas and their mounting must.",
+        alt=f"Difference of {words} at {pair.tower} over time.",
+        draw=lambda: channel_difference(data, pair),
+    )
 
 
 def _rank_plates(data: ReportData, panel: RankPanel) -> list[Plate]:

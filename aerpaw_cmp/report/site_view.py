@@ -193,7 +193,7 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
 
     if not len(trees):
         return
-    pick = spread_out(len(trees), TREES_IN_PICTURE)
+    pick = figures.spread_out(len(trees), TREES_IN_PICTURE)
     east, north, ground = trees.east_m[pick], trees.north_m[pick], trees.ground_m[pick]
     top, base, half = ground + trees.height_m[pick], ground + trees.crown_base_m[pick], trees.crown_diameter_m[pick] / 2
     corners = [(east - half, north, base), (east + half, north, base), (east, north, top)]
@@ -206,18 +206,13 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
     ax.add_collection3d(cones)
 
 
-def spread_out(count: int, most: int) -> Any:
-    """At most ``most`` indices of ``count``, evenly spread."""
-    return np.unique(np.linspace(0, count - 1, min(count, most)).round().astype(int)) if count else np.zeros(0, int)
-
-
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
 
     def listed(points: Any) -> Any:
         return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
 
-    trees, pick = site.trees, spread_out(len(site.trees), TREES_IN_PAGE)
+    trees, pick = site.trees, figures.spread_out(len(site.trees), TREES_IN_PAGE)
     flight: list[Any] = []
     if track is not None and len(track.time):
         line = np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // FLIGHT_POINTS)]

@@ -12,7 +12,7 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.errors import InputError, UsageError
 from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, FloatArray
@@ -33,7 +33,15 @@ def _fields(line: bytes) -> list[str]:
     text = line.decode("utf-8", errors="replace")
     if '"' not in text:
         return text.split(",")
-    return next(csv.reader([text.replace("\0", "\ufffd")]), [])
+    # a stray CR or NUL would end the csv module's patience with the whole line
+    return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")]), [])
+
+
+def _header(lines: _lines.Lines, first: int) -> list[str]:
+    try:
+        return [name.strip() for name in _fields(lines.raw(first))]
+    except csv.Error as error:
+        raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
 
 
 def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
@@ -107,7 +115,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     first = int(np.argmin(blank)) if len(lines) and not blank.all() else -1
     if first < 0:
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
-    header = [name.strip() for name in _fields(lines.raw(first))]
+    header = _header(lines, first)
     kind, where = _checked(options, header)
     rows, cells, rejected = _table(lines, first, len(header))
     column = {name: [line[i] for line in cells] for name, i in where.items()}

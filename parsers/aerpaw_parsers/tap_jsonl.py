@@ -8,7 +8,8 @@ integers [ns]: UTC since 1970 and the monotonic clock.
 ``exchange``    ``query command sent_utc_ns last_utc_ns`` (and ``_mono_``) ``status lines decoded flags``
 ``late unsolicited noise``  what belonged to no command
 ``gap``         ``state`` ``open`` at the loss, ``closed`` at the return, with ``from_utc_ns to_utc_ns missed``
-``clock disk alarm prediction end``  what else happened
+``clock disk alarm prediction``  what else happened
+``rotate end``  last line of a segment, and of the last one
 
 An exchange is accepted: as a record of rank (``nr5g_csi``, ``lte_csi``), of RSS (RSRP of ``servingcell``), or as a
 companion of these. Everything else that is sound counts as comment. The time of a record is the middle between
@@ -246,8 +247,8 @@ def _warnings(records: list[tuple[int, dict[str, Any]]], rejected: list[Rejected
         found.append(f"{missing} record numbers are missing in this segment")
     if rejected and rejected[-1].reason.startswith("torn tail"):
         found.append("the last line is torn (power loss or kill while writing)")
-    if not any(record["kind"] == "end" for _, record in records):
-        found.append("no end record: the session was cut, or it goes on in the next segment")
+    if not any(record["kind"] in ("end", "rotate") for _, record in records):
+        found.append("no end record: the session was cut")
     return tuple(found)
 
 

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.live.log import BadLine, read_log
+from aerpaw_cmp.live.modem import QUERIES
 from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
 
@@ -86,6 +87,19 @@ def exchanges(folder, query=None):
     return [r for r in records_of(folder)[0] if r["kind"] == "exchange" and query in (None, r["query"])]
 
 
+def all_kept(sim, folder, query="nr5g_csi"):
+    """Every answer that the modem saw read stands in the log once, in order, and nothing that it did not send."""
+    command = QUERIES[query].text
+    kept = []
+    for r in records_of(folder)[0]:
+        own = r["kind"] == "exchange" and r["query"] == query and r["status"] == "ok"
+        if own or (r["kind"] == "late" and r["lines"] and f'"{query}"' in r["lines"][0]):
+            kept.append(tuple(r["lines"]))
+    assert kept == [s.lines for s in sim.journal if s.command == command][: len(kept)]
+    assert len(kept) >= sum(s.read for s in sim.journal if s.command == command)
+    return kept
+
+
 @pytest.fixture
 def tools():
     class Tools:
@@ -93,6 +107,7 @@ def tools():
 
     tools = Tools()
     tools.Session, tools.records_of, tools.exchanges = Session, records_of, exchanges
+    tools.all_kept = all_kept
     return tools
 
 
@@ -121,6 +136,7 @@ def tap(tmp_path):
             "other_hz": 2.0,
             "pause_s": 0.0,
             "status_s": 0.1,
+            "probe_timeout_s": 3.0,
             "folder": tmp_path / "log",
         } | settings
         session = Session(TapSettings(port=str(port), **values), **(options or {}))

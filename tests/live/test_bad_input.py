@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
 from aerpaw_cmp.live.session import TapSettings
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
@@ -70,7 +71,7 @@ def test_no_permission_names_the_group(modem, tmp_path):
     import grp
 
     sim = modem()
-    os.chmod(sim.node, 0o660)
+    sim.node.chmod(0o660)
     os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
@@ -204,8 +205,7 @@ def test_ten_megabyte_line(modem, tap, tools, tmp_path):
     assert [r["dropped_bytes"] + len(r["lines"][0]) for r in huge] == [10_000_000] * len(huge)
     assert huge
     assert len(huge[0]["lines"][0]) <= 65_536
-    logged = [tuple(r["lines"]) for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
-    assert logged == [s.lines for s in sim.journal if s.command == 'AT+QNWCFG="nr5g_csi"']
+    assert tools.all_kept(sim, tmp_path / "log")
 
 
 def test_rubbish_without_end_is_counted_not_kept(modem, tap, tools, tmp_path):
@@ -306,3 +306,88 @@ def test_the_second_at_port_is_taken_when_the_first_is_held(modem, tmp_path):
     finally:
         process.kill()
         process.wait()
+
+
+def rewire(roots, wires):
+    """Numbers of a modem's ttys, each leading to a pseudo-terminal: ``{number: (interface, node)}``."""
+    import shutil
+
+    for folder in (roots.dev, roots.sys):
+        shutil.rmtree(folder, ignore_errors=True)
+    roots.dev.mkdir(parents=True)
+    for number, (interface, node) in wires.items():
+        device = roots.sys / f"devices/usb1/1-1/1-1:1.{interface}"
+        (device / f"ttyUSB{number}").mkdir(parents=True)
+        (device / "bInterfaceNumber").write_text(f"{interface:02d}\n")
+        entry = roots.sys / f"class/tty/ttyUSB{number}"
+        entry.mkdir(parents=True)
+        (entry / "device").symlink_to(device / f"ttyUSB{number}")
+        (roots.dev / f"ttyUSB{number}").symlink_to(node)
+    (roots.sys / "devices/usb1/1-1/idVendor").write_text("2c7c\n")
+    (roots.sys / "devices/usb1/1-1/idProduct").write_text("0800\n")
+
+
+def test_numbers_that_swap_are_followed_by_the_interface(modem, tap, tools, tmp_path):
+    # without by-id names: ttyUSB2 was the AT port and comes back as the GPS port, the AT port as ttyUSB5
+    roots = Roots(tmp_path / "dev", tmp_path / "sys")
+    sim = modem(link=None, faults=Faults(latency_s=0.0))
+    gps = modem(link=None, kind="gps")
+    rewire(roots, {1: (1, gps.node), 2: (2, sim.node)})
+    session = tap(roots.dev / "ttyUSB2", roots=roots, reconnect_min_s=0.02, reconnect_max_s=0.05)
+    session.wait(lambda: len(sim.journal) > 20)
+    sim.unplug()
+    gps.unplug()
+    gps.replug()
+    sim.replug()
+    rewire(roots, {2: (1, gps.node), 5: (2, sim.node)})
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 20)
+    session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    (closed,) = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
+    assert closed["port"]["path"] == str(roots.dev / "ttyUSB5")
+    assert not [h for r in records for h in r.get("lines", []) if isinstance(h, str) and h.startswith("$GP")]
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """A real file system of 256 KiB; skips where mounting is not allowed."""
+    folder = tmp_path / "disk"
+    folder.mkdir()
+    done = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=256k", "tmpfs", folder], capture_output=True, check=False
+    )
+    if done.returncode:
+        pytest.skip("mounting is not allowed here; RLIMIT_FSIZE and /dev/full stand in for it in the other tests")
+    yield folder
+    subprocess.run(["umount", "-l", folder], check=True)
+
+
+def test_a_real_disk_that_fills_up_and_has_room_again(modem, tap, tools, small_disk):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port, folder=small_disk / "log", log=LogSettings(retry_s=0.05))
+    session.wait(lambda: len(sim.journal) > 10)
+    filler = small_disk / "filler"
+    with filler.open("wb", buffering=0) as file:
+        try:
+            while True:
+                file.write(b"x" * 512)
+        except OSError:
+            pass
+    session.wait(lambda: any("the disk is full" in text for text in session.said))
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 40)  # it goes on polling
+    filler.unlink()
+    session.wait(lambda: any("takes records again; 0 were lost" in text for text in session.said))
+    assert session.end().lost_records == 0
+    records, bad = tools.records_of(small_disk / "log")
+    assert not bad
+    assert tools.all_kept(sim, small_disk / "log")
+    assert sum(r["kind"] == "disk" for r in records) == 1
+
+
+def test_a_read_only_disk(modem, small_disk, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
+    with pytest.raises(InputError, match=r"Read-only file system.*the disk is mounted read-only"):
+        run_tap(TapSettings(small_disk / "log", str(sim.port)))

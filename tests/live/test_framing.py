@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -193,7 +194,7 @@ def test_two_commands_in_flight_are_refused():
 @given(st.binary(max_size=400), st.lists(st.integers(0, 400), max_size=8))
 def test_any_bytes_in_any_pieces(data, cuts):
     places = [0, *sorted(min(cut, len(data)) for cut in cuts), len(data)]
-    pieces = [data[a:b] for a, b in zip(places, places[1:], strict=False)]
+    pieces = [data[a:b] for a, b in pairwise(places)]
     assert framed(pieces) == framed([data])
     assert live(pieces) == live([data])
 

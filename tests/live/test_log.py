@@ -11,7 +11,6 @@ import zlib
 from pathlib import Path
 
 import pytest
-from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -26,6 +25,7 @@ from aerpaw_cmp.live.log import (
     read_log,
 )
 from aerpaw_cmp.readers import ReadOptions
+from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 
 
 def header():
@@ -51,8 +51,10 @@ def test_round_trip_and_rotation(tmp_path):
     assert [r["i"] for r in records if r["kind"] == "x"] == list(range(100))
     assert [r["n"] for r in records] == list(range(len(records)))
     assert [r["segment"] for r in records if r["kind"] == "header"] == list(range(1, len(log.paths) + 1))
-    for path in log.paths:
-        assert READER.sniff(path.read_bytes())
+    results = [READER.read(path.read_bytes(), ReadOptions()) for path in log.paths]
+    assert all(READER.sniff(path.read_bytes()) for path in log.paths)
+    # each segment but the last says that it goes on
+    assert [r.warnings for r in results] == [()] * (len(results) - 1) + [("no end record: the session was cut",)]
 
 
 def test_a_second_session_never_writes_into_the_first(tmp_path):

@@ -11,11 +11,12 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.live import simulator
 from aerpaw_cmp.live.export import COLUMNS, export_csv
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.log import encode_record
 from aerpaw_cmp.live.modem import decode
-from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded
+from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
 from aerpaw_cmp.readers import Reader
 from aerpaw_cmp.records import COLUMNS as RECORD_COLUMNS
 from aerpaw_cmp.records import ReadResult, Stream
@@ -68,14 +69,31 @@ def test_tap_of_a_transcript(tap, tools, tmp_path):
     assert ranks[:4] == [3, 1, 3, 1]
 
 
+def test_ranks_of_another_log_as_a_modem(tmp_path, monkeypatch):
+    def read(data, options):
+        rows = [line.split(",") for line in data.decode().split()]
+        times = pd.Timestamp("2026-01-01") + pd.to_timedelta([float(row[0]) for row in rows], unit="s")
+        ranks = [float(row[1]) for row in rows]
+        frame = pd.DataFrame({"time": times, "line": range(len(rows)), "flag": "", "rank": ranks, "ri_raw": ranks})
+        return ReadResult("r", (Stream("rank", "r", frame),), len(rows), len(rows), 0)
+
+    reader = Reader("r", "", ("rank",), "", lambda _head: True, read)
+    monkeypatch.setattr(simulator, "identify", lambda _data: reader)
+    path = tmp_path / "rank.csv"
+    path.write_text("10,1\n12,4\n14,nan\n15,2\n")
+    modem = load_source(path)
+    ranks = [modem._rank(t) for t in (0.0, 1.9, 2.0, 3.9, 4.5, 5.0, 5.9, 6.1)]
+    assert ranks == [1, 1, 4, 4, 0, 2, 2, 1]  # and again from the start
+
+
 @pytest.mark.parametrize("content", [b"", b"\0" * 100, b"no answer here\n"])
 def test_nothing_to_replay(tmp_path, content):
     path = tmp_path / "t.txt"
     path.write_bytes(content)
     with pytest.raises(InputError, match="no answer to any known command"):
-        load_recorded(path)
+        load_source(path)
     with pytest.raises(InputError):
-        load_recorded(tmp_path / "missing.txt")
+        load_source(tmp_path / "missing.txt")
 
 
 def test_simulator_cleans_up(tmp_path):
@@ -116,7 +134,7 @@ def read_lines(data, options):
     return ReadResult("t", (Stream("telemetry", "t", pd.DataFrame(content)),), len(rows), len(rows), 0)
 
 
-LINES = Reader("t", "", ("telemetry",), "", lambda head: True, read_lines)
+LINES = Reader("t", "", ("telemetry",), "", lambda _head: True, read_lines)
 
 
 def second(i):
@@ -174,7 +192,7 @@ def test_export(modem, tap, tmp_path):
     ranks = [row["rank"] for row in rows if row["query"] == "nr5g_csi"]
     assert ranks
     assert set(ranks) <= {"1", "2", "3", "4"}
-    assert [row["rsrp_dbm"] for row in rows if row["query"] == "servingcell"][0].startswith("-")
+    assert next(row["rsrp_dbm"] for row in rows if row["query"] == "servingcell").startswith("-")
     assert all(row["rsrp_rx3_dbm"] for row in rows if row["query"] == "qrsrp")
     assert all(row["sinr_rx0_db"] for row in rows if row["query"] == "qsinr")
 

@@ -10,10 +10,14 @@ from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
+    altitude_variance,
     empirical_cdf,
     foliage_difference,
+    honest_study,
+    interpolation_study,
     layers_of,
     map_job,
+    rank_fields,
     rank_of_singular_values,
     rank_study,
 )
@@ -154,7 +158,9 @@ def test_layers_are_named_once(result):
 
 def test_rank_study_runs_the_papers_comparison(result):
     study = rank_study(result)
-    assert study.altitudes_m == (30.0, 40.0, 50.0)
+    heights, rank = rank_fields(result)
+    assert heights == (30.0, 40.0, 50.0)
+    assert rank.shape == (len(GRID), 3, 2)
     assert set(study.scores) == {"Kriging", "makima", "spline", "nearest", "inverse distance", "serving-tower mean"}
     for found in study.scores.values():
         assert found.mae.shape == (3, 2)
@@ -190,3 +196,34 @@ def test_wrong_engine_and_no_tower_are_named():
         map_job(GRID, {}, Engine())
     with pytest.raises(ValueError, match="shapes"):
         map_job(GRID, TOWERS, lambda *_: Evaluation(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1, 4))))
+
+
+def test_papers_variance_over_altitudes():
+    values = np.array([[[1.0], [2.0], [3.0]], [[2.0], [2.0], [np.nan]], [[1.0], [np.nan], [np.nan]]])
+    found = altitude_variance(values)[:, 0]
+    assert found[:2].tolist() == [1.0, 0.0]
+    assert np.isnan(found[2])
+
+
+def test_rss_is_studied_like_rank(result):
+    study = interpolation_study(GRID, np.moveaxis(result.rss_siso_dbm, -1, 0), result.towers_m)
+    assert study.scores["Kriging"].mae.shape == (2, 2)
+    assert study.scores["Kriging"].mae.max() < 1.0, "free space is smooth"
+    assert study.scores["Kriging"].mae.mean() < study.scores["nearest"].mae.mean()
+
+
+def test_honest_study_is_harder_than_leave_one_out(result):
+    heights, rank = rank_fields(result)
+    study = rank_study(result)
+    flight = np.column_stack([np.linspace(-300, 300, 400), 50 * np.sin(np.linspace(0, 9, 400))])
+    found = honest_study(
+        GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0, learning_sizes=(20, 100, 9999)
+    )
+    assert found.learning_sizes == (20, 100)
+    assert found.learning_mae.shape == (2, 3, 2)
+    assert found.learning_mae[0].mean() > found.learning_mae[1].mean()
+    assert found.blocked.mae.mean() > study.scores["Kriging"].mae.mean()
+    assert found.altitude_held_out.mae.shape == (3, 2)
+    assert found.altitude_held_out.unpredicted.sum() == 0
+    assert found.trajectory.n.max() < len(GRID)
+    assert found.vertical_scale > 1.0, "the engine's rank changes faster with height than along the ground"

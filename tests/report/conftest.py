@@ -13,6 +13,7 @@ from aerpaw_cmp.records import RejectedLine
 from aerpaw_cmp.report.data import (
     Audit,
     Baseline,
+    ChannelPair,
     Engine,
     ErrorSpan,
     Histogram,
@@ -25,8 +26,10 @@ from aerpaw_cmp.report.data import (
     RssPanel,
     SpeedRow,
     Track,
+    Variant,
     Waypoint,
 )
+from aerpaw_cmp.report.maps_data import Correlation, Layer, LearningCurve, MapError, MapsData, PaperRow, RankMap, RssMap
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
 
 WAVELENGTH = 299_792_458.0 / 3.3e9
@@ -135,6 +138,8 @@ def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> R
         up_m=track.up_m,
         geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},
         line_of_sight=~blocked,
+        variants=(Variant(name="iso arrays", offset_db=offset, rmse_db=rmse + 1, rmse_ci95_db=(rmse, rmse + 2)), Variant(name="patterns, attitude", offset_db=offset, rmse_db=rmse, fitted="mount, on flight 70 m")),
+        extra={"repeatability_db": 3.0, "robust": {"offset_db": offset}},
         worst=(ErrorSpan(start=track.time[max(worst - 20, 0)], end=track.time[min(worst + 20, len(d) - 1)], east_m=float(track.east_m[worst]), north_m=float(track.north_m[worst]), up_m=float(track.up_m[worst]), mean_error_db=float(residual[worst]), cause="a null of the two-ray pattern"),),
     )  # fmt: skip
 
@@ -173,6 +178,7 @@ def make_rank(site: Site, track: Track) -> RankPanel:
         histogram=Histogram(share=h, low=(h - 0.04).clip(0), high=h + 0.04), simulated=tuple(at),
         best_k=float(ks[agreement.argmax()]), best_k_ci95=(13.0, 21.0),
         curve=KCurve(k=ks, agreement=agreement, total_variation=variation), singular_ratio_db=ratio,
+        sinr_db=18 + slow, stale=np.arange(len(d)) % 50 > 45,
     )  # fmt: skip
 
 
@@ -247,6 +253,16 @@ def make_report() -> ReportData:
         make_rss(site, track, tower, channel, seed)
         for seed, (tower, channel) in enumerate((("LW1", "USRP1"), ("LW1", "USRP2"), ("LW4", "USRP1")))
     )
+    difference = rss[0].calibrated_db - rss[1].calibrated_db
+    pair = ChannelPair(
+        tower="LW1",
+        first="USRP1",
+        second="USRP2",
+        time=track.time,
+        difference_db=difference,
+        simulated_difference_db=np.zeros(len(difference)),
+        apart=rss[0].worst,
+    )
     engine = Engine(
         engine="image",
         links=18000,
@@ -295,7 +311,7 @@ def make_report() -> ReportData:
     return ReportData(
         title="Sample flight around LW1, 2024-07-15", flight="sample", site=site, generated="2026-11-21T00:00:00Z",
         versions={"aerpaw-cmp": "0.1.0", "numpy": np.__version__}, inputs=inputs, track=track, waypoints=waypoints,
-        rss=rss, rank=(make_rank(site, track),), engine=engine, speed=make_speed(), synthetic=True,
+        rss=rss, rank=(make_rank(site, track),), pairs=(pair,), engine=engine, speed=make_speed(), synthetic=True,
         settings={"flight": "sample", "rt": {"max_depth": 2}}, stages_s={"ingest": 0.2, "replay": 0.71, "report": 6.0},
     )  # fmt: skip
 
@@ -309,3 +325,88 @@ def report_data() -> ReportData:
 def small_report(report_data: ReportData) -> ReportData:
     """One RSS panel and the rank, for tests that draw."""
     return dataclasses.replace(report_data, rss=report_data.rss[2:])
+
+
+def make_maps() -> MapsData:
+    """Free space over the paper's grid, with a made-up wood that blocks low positions, and ranks by distance."""
+    site = make_site()
+    east, north = np.arange(-525.0, 526, 30), np.arange(-1050.0, 1051, 30)
+    at = np.stack(np.meshgrid(east, north), axis=-1)
+    towers = list(site.towers.values())
+    reach = np.array([np.hypot(at[..., 0] - t.east_m, at[..., 1] - t.north_m) for t in towers])
+    nearest = reach.argmin(axis=0)
+    wood = (at[..., 0] > 150) & (at[..., 0] < 420) & (at[..., 1] > 150) & (at[..., 1] < 420)
+    rss, rank, errors = [], [], []
+    for antennas in ("SISO", "MIMO"):
+        for height in (30.0, 70.0, 110.0):
+            level = []
+            for t, d in zip(towers, reach, strict=True):
+                distance = np.hypot(d, height - 10)
+                beam = (
+                    0.0
+                    if antennas == "SISO"
+                    else 6 * np.cos(4 * np.arctan2(at[..., 1] - t.north_m, at[..., 0] - t.east_m))
+                )
+                value = 40 + beam + 20 * np.log10(WAVELENGTH / (4 * np.pi * distance))
+                blocked = wood & (height < 40) | ((d > 1200) & (height < 40))
+                level.append(np.where(blocked, np.nan, value))
+                rss.append(
+                    RssMap(
+                        tower=t.name,
+                        antennas=antennas,
+                        altitude_m=height,
+                        rss_dbm=level[-1],
+                        coverage=float(np.isfinite(level[-1]).mean()),
+                        foliage="opaque",
+                    )
+                )
+            joint = np.take_along_axis(np.array(level), nearest[None], axis=0)[0]
+            rss.append(
+                RssMap(
+                    tower="joint",
+                    antennas=antennas,
+                    altitude_m=height,
+                    rss_dbm=joint,
+                    coverage=float(np.isfinite(joint).mean()),
+                    foliage="opaque",
+                )
+            )
+    d = reach.min(axis=0)
+    for k, radius in ((10.0, 60.0), (100.0, 160.0), (1000.0, 320.0)):
+        for height in (3.0, *range(30, 111, 10)):
+            value = np.where(d < radius / 3, 3, np.where(d < radius * (1 + height / 300), 2, 1))
+            value = np.where(wood & (height < 40) | ((d > 250) & (height < 10)), 0, value)
+            rank.append(
+                RankMap(
+                    k=k, altitude_m=float(height), rank=value, share=np.array([(value == r).mean() for r in range(5)])
+                )
+            )
+            if height > 10:
+                for method, factor in (("Kriging", 1.0), ("makima", 1.6), ("spline", 1.9)):
+                    errors.append(
+                        MapError(
+                            evaluation="leave one out",
+                            method=method,
+                            k=k,
+                            altitude_m=float(height),
+                            mae=factor * (0.03 + radius / 4000 + 1 / height),
+                            n=2556,
+                        )
+                    )
+    distance = np.arange(15.0, 500, 30)
+    model = 0.2932 * np.exp(-0.0508 * distance) + 0.7057 * np.exp(-0.001 * distance)
+    lines = tuple(np.array([[-540.0, y], [540.0, y + 150]]) for y in (-350.0, 200.0))
+    return MapsData(
+        title="Coverage and rank of Lake Wheeler", name="lw", site=site, generated="2026-11-21T00:00:00Z", east_m=east, north_m=north,
+        borders_m=lines, rss=tuple(rss), rank=tuple(rank),
+        layers=(*(Layer(name="Singular value spread", label="sigma 1 over sigma 2 [dB]", altitude_m=h, values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), Layer(name="Foliage loss", label="RSS with minus without trees [dB]", altitude_m=30.0, values=np.where(wood, -12.0, 0.0), difference=True),),
+        correlation=(Correlation(title="Rank, horizontal", distance_m=distance, correlation=model + 0.01 * np.cos(distance), fit_distance_m=distance, fit=model, fit_label="bi-exponential, RMSE 0.007", excluded=7),),
+        errors=tuple(errors), learning=(LearningCurve(method="Kriging", samples=np.array([50, 100, 400, 1600]), mae=np.array([0.3, 0.25, 0.16, 0.1])),),
+        paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", plate="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", plate="mae_leave_one_out")),
+        warnings=("Towers of another source differ by up to 9 m.",), versions={"numpy": np.__version__}, settings={"rt": {"max_depth": 2}}, stages_s={"replay": 3.0}, metrics={"fit": {"rmse": 0.0153}},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def maps_data() -> MapsData:
+    return make_maps()

@@ -186,11 +186,9 @@ def still(track: Track) -> Track:
 )  # fmt: skip
 def test_odd_flights_are_drawn_without_a_warning(report_data, change):
     data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
-    for plate, fig in drawn(data):
+    for _, fig in drawn(data):
         with figures.style():
-            svg, png = figures.save(fig)
-        assert len(svg) > 1000, plate.name
-        assert png.startswith(b"\x89PNG"), plate.name
+            fig.draw_without_rendering()  # lays out and draws every part; warnings are errors
 
 
 @given(arrays(bool, st.integers(0, 60)))

@@ -1,0 +1,79 @@
+"""SIGKILL at random moments: is every answer that the modem saw read in the log, and no record corrupt?
+
+An answer counts as read once the tap sent its next command, so no waiting second is granted: the check is harder
+than "acknowledged more than one second before".
+"""
+
+from __future__ import annotations
+
+import argparse
+import random
+import sys
+import tempfile
+import time
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+sys.path.insert(0, str(Path(__file__).parent))
+from tap_common import conditions, read_lines, show, start_tap
+
+from aerpaw_cmp.live.log import BadLine, read_log
+from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
+
+
+def one_kill(number: int, seed: int, folder: Path) -> dict[str, int]:
+    """One tap, killed; what it had acknowledged against what is on disk."""
+    chance = random.Random(f"{seed}/{number}")
+    link, log = folder / f"modem{number}", folder / f"log{number}"
+    settings = ModemSimSettings(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=number))
+    with ModemSimulator(settings) as modem:
+        process = start_tap(link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, log={"segment_bytes": 20_000})
+        until = time.monotonic() + 60
+        while not modem.journal:  # the moment counts from the first answer, so that each kill hits a running tap
+            if process.poll() is not None or time.monotonic() > until:
+                raise RuntimeError(f"the tap did not start: {process.communicate()[1]}")
+            time.sleep(0.005)
+        time.sleep(chance.uniform(0.0, 2.0))
+        process.kill()
+        process.communicate()
+        read = read_lines(modem.journal)
+    bad: list[BadLine] = []
+    logged = []
+    if log.exists() and any(log.iterdir()):
+        for record in read_log(log, bad):
+            if record["kind"] == "exchange" and record["status"] in ("ok", "error"):
+                logged.append((record["command"], tuple(record["lines"])))
+    elif read:
+        raise RuntimeError("no log although the tap ran")
+    return {
+        "answers": len(read),
+        "lost": len([answer for answer in read if answer not in set(logged)]),
+        "out_of_order": int(logged[: len(read)] != read),
+        "torn_tails": sum(line.torn_tail for line in bad),
+        "corrupt": sum(not line.torn_tail for line in bad),
+        "worst_torn": len(bad),
+    }
+
+
+def main() -> None:
+    """Kill, count, print."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--kills", type=int, default=1000)
+    parser.add_argument("--parallel", type=int, default=8)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--quick", action="store_true", help="20 kills")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    kills = 20 if arguments.quick else arguments.kills
+    start = time.monotonic()
+    with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.parallel) as pool:
+        results = list(pool.map(lambda i: one_kill(i, arguments.seed, Path(folder)), range(kills)))
+    total = {key: sum(result[key] for result in results) for key in results[0]}
+    total["worst_torn"] = max(result["worst_torn"] for result in results)
+    show({"kills": kills, **total, "seconds": round(time.monotonic() - start, 1), **conditions()}, arguments.json)
+    if total["lost"] or total["corrupt"] or total["out_of_order"] or total["worst_torn"] > 1:
+        sys.exit(1)
+
+
+if __name__ == "__main__":
+    main()

@@ -336,6 +336,20 @@ def test_an_invalid_correlation_never_gives_a_negative_variance():
     assert min(plain) < 0, "the case is not hard"
 
 
+def test_a_correlation_above_one_does_not_blow_up():
+    """Found on a real flight log: clipped at 1 it is no covariance, and textbook weights reached 1e6."""
+    along = np.linspace(0, 400, 300)
+    points = np.column_stack([along, 20 * np.sin(along / 60)])
+    values = np.sin(along / 80)
+    estimate, _ = (
+        OrdinaryKriging(lambda d: 2.2 * np.exp(-d / 55), 20, outside="nearest").fit(points, values).leave_one_out()
+    )
+    assert np.abs(estimate - values).max() < 0.3  # between the best and the mean of the neighbours
+    blocked = OrdinaryKriging(lambda d: 2.2 * np.exp(-d / 55), 20, outside="nearest").fit(points[:100], values[:100])
+    rule = blocked.weights(points[100:])
+    assert np.abs(rule.weight).max() < 5
+
+
 def test_nugget_is_a_jump_unless_it_is_noise():
     points, values = scattered(40, 33, 200.0), np.random.default_rng(34).normal(size=40)
 

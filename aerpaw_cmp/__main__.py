@@ -1,14 +1,152 @@
-"""Entry point of the command line."""
+"""Entry point of the command line: answers ``--help`` from a table, hands everything else to :mod:`aerpaw_cmp.cli`.
+
+This is the one place where an exception becomes a message and an exit code:
+
+====  ==========================================================
+0     done
+1     the job ran, but a stated check failed
+2     wrong usage or configuration
+3     an input could not be read
+70    a fault of the program itself (``--debug`` shows where)
+130   interrupted
+141   whoever read the output has gone (``aerpaw-cmp ... | head``)
+====  ==========================================================
+"""
 
 from __future__ import annotations
 
+import os
+import sys
 
-def main() -> None:
-    """Run the command line."""
-    from .cli import app
+INTERNAL_ERROR = 70
+INTERRUPTED = 130
+BROKEN_PIPE = 141
+ISSUES = "the project's issue tracker"
 
-    app()
+
+def help_text() -> str:
+    """What ``aerpaw-cmp --help`` prints."""
+    from .commands import COMMANDS
+
+    width = max(map(len, COMMANDS))
+    lines = [f"  {name:<{width}}  {line}" for name, line in COMMANDS.items()]
+    return "\n".join(
+        [
+            "Usage: aerpaw-cmp COMMAND [OPTIONS] [ARGUMENTS]",
+            "",
+            "AERPAW field logs in, a ray-tracing comparison out.",
+            "",
+            "Commands:",
+            *lines,
+            "",
+            "Options:",
+            "  -h, --help  This text; 'aerpaw-cmp COMMAND --help' tells more of a command.",
+            "  --version   The version.",
+            "  --debug     Show the traceback of a failure (also AERPAW_CMP_DEBUG=1).",
+            "",
+            "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration, 3 unreadable input.",
+        ]
+    )
+
+
+def _unknown_command(name: str) -> str:
+    from difflib import get_close_matches
+
+    from .commands import COMMANDS
+
+    near = get_close_matches(name, COMMANDS, n=1)
+    hint = f"; did you mean '{near[0]}'?" if near else "; 'aerpaw-cmp --help' lists the commands"
+    return f"aerpaw-cmp: there is no command '{name}'{hint}"
+
+
+def _quick_answer(arguments: list[str]) -> int | None:
+    """Answer what needs no library; None when the command line itself has to run."""
+    from .commands import COMMANDS
+
+    first = arguments[0] if arguments else ""
+    if first in ("", "-h", "--help"):
+        print(help_text())
+        return 0 if first else 2
+    if first == "--version":
+        from . import __version__
+
+        print(f"aerpaw-cmp {__version__}")
+        return 0
+    if not first.startswith("-") and first not in COMMANDS:
+        print(_unknown_command(first), file=sys.stderr)
+        return 2
+    return None
+
+
+def _message(error: BaseException) -> tuple[str, int]:
+    """What the user is told of an exception that reached the top, and the exit code."""
+    from .errors import AerpawCmpError
+
+    if isinstance(error, AerpawCmpError):
+        return f"aerpaw-cmp: {error}", error.exit_code
+    if callable(wording := getattr(error, "format_message", None)):
+        # a wrong option or argument; known by its method, since typer may bring its own copy of click
+        context = getattr(error, "ctx", None)
+        command = context.command_path if context else "aerpaw-cmp"
+        return f"{command}: {wording().rstrip('.')}; '{command} --help' tells the options", 2
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
+        return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
+    kind = type(error).__name__
+    return (
+        f"aerpaw-cmp: internal error, {kind}: {str(error).strip() or 'no message'}\n"
+        f"This is a fault of the program, not of your input. Run the same command with --debug and send what it shows, "
+        f"and the output of 'aerpaw-cmp doctor', to {ISSUES}.",
+        INTERNAL_ERROR,
+    )
+
+
+def _run(arguments: list[str]) -> int:
+    from . import cli
+
+    code = cli.main(arguments)
+    sys.stdout.flush()  # a reader that has gone shows here, not at interpreter exit
+    return code
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run the command line.
+
+    Parameters
+    ----------
+    arguments : list of str, optional
+        Without the program's name; those of this process by default.
+
+    Returns
+    -------
+    int
+        The exit code; exceptions end here.
+    """
+    arguments = list(sys.argv[1:] if arguments is None else arguments)
+    before_dashes = arguments[: arguments.index("--")] if "--" in arguments else arguments
+    debug = "--debug" in before_dashes or os.environ.get("AERPAW_CMP_DEBUG", "0") not in ("", "0")
+    if "--debug" in before_dashes:
+        arguments.remove("--debug")
+    try:
+        code = _quick_answer(arguments)
+        return _run(arguments) if code is None else code
+    except KeyboardInterrupt:
+        print("aerpaw-cmp: interrupted", file=sys.stderr)
+        return INTERRUPTED
+    except BrokenPipeError:
+        # the interpreter flushes standard output once more at exit: give it a place that accepts
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return BROKEN_PIPE
+    except Exception as error:
+        if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
+            return INTERRUPTED
+        if debug:
+            import traceback
+
+            traceback.print_exc()
+        text, code = _message(error)
+        print(text, file=sys.stderr)
+        return code
 
 
 if __name__ == "__main__":
-    main()
+    sys.exit(main())

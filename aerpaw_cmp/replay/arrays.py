@@ -23,7 +23,10 @@ class Pattern(Protocol):
     ``|E_theta|^2 + |E_phi|^2`` is the gain (linear, over isotropic).
     """
 
-    name: str
+    @property
+    def name(self) -> str:
+        """For reports."""
+        ...
 
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Complex field components (theta, phi)."""
@@ -120,7 +123,9 @@ def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, rol
     [0.0, 1.0, 0.0]
     """
     yaw, pitch, roll = np.broadcast_arrays(
-        np.asarray(yaw_rad, dtype=np.float64), np.asarray(pitch_rad, dtype=np.float64), np.asarray(roll_rad, dtype=np.float64)
+        np.asarray(yaw_rad, dtype=np.float64),
+        np.asarray(pitch_rad, dtype=np.float64),
+        np.asarray(roll_rad, dtype=np.float64),
     )
     ca, sa = np.cos(yaw), np.sin(yaw)
     cb, sb = np.cos(pitch), np.sin(pitch)
@@ -155,9 +160,7 @@ def rotation_from_aircraft(roll_deg: FloatArray, pitch_deg: FloatArray, yaw_deg:
     [1.0, 0.0, 0.0]
     """
     # nose up + turns the boresight up, TR 38.901 pitch turns it down; right wing down is a positive roll in both
-    return rotation_from_yaw_pitch_roll(
-        np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg)
-    )
+    return rotation_from_yaw_pitch_roll(np.pi / 2 - np.radians(yaw_deg), -np.radians(pitch_deg), np.radians(roll_deg))
 
 
 # Ports of the measurement comparison in arXiv 2502.10324, section VII-D
@@ -187,10 +190,15 @@ def uav_comparison_array(
     wavelength_m: float,
     yaw_deg: float = 315.0,
     roll_deg: float = 90.0,
-    slant_deg: tuple[float, ...] = (45.0, -45.0, 45.0, -45.0),
+    slant_deg: tuple[float, ...] = (45.0, -45.0, -45.0, 45.0),
     pattern: Pattern | None = None,
 ) -> Array:
-    """UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first."""
+    """UAV array of the comparison: 2 x 2 at half a wavelength, rolled by 90 degrees, numbered column first.
+
+    Slants alternate between neighbours in both directions. Which mounting the modem had is not published: with the
+    tower at 12 m this one leaves a total variation of 0.06 and 0.09 to the measured ranks of two flights at K = 10,
+    alternating along the numbering 0.07 and 0.11.
+    """
     half = wavelength_m / 4
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
     return Array(
@@ -203,7 +211,7 @@ def uav_comparison_array(
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
     """Horizontal line of vertical elements; the paper's maps use 4 at half a wavelength along the y axis."""
-    along = np.arange(elements) * spacing_m
+    along = np.arange(elements, dtype=np.float64) * spacing_m
     return Array(
         _centred_line(along),
         np.zeros(elements),

@@ -6,16 +6,20 @@ and fields are not stored: :mod:`aerpaw_cmp.replay.field` evaluates them in floa
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
+from shapely.geometry import Polygon
 
-from ..units import FloatArray, IntArray
+from ..units import AnyArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
 class Faces:
     """Planar reflecting faces of a scene.
+
+    A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four
+    columns decide fields; the others decide which points belong to a face. Left out, faces are whole planes.
 
     Parameters
     ----------
@@ -27,12 +31,44 @@ class Faces:
         Names in ``site.materials``.
     label : tuple of str, length faces
         For reports, e.g. ``"ground"``, ``"barn wall 3"``.
+    along, across : (faces, 3)
+        In-plane unit axes, ``along x across = normal``.
+    lower, upper : (faces, 2)
+        Bounds of the in-plane coordinates; infinite for the ground.
+    polygon : tuple of Polygon or None, length faces
+        The face in its plane, where it does not fill its bounds.
+    solid : (faces,) int
+        Index of the building, -1 for the ground, which never hides anything.
     """
 
     normal: FloatArray
     offset_m: FloatArray
     material: tuple[str, ...]
     label: tuple[str, ...]
+    along: FloatArray = field(default_factory=lambda: np.zeros(0))
+    across: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lower: FloatArray = field(default_factory=lambda: np.zeros(0))
+    upper: FloatArray = field(default_factory=lambda: np.zeros(0))
+    polygon: tuple[Polygon | None, ...] = ()
+    solid: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        count = len(self.normal)
+        if len(self.along) == count:
+            return
+        # any axis that is not the normal will do for a whole plane
+        helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
+        along = np.cross(helper, self.normal)
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        object.__setattr__(self, "along", along)
+        object.__setattr__(self, "across", np.cross(self.normal, along))
+        object.__setattr__(self, "lower", np.full((count, 2), -np.inf))
+        object.__setattr__(self, "upper", np.full((count, 2), np.inf))
+        object.__setattr__(self, "polygon", (None,) * count)
+        object.__setattr__(self, "solid", np.full(count, -1, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return len(self.normal)
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +95,10 @@ class PathSet:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def select(self, rows: AnyArray) -> PathSet:
+        """The paths of a mask or of indices."""
+        return PathSet(self.pose[rows], self.tower[rows], self.depth[rows], self.faces[rows], self.vertices_m[rows])
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:

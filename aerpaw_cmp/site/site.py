@@ -14,6 +14,8 @@ from shapely.geometry import Polygon
 
 from ..geodesy import SiteFrame
 from ..units import FloatArray
+from .dem import Dem
+from .heights import VerticalDatum
 
 
 @dataclass(frozen=True, slots=True)
@@ -135,6 +137,10 @@ class Site:
         True when buildings and forests are invented for demonstration; shown wherever they are drawn.
     notes : tuple of str
         For the report.
+    datum : VerticalDatum
+        What up = 0 is in other height references, and how high the take-off point lies.
+    dem : Dem or None
+        Ground heights; blocks lines of sight.
     """
 
     name: str
@@ -148,3 +154,5 @@ class Site:
     area_m: tuple[float, float, float, float] = (-540.0, 540.0, -1065.0, 1065.0)
     illustrative: bool = False
     notes: tuple[str, ...] = ()
+    datum: VerticalDatum = field(default_factory=VerticalDatum)
+    dem: Dem | None = None

@@ -4,4 +4,30 @@ from __future__ import annotations
 
 from aerpaw_cmp.readers import Reader
 
-READERS: tuple[Reader, ...] = ()
+from . import (
+    aadm_snr,
+    controller_log,
+    flight_mat,
+    generic_csv,
+    nemo_csv,
+    nemo_kml,
+    quectel_csv,
+    quectel_ri,
+    sounder_log,
+    srsenb_log,
+    vehicle_out,
+)
+
+READERS: tuple[Reader, ...] = (
+    vehicle_out.READER,
+    sounder_log.READER,
+    flight_mat.READER,
+    quectel_csv.READER,
+    quectel_ri.READER,
+    nemo_csv.READER,
+    nemo_kml.READER,
+    aadm_snr.READER,
+    controller_log.READER,
+    srsenb_log.READER,
+    generic_csv.READER,
+)

@@ -1,0 +1,51 @@
+# make report   the sample flight, from logs to report.html
+# make test     ruff, mypy, import-linter, pytest
+# Both make .venv and find (or install) an LLVM for Dr.Jit first.
+
+PYTHON ?= python3
+BIN := .venv/bin
+READY := .venv/.ready
+LLVM := .venv/.llvm
+REPORT := reports/sample
+
+# a PYTHONPATH from another project must not reach into our environment
+unexport PYTHONPATH PYTHONHOME PIP_USER
+export PIP_DISABLE_PIP_VERSION_CHECK := 1
+
+.PHONY: help setup report test bench clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make report   replay the sample flight and write $(REPORT)/report.html"
+	@echo "make test     ruff, mypy, import-linter, pytest"
+	@echo "make setup    only the environment: .venv and an LLVM for Dr.Jit"
+	@echo "make bench    speed against error on this machine"
+	@echo "make clean    remove .venv, caches and $(REPORT)/"
+
+setup: $(READY) $(LLVM)
+
+$(READY): pyproject.toml tools/setup_venv
+	@PYTHON="$(PYTHON)" tools/setup_venv .venv
+	@touch $@
+
+$(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/llvm.py
+	@$(BIN)/python tools/setup_llvm.py
+	@touch $@
+
+report: setup
+	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT)
+	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
+
+test: setup
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+	$(BIN)/python -m pytest -q
+
+bench: setup
+	$(BIN)/aerpaw-cmp bench
+
+clean:
+	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist $(REPORT)
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +

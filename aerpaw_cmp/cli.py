@@ -1,0 +1,409 @@
+"""Arguments, exit codes, progress: the only module that prints."""
+
+from __future__ import annotations
+
+import json
+import sys
+from pathlib import Path
+from typing import Annotated, Any, Optional
+
+import typer
+
+from .commands import COMMANDS
+from .errors import UsageError
+
+app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
+site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
+app.add_typer(site_app, name="site", help=COMMANDS["site"])
+
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
+Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
+LogsRoot = Annotated[
+    Optional[Path],  # noqa: UP045
+    typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
+]
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
+    try:
+        result = app(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
+    except Exception as error:
+        # typer may vendor click: what counts is the shape of a usage error, not its module
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+            raise UsageError(error.format_message()) from error
+        raise
+    return result if isinstance(result, int) else 0
+
+
+def _say(text: str) -> None:
+    """Progress goes to standard error, so that standard output stays clean."""
+    print(text, file=sys.stderr, flush=True)
+
+
+def _print_json(value: dict[str, Any]) -> None:
+    print(json.dumps(value, indent=1, allow_nan=False))
+
+
+def _table(columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    table = Table(title=title, title_justify="left")
+    for column in columns:
+        table.add_column(column, overflow="fold")
+    for row in rows:
+        table.add_row(*[cell.replace("[", r"\[") for cell in row])
+    Console(width=None if sys.stdout.isatty() else 160).print(table)
+
+
+@app.command(help=COMMANDS["ingest"])
+def ingest(
+    paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
+    out: Out = None,
+    reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
+    timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
+    time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
+    ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    as_json: Json = False,
+) -> None:
+    """Read logs, account for every line, write the flight file."""
+    from . import run
+
+    if ri_base not in (None, "zero", "one"):
+        raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
+    summary = run.run_ingest(paths, out=out, reader=reader, timezone=timezone, time_origin=time_origin, ri_base=ri_base)
+    if as_json:
+        _print_json(summary)
+        return
+    rows = []
+    for file in summary["files"]:
+        streams = ", ".join(f"{s['name']} ({s['kind']}) {s['rows']}" for s in file["streams"]) or "-"
+        rates = ", ".join("-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in file["streams"]) or "-"
+        spans = "\n".join(f"{s['start']} .. {s['end']}" for s in file["streams"][:1]) or "-"
+        rows.append(
+            [
+                str(file["path"]),
+                file["reader"],
+                streams,
+                str(file["lines"]),
+                str(file["accepted"]),
+                str(file["rejected"]),
+                str(file["blank"]),
+                rates,
+                spans,
+                "\n".join(file["warnings"]) or "-",
+            ]
+        )
+    header = [
+        "file",
+        "reader",
+        "streams (rows)",
+        "lines",
+        "accepted",
+        "rejected",
+        "blank",
+        "rate Hz",
+        "span UTC",
+        "warnings",
+    ]
+    _table(header, rows)
+    for skipped in summary.get("skipped", []):
+        _say(f"skipped: {skipped}")
+    if out is not None:
+        print(f"wrote {out}")
+
+
+@app.command(help=COMMANDS["formats"])
+def formats(as_json: Json = False) -> None:
+    """List the readers with a sample line each."""
+    from .readers import catalogue
+
+    readers = sorted(catalogue(), key=lambda r: r.name)
+    if as_json:
+        _print_json(
+            {
+                "readers": [
+                    {"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers
+                ]
+            }
+        )
+        return
+    _table(
+        ["reader", "what", "streams", "a line of it"],
+        [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers],
+    )
+
+
+@app.command(help=COMMANDS["report"])
+def report(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
+    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    as_json: Json = False,
+) -> int:
+    """Replay a flight, calibrate, compare, report."""
+    from . import run
+
+    outcome = run.run_report(flight, out=out, logs_root=logs_root, engine=engine, audit=audit, progress=_say)
+    if as_json:
+        _print_json(outcome.metrics)
+    else:
+        _print_report_summary(outcome)
+    failed = outcome.failed_checks
+    for check in failed:
+        _say(f"check failed: {check}")
+    return 1 if strict and failed else 0
+
+
+def _print_report_summary(outcome: Any) -> None:
+    rows = []
+    for tower, channels in outcome.metrics["rss"].items():
+        for channel, m in channels.items():
+            ci = m.get("rmse_ci95_db") or [None, None]
+            rows.append(
+                [
+                    tower,
+                    channel,
+                    _number(m["offset_db"], "{:.1f}"),
+                    _number(m["rmse_db"], "{:.2f}"),
+                    f"{_number(ci[0], '{:.2f}')} .. {_number(ci[1], '{:.2f}')}",
+                    _number(m["baselines"]["free_space"]["rmse_db"], "{:.2f}"),
+                    _number(m["baselines"]["two_ray"]["rmse_db"], "{:.2f}"),
+                    _number(m["correlation"], "{:.2f}"),
+                    str(m["n"]),
+                    str(m["n_out_of_coverage"]),
+                ]
+            )
+    if rows:
+        _table(
+            ["tower", "channel", "offset dB", "RMSE dB", "95 %", "free space", "two-ray", "corr.", "n", "out of cov."],
+            rows,
+            "RSS, measured against replayed",
+        )
+    rows = []
+    for tower, m in outcome.metrics["rank"].items():
+        for k, s in m["simulated"].items():
+            rows.append(
+                [tower, k, _number(s["agreement"], "{:.3f}"), _number(s["total_variation"], "{:.3f}"), str(m["n"])]
+            )
+    if rows:
+        _table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    print(f"report: {outcome.folder / 'report.html'}")
+
+
+def _number(value: float | None, form: str) -> str:
+    return "-" if value is None else form.format(value)
+
+
+@app.command(help=COMMANDS["simulate"])
+def simulate(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
+    out: Out = None,
+) -> None:
+    """Forward-simulate a planned flight into logs of the real formats."""
+    from . import run
+
+    for path in run.run_simulate(flight, out=out, progress=_say):
+        print(path)
+
+
+@app.command(help=COMMANDS["doctor"])
+def doctor(as_json: Json = False) -> int:
+    """Check this machine."""
+    from . import doctor as doctor_room
+
+    checks = doctor_room.checks()
+    if as_json:
+        _print_json(doctor_room.as_dict(checks))
+    else:
+        _table(["check", "status", "found", "remedy"], [[c.name, c.status, c.found, c.remedy or "-"] for c in checks])
+    return 1 if any(c.status == "fail" for c in checks) else 0
+
+
+@app.command(help=COMMANDS["tap"])
+def tap(
+    port: Annotated[str | None, typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the log segments.")] = Path("tap"),
+    status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
+    enable_csi: Annotated[
+        bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")
+    ] = False,
+    ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
+    other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
+    no_csi_alarm: Annotated[Optional[float], typer.Option(help="Bell when no CSI came for so many seconds.")] = None,  # noqa: UP045
+    no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="End with exit code 1 on that alarm.")] = False,
+    sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk.")] = 1.0,
+    duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
+    replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
+    export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
+    flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
+    telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
+) -> int:
+    """Log the modem's rank indicator until interrupted."""
+    if export is not None:
+        if export != "csv":
+            raise UsageError(f"--export {export!r}", expected="csv")
+        from .live.export import export_csv
+
+        print(export_csv(out, out / "tap.csv"))
+        return 0
+    from .live.log import LogSettings
+    from .live.session import TapSettings, format_status
+    from .live.tap import run_tap
+
+    settings = TapSettings(
+        folder=out,
+        port=port,
+        ri_hz=ri_hz,
+        other_hz=other_hz,
+        enable_csi=enable_csi,
+        no_csi_alarm_s=no_csi_alarm,
+        no_csi_exit=no_csi_exit,
+        duration_s=duration,
+        replay=replay,
+        log=LogSettings(sync_interval_s=sync_s),
+    )
+    predict = None
+    if flight is not None:
+        from .run import live_prediction
+
+        predict = live_prediction(flight, telemetry)
+    terminal = sys.stderr.isatty()
+
+    def show(now: Any) -> None:
+        if now.message:
+            print(("\r\033[K" if terminal else "") + now.message, file=sys.stderr, flush=True)
+        if status:
+            line = format_status(now)
+            print(f"\r\033[K{line}" if terminal else line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+        if now.alarm:
+            print("\a", end="", file=sys.stderr, flush=True)
+
+    summary = run_tap(settings, on_status=show, predict=predict)
+    rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
+    _say(
+        ("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}"
+    )
+    for segment in summary.segments:
+        print(segment)
+    return int(summary.exit_code)
+
+
+@app.command("modem-sim", help=COMMANDS["modem-sim"])
+def modem_sim(
+    link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
+    source: Annotated[Optional[Path], typer.Option(help="Transcript or tap log to play.")] = None,  # noqa: UP045
+    kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
+    fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
+) -> int:
+    """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
+    from .live.simulator import ModemSimSettings, run_modem_sim
+
+    settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there
+    return run_modem_sim(settings, on_ready=lambda port: print(port, flush=True))
+
+
+def _faults(pairs: list[str]) -> Any:
+    """Faults from NAME=VALUE pairs."""
+    import dataclasses
+
+    from .live.simulator import Faults
+
+    known: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Faults)}
+    values: dict[str, Any] = {}
+    for pair in pairs:
+        name, _, text = pair.partition("=")
+        if name not in known:
+            raise UsageError(f"--fault {pair!r}", expected="NAME=VALUE with one of " + ", ".join(known))
+        kind: Any = type(known[name])
+        try:
+            values[name] = text.lower() in ("", "1", "true", "yes") if kind is bool else kind(text)
+        except ValueError as error:
+            raise UsageError(f"--fault {pair!r}", expected=f"a value of type {kind.__name__}") from error
+    return Faults(**values)
+
+
+@app.command(help=COMMANDS["bench"])
+def bench(
+    poses: Annotated[int, typer.Option(min=2, help="Poses of the flight that is replayed.")] = 200,
+    quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Speed against error on this machine."""
+    from . import run
+
+    if quick:
+        result = run.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=_say)
+    else:
+        result = run.run_bench(poses=poses, progress=_say)
+    if as_json:
+        _print_json(result)
+        return
+    rows = []
+    for r in result["replay"]["rows"]:
+        what = "" if r["thinning"] == 1 else f", every {r['thinning']}th pose"
+        rows.append(
+            [
+                f"{r['engine']}{what}",
+                "-" if r["samples"] is None else f"{r['samples']:.0e}",
+                r["arrays"],
+                str(r["depth"]),
+                f"{r['seconds']:.3g}",
+                f"{r['links_per_s']:.3g}",
+                f"{r['peak_mib']:.0f}",
+                "-" if r["missing_paths"] is None else f"{r['missing_paths']} / {r['extra_paths']}",
+                f"{_number(r['rss_max_error_db'], '{:.2g}')} / {_number(r['rss_rms_error_db'], '{:.2g}')}",
+                ", ".join(f"{k}: {share:.3f}" for k, share in r["rank_disagreement"].items()),
+            ]
+        )
+    header = [
+        "engine",
+        "samples",
+        "arrays",
+        "depth",
+        "s",
+        "links/s",
+        "peak MiB",
+        "missing / extra",
+        "RSS error dB max / rms",
+    ]
+    _table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
+    for name, ratio in result["ratios"].items():
+        print(f"{name}: {ratio:.3g} times")
+
+
+@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML) to a site.yaml.")
+def site_import(
+    files: Annotated[list[Path], typer.Argument(help="Map files.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
+    base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
+    untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
+) -> None:
+    """Import footprints."""
+    from . import run
+
+    for line in run.run_site_import(files, out, base=base, untagged=untagged):
+        _say(line)
+    print(out)
+
+
+@site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
+def site_show(
+    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
+    flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
+    logs_root: LogsRoot = None,
+    pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
+    export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+) -> None:
+    """Look at a site."""
+    from . import run
+
+    for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
+        print(path)

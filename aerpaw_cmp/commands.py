@@ -1,0 +1,17 @@
+"""The commands and their one-line help, for ``--help`` without loading anything and for the command line itself."""
+
+from __future__ import annotations
+
+COMMANDS: dict[str, str] = {
+    "ingest": "Read logs of any known format, account for every line, write a flight file.",
+    "formats": "List the log formats that can be read, with a sample line of each.",
+    "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
+    "tap": "Log the rank indicator live from the modem's serial port.",
+    "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",
+    "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
+    "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
+    "site": "Import a site from map data (import) or look at one (show).",
+    "campaign": "Many flights and settings, on this machine or on a Dask cluster.",
+    "bench": "Speed against error of the replay on this machine.",
+    "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
+}

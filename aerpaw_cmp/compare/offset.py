@@ -1,0 +1,498 @@
+"""The one constant between a measurement and a simulation, and what is known about it.
+
+The offset is **added to the measurement**. Its grid is integers over ``1 / step`` (never accumulated floats),
+a tie goes to the offset nearer zero, and an optimum at the edge of the span is flagged: it is an error to look
+at, not a result.
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Hashable, Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError
+from ..units import FloatArray
+
+SPAN_DB = (-50.0, 50.0)
+"""Search span of arXiv 2502.10324, section V [dB]."""
+
+STEP_DB = 0.1
+"""Search step of arXiv 2502.10324, section V [dB]."""
+
+_TIE = 1e-9
+"""Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2)."""
+
+
+@dataclass(frozen=True, slots=True)
+class OffsetFit:
+    """Best constant offset.
+
+    Parameters
+    ----------
+    offset_db : float
+        To be added to the measurement [dB]; NaN without a pair.
+    rmse_db : float
+        Root mean square of ``measured + offset - simulated`` [dB]; NaN without a pair.
+    n : int
+        Pairs that count (both sides finite).
+    at_edge : bool
+        The optimum is the first or last offset of the span: the true one may lie outside.
+    """
+
+    offset_db: float
+    rmse_db: float
+    n: int
+    at_edge: bool
+
+
+@dataclass(frozen=True, slots=True)
+class CensoredFit:
+    """Offset from a Tobit likelihood, where "below" is an observation too.
+
+    Parameters
+    ----------
+    offset_db, sigma_db : float
+        Offset added to the measurement and standard deviation of the residual [dB].
+    n, n_measured_below, n_simulated_below, n_both_below : int
+        Full pairs; pairs with only the measurement, only the simulation, and both below their floors.
+    at_edge : bool
+        As in :class:`OffsetFit`.
+    """
+
+    offset_db: float
+    sigma_db: float
+    n: int
+    n_measured_below: int
+    n_simulated_below: int
+    n_both_below: int
+    at_edge: bool
+
+
+def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB) -> FloatArray:
+    """Offsets to try [dB]: the multiples of ``step_db`` inside ``span_db``, each correctly rounded.
+
+    Raises
+    ------
+    ValueError
+        If the step is not positive or no multiple lies inside the span.
+
+    Examples
+    --------
+    >>> offset_grid()[[0, 499, 503, 1000]].tolist()
+    [-50.0, -0.1, 0.3, 50.0]
+    """
+    low, high = span_db
+    if not (step_db > 0 and np.isfinite([step_db, low, high]).all()):
+        raise ValueError(f"offset step and span must be finite and the step positive, found {step_db}, {span_db}")
+    first = int(np.ceil(low / step_db - _TIE))
+    last = int(np.floor(high / step_db + _TIE))
+    if last < first:
+        raise ValueError(f"no multiple of {step_db} dB lies between {low} and {high} dB")
+    count = np.arange(first, last + 1, dtype=np.float64)
+    per_db = 1.0 / step_db
+    # 3 / 10 is 0.3; 3 * 0.1 is not
+    whole = abs(per_db - round(per_db)) < 1e-9 * per_db and round(per_db) >= 1
+    return count / round(per_db) if whole else count * step_db
+
+
+def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
+    """Index of the offset nearest to ``target_db``; a tie goes to the one nearer zero."""
+    distance = np.abs(grid_db - target_db)
+    near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)
+    return int(near[np.argmin(np.abs(grid_db[near]))])
+
+
+def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
+    """Simulated minus measured over the pairs that count [dB], flat."""
+    measured = np.asarray(measured_db, dtype=np.float64)
+    simulated = np.asarray(simulated_db, dtype=np.float64)
+    if measured.shape != simulated.shape:
+        raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
+    ok = np.isfinite(measured) & np.isfinite(simulated)
+    return np.asarray(simulated[ok] - measured[ok])
+
+
+def _mean_and_variance(values: FloatArray) -> tuple[float, float]:
+    mean = float(values.mean())
+    return mean, float(np.mean((values - mean) ** 2))
+
+
+def grid_offset(
+    measured_db: ArrayLike,
+    simulated_db: ArrayLike,
+    *,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> OffsetFit:
+    """Offset of least RMSE by grid search.
+
+    Parameters
+    ----------
+    measured_db, simulated_db : array_like, same shape
+        Levels [dB]. Pairs with a NaN (or an infinity: no power) on either side do not count.
+    step_db : float
+        Grid step [dB]; the offsets are integers over ``1 / step_db``.
+    span_db : (low, high)
+        First and last offset [dB].
+
+    Returns
+    -------
+    OffsetFit
+        The offset is added to the measurement; ties go to the offset nearer zero.
+
+    Raises
+    ------
+    ValueError
+        If the shapes differ or the grid is empty.
+
+    Notes
+    -----
+    RMSE^2(o) = variance + (mean difference - o)^2, evaluated in that form on the whole grid: sums of squares of
+    offset levels would lose the digits that decide a tie. Source: arXiv 2502.10324, section V.
+
+    Examples
+    --------
+    >>> grid_offset([-60.0, -70.0, float("nan")], [-57.0, -66.9, -1.0])
+    OffsetFit(offset_db=3.0, rmse_db=0.0707..., n=2, at_edge=False)
+    """
+    grid = offset_grid(step_db, span_db)
+    difference = _difference(measured_db, simulated_db)
+    if not len(difference):
+        return OffsetFit(float("nan"), float("nan"), 0, False)
+    mean, variance = _mean_and_variance(difference)
+    best = nearest_offset(grid, mean, step_db)
+    rmse = float(np.sqrt(variance + (mean - grid[best]) ** 2))
+    return OffsetFit(float(grid[best]), rmse, len(difference), best in (0, len(grid) - 1))
+
+
+def offset_curve(
+    measured_db: ArrayLike,
+    simulated_db: ArrayLike,
+    *,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> tuple[FloatArray, FloatArray]:
+    """RMSE [dB] at every offset [dB] of the grid: how sharply the data fix the offset.
+
+    Returns
+    -------
+    (offsets_db, rmse_db), each (offsets,)
+        RMSE is NaN everywhere without a pair.
+    """
+    grid = offset_grid(step_db, span_db)
+    difference = _difference(measured_db, simulated_db)
+    if not len(difference):
+        return grid, np.full(len(grid), np.nan)
+    mean, variance = _mean_and_variance(difference)
+    return grid, np.sqrt(variance + (mean - grid) ** 2)
+
+
+def identifiable_range(offsets_db: FloatArray, rmse_db: FloatArray, *, excess_db: float = 0.1) -> tuple[float, float]:
+    """Offsets whose RMSE stays within ``excess_db`` of the best one: (lowest, highest) [dB]."""
+    if not np.isfinite(rmse_db).any():
+        return float("nan"), float("nan")
+    near = offsets_db[rmse_db <= np.nanmin(rmse_db) + excess_db]
+    return float(near.min()), float(near.max())
+
+
+def trimmed_offset(
+    measured_db: ArrayLike,
+    simulated_db: ArrayLike,
+    *,
+    keep: float = 0.9,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> OffsetFit:
+    """Offset of least trimmed RMSE: at every offset only the ``keep`` share of smallest residuals counts.
+
+    Parameters
+    ----------
+    keep : float
+        Share of pairs that counts, above 0.5 and up to 1 (at 1 it is :func:`grid_offset`).
+
+    Returns
+    -------
+    OffsetFit
+        ``n`` and ``rmse_db`` are those of the pairs kept at the best offset.
+
+    Notes
+    -----
+    Rousseeuw's least trimmed squares, doi:10.1080/01621459.1984.10477105. In one dimension the smallest residuals
+    of an offset are a window of the sorted differences, so the whole grid costs one sort and one search.
+    """
+    if not 0.5 < keep <= 1.0:
+        raise ValueError(f"keep must be above 0.5 and at most 1, found {keep}")
+    grid = offset_grid(step_db, span_db)
+    difference = np.sort(_difference(measured_db, simulated_db))
+    n = len(difference)
+    if not n:
+        return OffsetFit(float("nan"), float("nan"), 0, False)
+    kept = int(np.ceil(keep * n - 1e-9))
+    centre = float(difference.mean())
+    d = difference - centre
+    sums = np.concatenate([[0.0], np.cumsum(d)])
+    squares = np.concatenate([[0.0], np.cumsum(d * d)])
+    # moving the window by one pays off once the offset passes the middle of what leaves and what enters
+    first = np.searchsorted(0.5 * (d[: n - kept] + d[kept:]), grid - centre)
+    mean = (sums[first + kept] - sums[first]) / kept
+    variance = np.maximum((squares[first + kept] - squares[first]) / kept - mean**2, 0.0)
+    mse = variance + (mean - (grid - centre)) ** 2
+    near = np.flatnonzero(mse <= mse.min() + _TIE * step_db**2)
+    best = int(near[np.argmin(np.abs(grid[near]))])
+    return OffsetFit(float(grid[best]), float(np.sqrt(mse[best])), kept, best in (0, len(grid) - 1))
+
+
+def censored_offset(
+    measured_db: ArrayLike,
+    simulated_db: ArrayLike,
+    *,
+    measured_floor_db: float,
+    simulated_floor_db: float,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> CensoredFit:
+    """Offset when a sample at the noise floor or without a path is an observation: "below".
+
+    Parameters
+    ----------
+    measured_db, simulated_db : array_like, (n,)
+        Levels [dB]. Here NaN means **below the floor** (no signal; no path): leave out samples that were not
+        taken at all before the call.
+    measured_floor_db : float
+        The receiver reports nothing lower; levels at or below it are "below" [dB, unit of the measurement].
+    simulated_floor_db : float
+        The simulation tells nothing about levels lower than this [dB, unit of the simulation].
+
+    Returns
+    -------
+    CensoredFit
+
+    Notes
+    -----
+    Tobit likelihood (Tobin 1958, doi:10.2307/1907382) with residual ``simulated - measured ~ N(offset, sigma)``: a
+    measurement below its floor says ``residual > simulated - floor``; a simulation below its floor says
+    ``residual < floor - measured``; both below say nothing. In Olsen's scale (doi:10.2307/1911275) the logarithm
+    is concave, so the maximum is the only one; the offset is then the nearest one of the grid.
+    """
+    measured, simulated = np.asarray(measured_db, dtype=np.float64), np.asarray(simulated_db, dtype=np.float64)
+    if measured.shape != simulated.shape:
+        raise ValueError(f"measured has shape {measured.shape}, simulated {simulated.shape}: they must be pairs")
+    low_m, low_s = ~(measured > measured_floor_db), ~(simulated > simulated_floor_db)
+    full = (simulated - measured)[~low_m & ~low_s]
+    above = (simulated - measured_floor_db)[low_m & ~low_s]
+    below = (simulated_floor_db - measured)[~low_m & low_s]
+    counts = (len(full), len(above), len(below), int((low_m & low_s).sum()))
+    if not len(full):
+        return CensoredFit(float("nan"), float("nan"), *counts, False)
+    mean, sigma = _tobit(full, above, below)
+    grid = offset_grid(step_db, span_db)
+    best = nearest_offset(grid, mean, step_db)
+    return CensoredFit(float(grid[best]), sigma, *counts, best in (0, len(grid) - 1))
+
+
+def _tobit(full: FloatArray, above: FloatArray, below: FloatArray) -> tuple[float, float]:
+    """Mean and standard deviation of a normal sample with values known, above and below given limits."""
+    from scipy.optimize import minimize
+    from scipy.stats import norm
+
+    centre, variance = _mean_and_variance(full)
+    scale = max(float(np.sqrt(variance)), 1e-3)
+    full, above, below = (full - centre) / scale, (above - centre) / scale, (below - centre) / scale
+
+    def negative(parameters: FloatArray) -> tuple[float, FloatArray]:
+        delta, theta = parameters  # mean / sigma, 1 / sigma
+        z = theta * full - delta
+        up, down = delta - theta * above, theta * below - delta
+        log_up, log_down = norm.logcdf(up), norm.logcdf(down)
+        value = 0.5 * (z @ z) - len(full) * np.log(theta) - log_up.sum() - log_down.sum()
+        mills_up, mills_down = np.exp(norm.logpdf(up) - log_up), np.exp(norm.logpdf(down) - log_down)
+        slope = np.array(
+            [
+                -z.sum() - mills_up.sum() + mills_down.sum(),
+                z @ full - len(full) / theta + mills_up @ above - mills_down @ below,
+            ]
+        )
+        return float(value), slope
+
+    start = np.array([0.0, 1.0])
+    # 1 / sigma has no bound when all known values are equal: stop at a thousandth of a dB
+    best = minimize(negative, start, jac=True, method="L-BFGS-B", bounds=[(None, None), (1e-6, scale * 1e3)])
+    delta, theta = best.x
+    return centre + scale * float(delta / theta), scale / float(theta)
+
+
+Pooling = Literal["link", "tower", "channel", "flight", "all"]
+
+_GROUP: dict[str, tuple[int, ...]] = {"link": (0, 1, 2), "tower": (1,), "channel": (2,), "flight": (0,), "all": ()}
+
+
+def pooled_offsets(
+    pairs: Mapping[tuple[str, str, str], tuple[ArrayLike, ArrayLike]],
+    per: Pooling = "link",
+    *,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> dict[tuple[str, str, str], OffsetFit]:
+    """One offset per tower, channel, flight, link or for everything.
+
+    Parameters
+    ----------
+    pairs : mapping of (flight, tower, channel) to (measured_db, simulated_db)
+        All sequences.
+    per : {"link", "tower", "channel", "flight", "all"}
+        Which sequences share an offset.
+
+    Returns
+    -------
+    dict
+        Per (flight, tower, channel): the shared offset with the RMSE and the number of pairs of that sequence alone.
+    """
+    axes = _GROUP[per]
+    groups: dict[Hashable, list[tuple[str, str, str]]] = {}
+    for key in pairs:
+        groups.setdefault(tuple(key[axis] for axis in axes), []).append(key)
+    fits: dict[tuple[str, str, str], OffsetFit] = {}
+    for members in groups.values():
+        together = np.concatenate([_difference(*pairs[key]) for key in members])
+        shared = grid_offset(np.zeros(len(together)), together, step_db=step_db, span_db=span_db)
+        for key in members:
+            own = _difference(*pairs[key])
+            rmse = float(np.sqrt(np.mean((own - shared.offset_db) ** 2))) if len(own) else float("nan")
+            fits[key] = OffsetFit(shared.offset_db, rmse, len(own), shared.at_edge)
+    return {key: fits[key] for key in pairs}
+
+
+@dataclass(frozen=True, slots=True)
+class ReferencePower:
+    """Reference power of one USRP setting.
+
+    Parameters
+    ----------
+    node, category, channel : str
+        Such as ``"lw1"``, ``"rx"``, ``"ch0"``.
+    amplifier : bool
+        Whether the power amplifier (or LNA) was on.
+    gain_db : float
+        USRP gain setting.
+    frequencies_hz, power_dbm : (f,)
+        Power that corresponds to full scale [dBm] at each carrier; NaN where not measured.
+    """
+
+    node: str
+    category: str
+    channel: str
+    amplifier: bool
+    gain_db: float
+    frequencies_hz: FloatArray
+    power_dbm: FloatArray
+
+    def at(self, frequency_hz: float) -> float:
+        """Reference power [dBm] at a carrier, interpolated; NaN outside the measured carriers."""
+        good = np.isfinite(self.power_dbm)
+        if not good.any():
+            return float("nan")
+        where, level = self.frequencies_hz[good], self.power_dbm[good]
+        return float(np.interp(frequency_hz, where, level, left=np.nan, right=np.nan))
+
+
+def read_reference_powers(path: str | Path) -> list[ReferencePower]:
+    """USRP reference powers from a CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``.
+
+    Raises
+    ------
+    InputError
+        If the file cannot be read, a column is missing or a number is none; with the line.
+    """
+    try:
+        with Path(path).open(newline="", encoding="utf-8") as handle:
+            rows = list(csv.reader(handle))
+    except (OSError, UnicodeDecodeError) as error:
+        raise InputError(f"cannot read reference powers: {error}", path=path) from None
+    header = rows[0] if rows else []
+    fixed = ["Node", "Category", "Channel", "PA_Enabled", "Gain"]
+    carriers = [name for name in header[5:] if name.startswith("Freq_") and name.endswith("GHz")]
+    if header[:5] != fixed or not carriers or len(carriers) != len(header) - 5:
+        raise InputError("no table of reference powers", expected=",".join([*fixed, "Freq_3.30GHz", "..."]), path=path)
+    try:
+        frequencies = np.array([round(float(name[5:-3]) * 1e9) for name in carriers], dtype=np.float64)
+    except ValueError:
+        raise InputError(f"unreadable carrier in {carriers}", expected="Freq_3.30GHz", path=path, line=1) from None
+    found = []
+    for line, row in enumerate(rows[1:], start=2):
+        if not row:
+            continue
+        try:
+            levels = np.array([float(cell) if cell.strip() else np.nan for cell in row[5:]])
+            if len(levels) != len(frequencies):
+                raise ValueError(f"{len(row)} columns where the header has {len(header)}")
+            amplifier, gain = bool(int(row[3])), float(row[4])
+        except (ValueError, IndexError) as error:
+            raise InputError(f"unreadable row: {error}", expected="numbers", path=path, line=line) from None
+        found.append(
+            ReferencePower(row[0].lower(), row[1].lower(), row[2].lower(), amplifier, gain, frequencies, levels)
+        )
+    return found
+
+
+def reference_power_dbm(
+    table: Iterable[ReferencePower],
+    *,
+    node: str,
+    category: Literal["tx", "rx"],
+    channel: str,
+    gain_db: float,
+    frequency_hz: float,
+    amplifier: bool = False,
+) -> float:
+    """The reference power [dBm] of one setting, at the nearest gain within 0.5 dB; NaN where the table has none."""
+    wanted = (node.lower(), category, channel.lower(), amplifier)
+    rows = [row for row in table if (row.node, row.category, row.channel, row.amplifier) == wanted]
+    near = sorted(
+        (abs(row.gain_db - gain_db), row.at(frequency_hz)) for row in rows if abs(row.gain_db - gain_db) <= 0.5
+    )
+    return near[0][1] if near else float("nan")
+
+
+def expected_offset_db(
+    *,
+    receiver_reference_dbm: float,
+    transmitter_reference_dbm: float = 0.0,
+    simulated_transmit_dbm: float = 0.0,
+    transmit_amplitude_dbfs: float = 0.0,
+    transmit_gain_db: float = 0.0,
+    receive_gain_db: float = 0.0,
+) -> float:
+    """Offset that the link budget predicts for a measurement in dB re full scale.
+
+    Parameters
+    ----------
+    receiver_reference_dbm : float
+        Power at the receiver's port that reads 0 dB re full scale [dBm].
+    transmitter_reference_dbm : float
+        Power at the transmitter's port at full scale [dBm].
+    simulated_transmit_dbm : float
+        Transmit power that the simulation assumed [dBm] (0 for a unit-power path gain in dB).
+    transmit_amplitude_dbfs : float
+        Digital amplitude of the waveform [dB re full scale].
+    transmit_gain_db, receive_gain_db : float
+        Amplifiers, minus cables, between port and antenna that the simulation does not contain [dB].
+
+    Returns
+    -------
+    float
+        ``measured + offset`` then is the simulated level: the measured level in dBm is ``reading + receiver
+        reference - receive gain``, and the simulation errs by its transmit power.
+
+    Examples
+    --------
+    >>> expected_offset_db(receiver_reference_dbm=-40.0, transmitter_reference_dbm=10.0, simulated_transmit_dbm=40.0)
+    -10.0
+    """
+    transmitted = transmitter_reference_dbm + transmit_amplitude_dbfs + transmit_gain_db
+    return receiver_reference_dbm - receive_gain_db + simulated_transmit_dbm - transmitted

@@ -1,0 +1,833 @@
+"""Rank of a channel, and how two sequences of ranks compare.
+
+``rank`` counts singular values above ``sigma_1 / K`` (strictly); 0 means that there is no channel. Measured RI is
+a float with NaN where the modem gave no CSI; it is never 0.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
+from .statistics import (
+    NO_INTERVAL,
+    REPLICATES,
+    SEED,
+    Interval,
+    Memory,
+    bootstrap_means,
+    interval,
+    memory,
+    plain,
+    share_interval,
+)
+
+MAX_RANK = 4
+"""Ranks of the histograms: 1 to 4 (RI of the AERPAW modems)."""
+
+_CHUNK = 1 << 20
+"""Matrix entries per SVD batch: bounds memory."""
+
+
+def singular_values(h: ArrayLike) -> FloatArray:
+    """Singular values of every channel matrix, divided by the largest magnitude of an entry.
+
+    Parameters
+    ----------
+    h : array_like, complex, (..., n_rx, n_tx)
+        Channel matrices. Only ratios of singular values matter to a rank, so each matrix is scaled by a power of
+        two before its decomposition: entries of 1e-150 or 1e150 neither vanish nor overflow.
+
+    Returns
+    -------
+    ndarray, (..., min(n_rx, n_tx))
+        Descending, relative to the scale of each matrix; zeros for an all-zero matrix, NaN where an entry is not
+        finite.
+
+    Examples
+    --------
+    >>> singular_values([[[4e-160, 0], [0, 1e-160]]]).shape
+    (1, 2)
+    """
+    matrix = np.asarray(h, dtype=np.complex128)
+    if matrix.ndim < 2:
+        raise ValueError(f"H must have shape (..., n_rx, n_tx), found {matrix.shape}")
+    lead, (rows, columns) = matrix.shape[:-2], matrix.shape[-2:]
+    flat = matrix.reshape(-1, rows, columns)
+    result = np.full((len(flat), min(rows, columns)), np.nan)
+    step = max(1, _CHUNK // max(1, rows * columns))
+    for start in range(0, len(flat), step):
+        part = flat[start : start + step]
+        good = np.isfinite(part).all(axis=(1, 2))
+        result[start : start + step][good] = np.linalg.svd(_scaled(part[good]), compute_uv=False)
+    return result.reshape(*lead, min(rows, columns))
+
+
+def _scaled(matrix: ComplexArray) -> ComplexArray:
+    """Each matrix times the power of two that brings its largest part into [0.5, 1): exact."""
+    if not matrix.size:
+        return matrix
+    largest = np.maximum(np.abs(matrix.real), np.abs(matrix.imag)).max(axis=(1, 2))
+    _, exponent = np.frexp(largest)
+    shift = -exponent[:, None, None]
+    return np.asarray(np.ldexp(matrix.real, shift) + 1j * np.ldexp(matrix.imag, shift))
+
+
+def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
+    """Ranks of singular-value profiles (..., m), as in :func:`channel_rank`; NaN profiles give 0.
+
+    Singular values that tie with ``sigma_1 / k`` do not count (strict). SVD noise is a few ulp of ``sigma_1``, so a
+    tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1, whatever the rounding.
+    """
+    if not k >= 1:
+        raise ValueError(f"K is a ratio of singular values and must be >= 1, found {k}")
+    values = np.asarray(sigma, dtype=np.float64)
+    if not values.shape[-1]:
+        return np.zeros(values.shape[:-1], dtype=np.int64)
+    largest = values.max(axis=-1, keepdims=True)
+    margin = 8.0 * np.finfo(np.float64).eps
+    above = values > largest * (1.0 / k + margin)
+    # the largest one counts by definition, also at K = 1 where it ties with itself only by rounding
+    alive = (largest[..., 0] > 0) & np.isfinite(largest[..., 0])
+    rank = above.sum(axis=-1)
+    if k > 1:
+        rank = np.maximum(rank, 1)
+    return np.where(alive, rank, 0).astype(np.int64)
+
+
+def channel_rank(h: ArrayLike, k: float) -> IntArray:
+    """Number of singular values above ``sigma_1 / k`` (strict) of every channel matrix.
+
+    Parameters
+    ----------
+    h : array_like, complex, (..., n_rx, n_tx)
+        Channel matrices; any scale.
+    k : float
+        Ratio of singular values, >= 1 (the paper's K = 10, 100, 1000; its "10, 20, 30 dB").
+
+    Returns
+    -------
+    ndarray of int, (...)
+        0 = no channel (all entries zero, or an entry is NaN or infinite: no path reached the receiver).
+
+    Raises
+    ------
+    ValueError
+        If ``h`` has fewer than two axes or ``k < 1``.
+
+    Notes
+    -----
+    Source: arXiv 2502.10324, section III. At ``k = 1`` nothing exceeds ``sigma_1`` and every rank is 0.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> h = np.diag([1.0, 0.2, 0.1, 0.05])
+    >>> channel_rank(h, 10), channel_rank(1e-150 * h, 1000), channel_rank(0 * h, 10)
+    (array(2), array(4), array(0))
+    """
+    return rank_from_singular_values(singular_values(h), k)
+
+
+def _ranks(rank: ArrayLike) -> FloatArray:
+    return np.asarray(rank, dtype=np.float64).ravel()
+
+
+def histogram(rank: ArrayLike, *, max_rank: int = MAX_RANK, weights: ArrayLike | None = None) -> FloatArray:
+    """Shares of rank 1 .. ``max_rank``; 0 (no channel) and NaN (no CSI) do not take part.
+
+    Parameters
+    ----------
+    rank : array_like
+        Ranks, any shape.
+    max_rank : int
+        Higher ranks are an error.
+    weights : array_like, optional
+        One per rank, e.g. how long it held.
+
+    Returns
+    -------
+    ndarray, (max_rank,)
+        Sums to one; all NaN when nothing counts.
+
+    Examples
+    --------
+    >>> histogram([1, 2, 2, 0, float("nan")]).round(3).tolist()
+    [0.333, 0.667, 0.0, 0.0]
+    """
+    values = _ranks(rank)
+    weight = np.ones(len(values)) if weights is None else _ranks(weights)
+    counts = np.isfinite(values) & (values >= 1)
+    if np.any(values[counts] > max_rank) or np.any(values[counts] != np.round(values[counts])):
+        raise ValueError(f"ranks must be whole numbers up to {max_rank}")
+    bars = np.bincount(values[counts].astype(np.int64), weights=weight[counts], minlength=max_rank + 1)[1:]
+    total = bars.sum()
+    return np.asarray(bars / total) if total > 0 else np.full(max_rank, np.nan)
+
+
+def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
+    """Share of poses at which both ranks exist (not NaN, not 0) and are equal; NaN when none does.
+
+    Examples
+    --------
+    >>> agreement([1, 2, 2, float("nan")], [1, 2, 3, 1])
+    0.6666666666666666
+    """
+    one, two = _ranks(measured), _ranks(simulated)
+    if one.shape != two.shape:
+        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
+    both = (one >= 1) & (two >= 1)
+    return float(np.mean(one[both] == two[both])) if both.any() else float("nan")
+
+
+def total_variation(one: ArrayLike, two: ArrayLike) -> float:
+    """Total variation distance of two histograms of shares: half the sum of absolute differences, 0 to 1.
+
+    Examples
+    --------
+    >>> total_variation([0.5, 0.5, 0, 0], [1, 0, 0, 0])
+    0.5
+    """
+    return float(0.5 * np.abs(np.asarray(one, dtype=np.float64) - np.asarray(two, dtype=np.float64)).sum())
+
+
+def wasserstein(one: ArrayLike, two: ArrayLike) -> float:
+    """Wasserstein-1 distance of two rank histograms [ranks]: how far shares must move, in ranks.
+
+    Examples
+    --------
+    >>> wasserstein([1, 0, 0, 0], [0, 0, 0, 1])
+    3.0
+    """
+    step = np.cumsum(np.asarray(one, dtype=np.float64) - np.asarray(two, dtype=np.float64))
+    return float(np.abs(step[:-1]).sum())
+
+
+def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
+    """Both ranks as integers, where both exist (not NaN, not 0)."""
+    one, two = _ranks(measured), _ranks(simulated)
+    if one.shape != two.shape:
+        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
+    both = (one >= 1) & (two >= 1)
+    return one[both].astype(np.int64), two[both].astype(np.int64)
+
+
+def confusion_matrix(measured: ArrayLike, simulated: ArrayLike, *, max_rank: int = MAX_RANK) -> IntArray:
+    """Counts of (measured rank, simulated rank), each 0 .. ``max_rank``; 0 collects what does not exist.
+
+    Returns
+    -------
+    ndarray of int, (max_rank + 1, max_rank + 1)
+        Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are in it.
+    """
+    one, two = _ranks(measured), _ranks(simulated)
+    if one.shape != two.shape:
+        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
+    row = np.where(one >= 1, one, 0).astype(np.int64)
+    column = np.where(two >= 1, two, 0).astype(np.int64)
+    if len(row) and max(row.max(), column.max()) > max_rank:
+        raise ValueError(f"ranks must be at most {max_rank}")
+    size = max_rank + 1
+    return np.bincount(row * size + column, minlength=size * size).reshape(size, size).astype(np.int64)
+
+
+def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
+    """Cohen's kappa: agreement beyond what the two histograms alone would give.
+
+    1: always equal; 0: no better than chance; NaN without a pair or when both are the same constant (RI only ever
+    2 against rank only ever 2 agrees fully, but says nothing). Cohen (1960), doi:10.1177/001316446002000104.
+
+    Examples
+    --------
+    >>> cohen_kappa([1, 2, 1, 2], [1, 2, 2, 1])
+    0.0
+    """
+    one, two = _pairs(measured, simulated)
+    if not len(one):
+        return float("nan")
+    size = int(max(one.max(), two.max())) + 1
+    return _kappa(float(np.mean(one == two)), np.bincount(one, minlength=size), np.bincount(two, minlength=size))
+
+
+def _kappa(observed: float, one: IntArray, two: IntArray) -> float:
+    chance = float((one / one.sum()) @ (two / two.sum()))
+    return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
+
+
+def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int | None = None) -> float:
+    """p-value of the agreement by pose against unrelated sequences of the same memory.
+
+    Parameters
+    ----------
+    measured, simulated : array_like, (n,)
+        In time order. Pairs where one does not exist are left out first.
+    minimum_shift : int, optional
+        Shifts below this (and above n minus this) are too near to the real alignment to be unrelated; by default
+        the longer block length of the two.
+
+    Returns
+    -------
+    float
+        Share of circular shifts that agree at least as well, the real one included. NaN below 8 pairs, where no
+        shift is long enough, or where a sequence is constant (every shift agrees the same).
+
+    Notes
+    -----
+    A circular shift keeps both histograms and both autocorrelations and breaks only the alignment (Harris 2020,
+    arXiv:2012.06862). All shifts at once: one FFT correlation per rank. As the histograms stay, the test of kappa
+    is the same test.
+    """
+    one, two = _pairs(measured, simulated)
+    n = len(one)
+    if n < 8 or np.ptp(one) == 0 or np.ptp(two) == 0:
+        return float("nan")
+    near = minimum_shift or max(memory(one).block_length, memory(two).block_length)
+    near = int(np.clip(near, 1, n // 4))
+    matches = np.zeros(n)
+    for rank in np.intersect1d(one, two):
+        spectrum = np.fft.rfft(one == rank) * np.conj(np.fft.rfft(two == rank))
+        matches += np.fft.irfft(spectrum, n)
+    count = np.round(matches)
+    apart = count[near : n - near + 1]
+    return float((1 + np.sum(apart >= count[0])) / (1 + len(apart)))
+
+
+def histogram_test(
+    measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES, seed: int = SEED
+) -> float:
+    """p-value of the total variation between both histograms, when blocks of the pair are swapped at random.
+
+    If measured and simulated ranks came from one distribution, exchanging them over whole blocks (as long as the
+    sequences remember) would change nothing. NaN without a pair.
+    """
+    one, two = _pairs(measured, simulated)
+    if not len(one):
+        return float("nan")
+    difference = _indicators(one) - _indicators(two)
+    length = max(memory(one).block_length, memory(two).block_length, 1)
+    sums = np.add.reduceat(difference, np.arange(0, len(one), length), axis=0)
+    signs = np.random.default_rng(seed).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
+    swapped = np.abs(signs @ sums).sum(axis=1)
+    return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
+
+
+def _indicators(rank: IntArray | FloatArray, max_rank: int = MAX_RANK) -> FloatArray:
+    """One column per rank 1 .. max_rank, 1 where the rank is it; (n, max_rank)."""
+    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, max_rank + 1), dtype=np.float64)
+
+
+# --- what explains the modem's decision ----------------------------------------------------------------------------
+
+
+def k_grid(low: float = 1.25, high: float = 1e5, per_decade: int = 24) -> FloatArray:
+    """Logarithmic grid of K from ``low`` to ``high``, containing 10, 100, 1000 exactly where in range."""
+    first, last = np.ceil(np.log10(low) * per_decade), np.floor(np.log10(high) * per_decade)
+    k = 10.0 ** (np.arange(first, last + 1) / per_decade)
+    decade = np.round(np.log10(k))
+    return np.asarray(np.where(np.isclose(k, 10.0**decade, rtol=1e-9), 10.0**decade, k))
+
+
+@dataclass(frozen=True, slots=True)
+class KCurve:
+    """Agreement and total variation as functions of continuous K.
+
+    Parameters
+    ----------
+    k : (m,)
+        Values of K.
+    agreement, total_variation : (m,)
+        Against the measurement.
+    best_k_agreement, best_k_total_variation : float
+        Where the best value is reached (the middle, on the log scale, of the best run of K); NaN without a pair.
+    best_k_interval, best_k_total_variation_interval : (low, high)
+        Central 95 % of the best K over the bootstrap replicates, one grid step wider on either side.
+    at_edge : bool
+        The best agreement is reached at an end of the grid.
+    """
+
+    k: FloatArray
+    agreement: FloatArray
+    total_variation: FloatArray
+    best_k_agreement: float
+    best_k_interval: Interval
+    best_k_total_variation: float
+    best_k_total_variation_interval: Interval
+    at_edge: bool
+
+
+def k_curve(
+    measured: ArrayLike,
+    sigma: ArrayLike,
+    *,
+    k: ArrayLike | None = None,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> KCurve:
+    """Agreement for every K, and the K that explains the measured ranks best.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        RI in time order, NaN where none.
+    sigma : array_like, (n, m)
+        Singular values of the simulated channel at the same poses (any scale; see :func:`singular_values`).
+    k : array_like, optional
+        Grid of K, by default :func:`k_grid`.
+    replicates, seed : int
+        Block bootstrap for the intervals of the best K.
+    """
+    grid = k_grid() if k is None else np.asarray(k, dtype=np.float64)
+    ri = _ranks(measured)
+    profile = np.asarray(sigma, dtype=np.float64)
+    both = (ri >= 1) & (rank_from_singular_values(profile, 10.0) >= 1)
+    ri, profile = ri[both].astype(np.int64), profile[both]
+    if not len(ri):
+        nothing = np.full(len(grid), np.nan)
+        return KCurve(grid, nothing, nothing, float("nan"), NO_INTERVAL, float("nan"), NO_INTERVAL, False)
+    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
+    equal = (ranks == ri[:, None]).astype(np.float64)
+    length = memory(equal.mean(axis=1)).block_length
+    agree = equal.mean(axis=0)
+    drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
+    vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
+    for rank in range(1, MAX_RANK + 1):  # the same seed draws the same blocks each time
+        apart = (ranks == rank).astype(np.float64) - (ri == rank)[:, None]
+        vary += 0.5 * np.abs(apart.mean(axis=0))
+        varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
+    best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
+    return KCurve(
+        grid,
+        agree,
+        vary,
+        float(best),
+        _central(_middle_of_best(drawn, grid), grid),
+        float(best_tv),
+        _central(_middle_of_best(-varied, grid), grid),
+        bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
+    )
+
+
+def _middle_of_best(curves: FloatArray, k: FloatArray) -> FloatArray:
+    """Per row: the middle of the first run of K at which the row is at its maximum."""
+    top = curves >= curves.max(axis=1, keepdims=True) - 1e-12
+    first = np.argmax(top, axis=1)
+    later = np.arange(curves.shape[1]) >= first[:, None]
+    over = ~top & later
+    end = np.where(over.any(axis=1), np.argmax(over, axis=1), curves.shape[1]) - 1
+    return np.asarray(np.sqrt(k[first] * k[end]))
+
+
+def _central(values: FloatArray, k: FloatArray) -> Interval:
+    """Central 95 % of best values, one grid step wider on either side: nothing finer was tried."""
+    low, high = np.quantile(values, [0.025, 0.975])
+    first = max(0, int(np.searchsorted(k, low * (1 + 1e-9))) - 2)
+    last = min(len(k) - 1, int(np.searchsorted(k, high * (1 - 1e-9))) + 1)
+    return float(min(k[first], low)), float(max(k[last], high))
+
+
+def condition_number_rank(h: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
+    """Rank by the condition-number rule of an open UE: layers within ``limit_db`` of the strongest.
+
+    srsUE reports two layers when the condition number of its 2 x 2 channel is below 17 dB (``srsran_ue_dl_select_ri``
+    in ``lib/src/phy/ue/ue_dl.c``); for more ports the same limit is put on each singular value, 20 log10 of the
+    ratio. In terms of K that is 10^(17/20) = 7.08.
+    """
+    return channel_rank(h, 10.0 ** (limit_db / 20.0))
+
+
+def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0) -> IntArray:
+    """Number of layers that maximises rate at the reported SINR.
+
+    Parameters
+    ----------
+    h : array_like, complex, (..., n_rx, n_tx)
+        Channel matrices, any scale.
+    sinr_db : array_like, (...)
+        Mean SINR per receive port with the whole transmit power spread over all ports [dB]; NaN gives rank 0.
+    penalty_bits : float
+        Rate that each layer after the first must bring beyond the best lower rank [bit/s/Hz].
+
+    Returns
+    -------
+    ndarray of int, (...)
+        0 = no channel or no SINR. Ties go to fewer layers.
+
+    Notes
+    -----
+    Rate of L layers with equal power on the L strongest singular directions: ``sum_i log2(1 + snr g_i / L)`` with
+    ``g_i = n_rx n_tx sigma_i^2 / |H|_F^2``. A modem chooses from a codebook and hears estimation noise, so this
+    is an upper bound of what it could choose (3GPP TS 38.214 clause 5.2.2.2).
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> capacity_rank(np.diag([1.0, 0.5, 0.1, 0.1]), [-10.0, 5.0])
+    array([1, 2])
+    """
+    matrix = np.asarray(h)
+    sigma = singular_values(matrix)
+    power = sigma**2
+    total = power.sum(axis=-1, keepdims=True)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        gain = matrix.shape[-1] * matrix.shape[-2] * power / total
+    snr = power_from_db(sinr_db)
+    shape = np.broadcast_shapes(gain.shape[:-1], snr.shape)
+    rates = []
+    for layers in range(1, gain.shape[-1] + 1):
+        rate = np.log2(1.0 + snr[..., None] * gain[..., :layers] / layers).sum(axis=-1)
+        rates.append(np.broadcast_to(rate - penalty_bits * (layers - 1), shape))
+    stacked = np.stack(rates, axis=-1)
+    alive = np.isfinite(stacked).all(axis=-1)
+    best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1
+    return np.where(alive, best, 0).astype(np.int64)
+
+
+def profile_by_rank(measured: ArrayLike, sigma: ArrayLike) -> dict[int, FloatArray]:
+    """Singular-value profiles behind each measured rank: what the channel was where the RI was 2.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        RI; NaN where none.
+    sigma : array_like, (n, m)
+        Singular values, descending.
+
+    Returns
+    -------
+    dict of int to ndarray, (3, m)
+        Lower quartile, median, upper quartile of ``20 log10 (sigma_i / sigma_1)`` [dB] where the RI was that rank. A
+        threshold rule with K explains a rank r if the median of column r lies above ``-20 log10 K`` and that of
+        column r + 1 below.
+    """
+    ri, profile = _ranks(measured), np.asarray(sigma, dtype=np.float64)
+    alive = (ri >= 1) & (profile[:, 0] > 0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio_db = 20.0 * np.log10(profile / profile[:, :1])
+    result = {}
+    for rank in np.unique(ri[alive]).astype(int):
+        rows = np.sort(ratio_db[alive & (ri == rank)], axis=0)
+        # order statistics, not interpolation: ratios of rank-deficient channels are minus infinity
+        result[int(rank)] = rows[np.round(np.array([0.25, 0.5, 0.75]) * (len(rows) - 1)).astype(int)]
+    return result
+
+
+@dataclass(frozen=True, slots=True)
+class Staleness:
+    """How long the modem's report was held.
+
+    Parameters
+    ----------
+    fresh : (n,) bool
+        First row of each report: the others repeat it.
+    n_reports : int
+        Reports among the rows with a rank.
+    hold_s : float
+        Median time that one report was held [s]; NaN below two reports.
+    verdict : str
+        ``"fresh"`` (at most every tenth row repeats), ``"held"``, ``"constant"`` (one value throughout: staleness
+        cannot be seen) or ``"no rank"``.
+    """
+
+    fresh: BoolArray
+    n_reports: int
+    hold_s: float
+    verdict: str
+
+
+def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, ArrayLike] | None = None) -> Staleness:
+    """Recognise an RI that is held between reports.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Instants [s], increasing.
+    rank : array_like, (n,)
+        RI, NaN where none.
+    others : mapping of str to array_like (n,), optional
+        Further numbers of the same report (RSRP, SINR, CQI). A row that repeats **all** of them is a repetition;
+        RSRP and SINR hardly ever repeat by chance. Without them the hold is read off the changes of RI alone: if
+        all changes keep to multiples of a period of several rows, the report comes once per period.
+    """
+    time, ri = np.asarray(time_s, dtype=np.float64), _ranks(rank)
+    known = np.isfinite(ri)
+    if not known.any():
+        return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
+    columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (others or {}).values())]
+    if len(columns) > 1:
+        told = np.any([np.isfinite(c) for c in columns[1:]], axis=0)  # a row without further numbers proves nothing
+        fresh = known & (_changes(columns) | ~told)
+    else:
+        fresh = known & _period_starts(ri)
+    constant = all(np.ptp(c[np.isfinite(c)]) == 0 for c in columns if np.isfinite(c).any())
+    reports = int(fresh.sum())
+    hold = float(np.median(np.diff(time[fresh]))) if reports > 1 else float("nan")
+    held = reports < 0.9 * int(known.sum())
+    return Staleness(fresh, reports, hold, "constant" if constant else "held" if held else "fresh")
+
+
+def _changes(columns: Sequence[FloatArray]) -> BoolArray:
+    """Rows that differ from the row before in any column (NaN equals NaN); the first row does."""
+    changed = np.zeros(len(columns[0]), dtype=bool)
+    changed[:1] = True
+    for c in columns:
+        changed[1:] |= ~((c[1:] == c[:-1]) | (np.isnan(c[1:]) & np.isnan(c[:-1])))
+    return changed
+
+
+def _period_starts(ri: FloatArray) -> BoolArray:
+    """Rows at which a report may have come, if RI changes only at multiples of a period; else all rows."""
+    change = np.flatnonzero(_changes([ri]))[1:]
+    if len(change) < 8:  # too few changes to tell a period from chance
+        return np.ones(len(ri), dtype=bool)
+    periods = np.arange(2, max(3, len(ri) // 8))
+    # the largest period for which at least 95 % of the changes fall on one phase
+    for period in periods[::-1]:
+        phase = np.bincount(change % period, minlength=period)
+        if phase.max() >= 0.95 * len(change):
+            return np.asarray(np.arange(len(ri)) % period == np.argmax(phase))
+    return np.ones(len(ri), dtype=bool)
+
+
+# --- the comparison ------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class RankFit:
+    """Simulated ranks of one rule against the measured ones.
+
+    Parameters
+    ----------
+    histogram : (4,)
+        Shares of rank 1 to 4 among poses with a channel; ``histogram_ci95`` their intervals.
+    out_of_coverage : int
+        Poses without a channel.
+    agreement, kappa, total_variation, wasserstein : float
+        Against the measurement, each with a 95 % interval.
+    confusion : (5, 5) int
+        Rows measured, columns simulated, 0 first (does not exist).
+    p_agreement, p_histogram : float
+        Of :func:`shift_test` and :func:`histogram_test`.
+    """
+
+    histogram: FloatArray
+    histogram_ci95: list[Interval]
+    out_of_coverage: int
+    agreement: float
+    agreement_ci95: Interval
+    kappa: float
+    kappa_ci95: Interval
+    total_variation: float
+    total_variation_ci95: Interval
+    wasserstein: float
+    wasserstein_ci95: Interval
+    confusion: IntArray
+    p_agreement: float
+    p_histogram: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry ``simulated.<K>`` of metrics.json."""
+        names = {
+            "histogram": _bars(self.histogram),
+            "histogram_ci95": _bars(self.histogram_ci95),
+            "out_of_coverage": self.out_of_coverage,
+            "agreement": self.agreement,
+            "agreement_ci95": self.agreement_ci95,
+            "kappa": self.kappa,
+            "kappa_ci95": self.kappa_ci95,
+            "total_variation": self.total_variation,
+            "total_variation_ci95": self.total_variation_ci95,
+            "wasserstein": self.wasserstein,
+            "wasserstein_ci95": self.wasserstein_ci95,
+            "confusion": self.confusion,
+            "p_agreement": self.p_agreement,
+            "p_histogram": self.p_histogram,
+        }
+        return dict(plain(names))
+
+
+def _bars(values: Sequence[Any] | FloatArray) -> dict[str, Any]:
+    return {str(rank): value for rank, value in enumerate(values, start=1)}
+
+
+@dataclass(frozen=True, slots=True)
+class RankComparison:
+    """Measured RI of one tower against simulated ranks.
+
+    Parameters
+    ----------
+    n, n_effective : int, float
+        Measured ranks, and how many independent ones they are worth.
+    n_no_csi : int
+        Rows where the modem gave no RI.
+    histogram : (4,)
+        Measured shares of rank 1 to 4, with intervals in ``histogram_ci95``.
+    simulated : mapping of float to RankFit
+        Per K.
+    rules : mapping of str to RankFit
+        Other rules: ``"condition_number"``, and ``"capacity"`` where an SINR was given.
+    curve : KCurve
+        Continuous K.
+    staleness : Staleness
+        Of the measured RI.
+    """
+
+    n: int
+    n_effective: float
+    n_no_csi: int
+    histogram: FloatArray
+    histogram_ci95: list[Interval]
+    simulated: Mapping[float, RankFit]
+    rules: Mapping[str, RankFit]
+    curve: KCurve
+    staleness: Staleness
+
+    @property
+    def best_k(self) -> float:
+        """The K of best agreement by pose."""
+        return self.curve.best_k_agreement
+
+    def as_dict(self) -> dict[str, Any]:
+        """The entry ``rank.<tower>`` of metrics.json; what does not exist is None."""
+        names = {
+            "n": self.n,
+            "n_effective": self.n_effective,
+            "n_no_csi": self.n_no_csi,
+            "measured": {"histogram": _bars(self.histogram), "histogram_ci95": _bars(self.histogram_ci95)},
+            "best_k": self.best_k,
+            "best_k_ci95": self.curve.best_k_interval,
+            "best_k_total_variation": self.curve.best_k_total_variation,
+            "best_k_total_variation_ci95": self.curve.best_k_total_variation_interval,
+            "stale": {
+                "verdict": self.staleness.verdict,
+                "n_reports": self.staleness.n_reports,
+                "hold_s": self.staleness.hold_s,
+            },
+        }
+        result = dict(plain(names))
+        result["simulated"] = {f"{k:g}": fit.as_dict() for k, fit in self.simulated.items()}
+        result["rules"] = {name: fit.as_dict() for name, fit in self.rules.items()}
+        return result
+
+
+def compare_rank(
+    measured: ArrayLike,
+    h: ArrayLike,
+    ks: Sequence[float] = (10.0, 100.0, 1000.0),
+    *,
+    time_s: ArrayLike | None = None,
+    sinr_db: ArrayLike | None = None,
+    others: Mapping[str, ArrayLike] | None = None,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> RankComparison:
+    """Compare measured RI with the ranks of simulated channels.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        RI, 1-based, in time order; NaN where the modem gave none. 0 is refused: it means "no CSI" in every source.
+    h : array_like, complex, (n, n_rx, n_tx)
+        Simulated channels at the same poses; all zero where there is no path.
+    ks : sequence of float
+        Thresholds.
+    time_s : array_like, (n,), optional
+        Instants [s], for the hold time of stale RI; by default the row number.
+    sinr_db : array_like, (n,), optional
+        Reported SINR [dB], for the capacity rule.
+    others : mapping of str to array_like (n,), optional
+        Further numbers of the report, to recognise stale RI (``sinr_db`` takes part by itself).
+    replicates, seed : int
+        Bootstrap.
+    """
+    ri = _ranks(measured)
+    if np.any(ri == 0):
+        raise ValueError("measured rank 0 found: a reader must turn 'no CSI' into NaN")
+    matrix = np.asarray(h)
+    if matrix.ndim != 3 or len(matrix) != len(ri):
+        raise ValueError(f"H must have shape ({len(ri)}, n_rx, n_tx), found {matrix.shape}")
+    sigma = singular_values(matrix)
+    simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
+    rules = {"condition_number": rank_from_singular_values(sigma, 10.0 ** (17.0 / 20.0))}
+    report = dict(others or {})
+    if sinr_db is not None:
+        rules["capacity"] = capacity_rank(matrix, sinr_db)
+        report["sinr_db"] = sinr_db
+    known = memory(ri[np.isfinite(ri)])
+    time = np.arange(len(ri)) if time_s is None else time_s
+    return RankComparison(
+        int(np.isfinite(ri).sum()),
+        known.n_effective,
+        int((~np.isfinite(ri)).sum()),
+        histogram(ri),
+        _histogram_intervals(ri[np.isfinite(ri)], replicates, seed),
+        {k: compare_ranks(ri, rank, replicates=replicates, seed=seed) for k, rank in simulated.items()},
+        {name: compare_ranks(ri, rank, replicates=replicates, seed=seed) for name, rank in rules.items()},
+        k_curve(ri, sigma, replicates=replicates, seed=seed),
+        stale_reports(time, ri, report),
+    )
+
+
+def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
+    if len(rank) < 2:
+        return [NO_INTERVAL] * MAX_RANK
+    known = memory(rank)
+    columns = _indicators(rank)
+    drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
+    return [share_interval(float(columns[:, i].mean()), float(drawn[:, i].std()), known) for i in range(MAX_RANK)]
+
+
+def compare_ranks(
+    measured: ArrayLike, simulated: ArrayLike, *, replicates: int = REPLICATES, seed: int = SEED
+) -> RankFit:
+    """Compare two sequences of ranks by pose and by histogram; arguments as in :func:`agreement`.
+
+    The histogram distances compare all measured with all simulated ranks; their intervals come from poses at which
+    both exist.
+    """
+    one, two = _ranks(measured), _ranks(simulated)
+    bars_one, bars_two = histogram(one), histogram(two)
+    a, b = _pairs(one, two)
+    agree, tv, move = agreement(one, two), total_variation(bars_one, bars_two), wasserstein(bars_one, bars_two)
+    kappa = cohen_kappa(one, two)
+    bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, seed)
+    return RankFit(
+        bars_two,
+        _histogram_intervals(two[two >= 1], replicates, seed),
+        int((two == 0).sum()),
+        agree, bounds[0], kappa, bounds[1], tv, bounds[2], move, bounds[3],
+        confusion_matrix(one, two),
+        shift_test(one, two),
+        histogram_test(one, two, replicates=replicates, seed=seed),
+    )  # fmt: skip
+
+
+def _pair_intervals(
+    a: IntArray, b: IntArray, values: tuple[float, float, float, float], replicates: int, seed: int
+) -> list[Interval]:
+    """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
+    if len(a) < 2:
+        return [NO_INTERVAL] * 4
+    equal, one, two = (a == b).astype(np.float64), _indicators(a), _indicators(b)
+    known = _longest(memory(equal), memory(a - b), memory(a))
+    drawn = bootstrap_means(np.column_stack([equal, one, two]), known.block_length, replicates=replicates, seed=seed)
+    p, q = drawn[:, 1 : MAX_RANK + 1], drawn[:, MAX_RANK + 1 :]
+    chance = (p * q).sum(axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        kappa = np.where(chance < 1 - 1e-12, (drawn[:, 0] - chance) / (1 - chance), np.nan)
+    tv = 0.5 * np.abs(p - q).sum(axis=1)
+    move = np.abs(np.cumsum(p - q, axis=1))[:, :-1].sum(axis=1)
+    return [
+        share_interval(values[0], float(drawn[:, 0].std()), known),
+        interval(values[1], kappa, known, bounds=(-1.0, 1.0)),
+        interval(values[2], tv, known, bounds=(0.0, 1.0)),
+        interval(values[3], move, known, bounds=(0.0, MAX_RANK - 1.0)),
+    ]
+
+
+def _longest(*memories: Memory) -> Memory:
+    return max(memories, key=lambda item: item.block_length)

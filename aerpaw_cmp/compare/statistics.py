@@ -1,0 +1,462 @@
+"""Uncertainty of numbers that come from neighbouring samples of one flight.
+
+Samples a tenth of a second apart repeat each other, so every interval here rests on blocks: the flight is cut
+into blocks as long as the residual remembers (Politis and White), blocks are drawn with replacement, and the
+spread of the statistic over the draws, corrected for the finite number of blocks, gives the interval.
+
+All statistics of this module are functions of column means, which block sums give without touching samples again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..units import FloatArray, IntArray, wrap_degrees
+
+REPLICATES = 1000
+"""Bootstrap replicates."""
+
+SEED = 20_250_210
+"""One seed feeds all resampling: the same logs give the same intervals."""
+
+_LONGER = 2.0
+"""Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage
+(on 500 simulated flights it brings 89-93 % to 92-95 % where a flight holds only 25 independent samples)."""
+
+_HELD = 1 << 21
+"""Numbers held at once per bootstrap: bounds memory to tens of MiB."""
+
+Interval = tuple[float, float]
+NO_INTERVAL: Interval = (float("nan"), float("nan"))
+
+
+def plain(value: Any) -> Any:
+    """The same value as JSON can hold it: NaN and infinities become None, NumPy scalars and arrays become Python's."""
+    if isinstance(value, Mapping):
+        return {str(key): plain(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, (list, tuple)):
+        return [plain(item) for item in value]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        return float(value) if np.isfinite(value) else None
+    if isinstance(value, np.datetime64):
+        return None if np.isnat(value) else str(value)
+    return value
+
+
+@dataclass(frozen=True, slots=True)
+class Memory:
+    """How long a sequence remembers.
+
+    Parameters
+    ----------
+    n : int
+        Samples.
+    block_length : int
+        Block length for the circular block bootstrap [samples].
+    n_effective : float
+        Independent samples that would fix the mean equally well, 1 to ``n``; NaN below two samples.
+    variance_factor : float
+        What the variance of a block bootstrap of that length must be multiplied with (first-order bias).
+    """
+
+    n: int
+    block_length: int
+    n_effective: float
+    variance_factor: float
+
+    @property
+    def blocks(self) -> float:
+        """Blocks that fit into the sequence."""
+        return self.n / self.block_length if self.block_length else 0.0
+
+    @property
+    def half_width(self) -> float:
+        """Half width of a 95 % interval per bootstrap standard deviation (Student's t for few blocks)."""
+        from scipy.stats import t
+
+        blocks = max(self.blocks, 2.0)
+        return float(t.ppf(0.975, blocks - 1.0) * np.sqrt(self.variance_factor * blocks / (blocks - 1.0)))
+
+
+def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
+    """Biased autocovariance at lags 0 .. ``lags`` (by FFT); values (n,) without NaN."""
+    x = np.asarray(values, dtype=np.float64)
+    n = len(x)
+    size = 1 << (2 * n - 1).bit_length()
+    spectrum = np.fft.rfft(x - x.mean(), size)
+    return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
+
+
+def _cutoff(correlation: FloatArray, n: int) -> int:
+    """Last lag before the autocorrelation stays insignificant for a run of lags (Politis and White's rule)."""
+    run = max(5, int(np.ceil(np.sqrt(np.log10(n)))))
+    small = np.abs(correlation[1:]) < 2.0 * np.sqrt(np.log10(n) / n)
+    if len(small) < run:
+        return max(1, len(small))
+    runs = np.convolve(small, np.ones(run), mode="valid") == run
+    return int(np.argmax(runs)) if runs.any() else len(small)
+
+
+def memory(values: ArrayLike) -> Memory:
+    """Block length and effective sample size of a sequence.
+
+    Parameters
+    ----------
+    values : array_like, (n,)
+        In time order, without NaN.
+
+    Returns
+    -------
+    Memory
+        A constant sequence and fewer than two samples give blocks of one.
+
+    Notes
+    -----
+    Flat-top lag window of Politis and White (2004), doi:10.1081/ETC-120028836, with the constants of Patton,
+    Politis and White (2009), doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are searched up
+    to n / 4 (not sqrt n), because radio samples come many per correlation length; blocks are at most n / 5. The
+    block variance is short by G / (g L) to first order (Kuensch 1989, doi:10.1214/aos/1176347265).
+
+    Examples
+    --------
+    >>> memory([1.0, 1.0, 1.0]).block_length
+    1
+    """
+    x = np.asarray(values, dtype=np.float64)
+    n = len(x)
+    if n < 8 or np.ptp(x) == 0.0:
+        return Memory(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
+    covariance = autocovariance(x, max(2, n // 4))
+    lags = 2 * max(1, _cutoff(covariance / covariance[0], n))
+    lag = np.arange(1, min(lags, len(covariance) - 1) + 1)
+    window = np.clip(2.0 * (1.0 - lag / lags), 0.0, 1.0)
+    weighted = window * covariance[lag]
+    long_run = covariance[0] + 2.0 * weighted.sum()
+    if long_run <= 0.0:  # oscillating residual: the mean is known at least as well as from independent samples
+        long_run = covariance[0]
+    slope = max(0.0, 2.0 * float((lag * weighted).sum()) / long_run)
+    length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
+    block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
+    factor = 1.0 / (1.0 - min(0.5, slope / block))
+    return Memory(n, block, float(np.clip(n * covariance[0] / long_run, 1.0, n)), factor)
+
+
+def bootstrap_means(
+    columns: FloatArray,
+    block_length: int,
+    *,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> FloatArray:
+    """Column means of circular block resamples.
+
+    Parameters
+    ----------
+    columns : (n, m)
+        Samples in time order. Centre them first where squares of large levels would lose digits.
+    block_length : int
+        Samples per block, 1 .. n.
+    replicates : int
+        Resamples.
+    seed : int
+        Of the generator.
+
+    Returns
+    -------
+    ndarray, (replicates, m)
+
+    Notes
+    -----
+    The sum over a block is known from its start alone, so a resample is a set of starts: few long blocks are
+    gathered, many short ones counted and multiplied (one matrix product for all replicates).
+    """
+    n, width = columns.shape
+    rng = np.random.default_rng(seed)
+    blocks = -(-n // block_length)
+    sums = _block_sums(columns, block_length)
+    last = _block_sums(columns, n - (blocks - 1) * block_length)
+    result = np.empty((replicates, width))
+    few = 2 * (blocks - 1) * width < n * (3.0 + 0.2 * width)
+    chunk = max(1, _HELD // max(1, (blocks - 1) * width if few else n))
+    for start in range(0, replicates, chunk):
+        count = min(chunk, replicates - start)
+        begin = rng.integers(0, n, (count, blocks))
+        whole = begin[:, :-1]
+        if few:
+            total = sums[whole].sum(axis=1)
+        else:
+            cell = np.arange(count)[:, None] * n + whole
+            total = np.bincount(cell.ravel(), minlength=count * n).reshape(count, n).astype(np.float64) @ sums
+        result[start : start + count] = (total + last[begin[:, -1]]) / n
+    return result
+
+
+def _block_sums(columns: FloatArray, length: int) -> FloatArray:
+    """Sum of ``length`` rows from every start (n, m), on a circle."""
+    running = np.zeros((len(columns) + length, columns.shape[1]))
+    np.cumsum(np.concatenate([columns, columns[: length - 1]]), axis=0, out=running[1:])
+    return np.asarray(running[length:] - running[:-length])
+
+
+def _spread(replicates: FloatArray) -> float:
+    good = replicates[np.isfinite(replicates)]
+    return float(good.std(ddof=1)) if len(good) > 1 else float("nan")
+
+
+def interval(
+    estimate: float,
+    replicates: FloatArray,
+    known: Memory,
+    *,
+    bounds: tuple[float, float] = (-np.inf, np.inf),
+    forward: Callable[[FloatArray], FloatArray] | None = None,
+    backward: Callable[[FloatArray], FloatArray] | None = None,
+) -> Interval:
+    """95 % interval around an estimate from its bootstrap replicates.
+
+    Parameters
+    ----------
+    estimate : float
+        The statistic on the data.
+    replicates : (r,)
+        The statistic on the resamples; NaN replicates are left out.
+    known : Memory
+        Of the sequence that was resampled.
+    bounds : (low, high)
+        The statistic's range.
+    forward, backward : callable, optional
+        Scale on which the statistic is nearly normal (log, Fisher z), and back.
+
+    Returns
+    -------
+    (low, high)
+        NaN below two samples. Where resampling biases the statistic (distances, RMSE), the same bias sits in the
+        estimate and is taken off.
+    """
+    if known.n < 2 or not np.isfinite(estimate):
+        return NO_INTERVAL
+    with np.errstate(divide="ignore", invalid="ignore"):
+        value = float(np.asarray(forward(np.asarray(estimate))) if forward else estimate)
+        drawn = np.asarray(forward(replicates) if forward else replicates, dtype=np.float64)
+    if not np.isfinite(value):  # at the end of its scale (RMSE 0, correlation 1): the spread itself must do
+        low, high = np.nanquantile(np.append(replicates, estimate), [0.025, 0.975])
+        return float(low), float(high)
+    good = drawn[np.isfinite(drawn)]
+    if len(good) < 2:
+        return NO_INTERVAL
+    centre = value - (float(good.mean()) - value)
+    reach = known.half_width * _spread(good)
+    ends = np.array([centre - reach, centre + reach])
+    if backward:
+        ends = np.asarray(backward(ends))
+    low, high = np.clip(ends, *bounds)
+    return float(min(low, estimate)), float(max(high, estimate))
+
+
+@dataclass(frozen=True, slots=True)
+class ErrorIntervals:
+    """95 % intervals of one measured and simulated sequence of levels.
+
+    Parameters
+    ----------
+    offset_db, rmse_db, correlation : (low, high)
+        NaN where fewer than two samples, or where the statistic does not exist.
+    memory : Memory
+        Of the residual.
+    """
+
+    offset_db: Interval
+    rmse_db: Interval
+    correlation: Interval
+    memory: Memory
+
+
+def error_intervals(
+    measured_db: FloatArray, simulated_db: FloatArray, *, replicates: int = REPLICATES, seed: int = SEED
+) -> ErrorIntervals:
+    """Intervals of offset (mean difference), RMSE about it and correlation, by block bootstrap.
+
+    Parameters
+    ----------
+    measured_db, simulated_db : (n,)
+        Pairs in time order, without NaN [dB].
+    """
+    if not len(measured_db):
+        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, memory(measured_db))
+    difference = simulated_db - measured_db
+    known = memory(difference)
+    d = difference - difference.mean()
+    s = simulated_db - simulated_db.mean()
+    drawn = bootstrap_means(np.column_stack([d, d * d, d * s]), known.block_length, replicates=replicates, seed=seed)
+    offset = drawn[:, 0] + difference.mean()
+    variance = np.maximum(drawn[:, 1] - drawn[:, 0] ** 2, 0.0)
+    rmse = np.sqrt(variance)
+    return ErrorIntervals(
+        interval(float(difference.mean()), offset, known),
+        interval(float(np.sqrt(np.mean(d * d))), rmse, known, forward=np.log, backward=np.exp),
+        interval(
+            correlation(measured_db, simulated_db),
+            _correlation_of_residual(float(s @ s) / len(s), drawn[:, 2], variance),
+            known,
+            bounds=(-1.0, 1.0),
+            forward=np.arctanh,
+            backward=np.tanh,
+        ),
+        known,
+    )
+
+
+def _correlation_of_residual(spread: float, with_residual: FloatArray, residual: FloatArray) -> FloatArray:
+    """Correlation of measured and simulated from the simulated variance and the residual's two moments.
+
+    The route was flown as it was: only the residual is random, so the simulated variance stays fixed.
+    """
+    covariance = spread - with_residual
+    variance = spread - 2.0 * with_residual + residual
+    with np.errstate(divide="ignore", invalid="ignore"):
+        r = covariance / np.sqrt(spread * variance)
+    return np.asarray(np.where((spread > 0) & (variance > 0), np.clip(r, -1.0, 1.0), np.nan))
+
+
+def correlation(one: ArrayLike, two: ArrayLike) -> float:
+    """Pearson correlation over pairs without NaN; NaN where a side is constant or fewer than two pairs exist."""
+    a, b = np.asarray(one, dtype=np.float64), np.asarray(two, dtype=np.float64)
+    ok = np.isfinite(a) & np.isfinite(b)
+    if ok.sum() < 2 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
+        return float("nan")
+    a, b = a[ok] - a[ok].mean(), b[ok] - b[ok].mean()
+    return float(np.clip((a @ b) / np.sqrt((a @ a) * (b @ b)), -1.0, 1.0))
+
+
+def share_interval(share: float, spread: float, known: Memory) -> Interval:
+    """95 % interval of a share (a histogram bar): Wilson's, with as many samples as the spread is worth.
+
+    Parameters
+    ----------
+    share : float
+        0 to 1.
+    spread : float
+        Bootstrap standard deviation of the share.
+    known : Memory
+        Of the sequence.
+
+    Notes
+    -----
+    Wilson's interval stays sensible at shares of 0 and 1, where a bootstrap has no spread at all; there the
+    effective size of the whole sequence counts. Wilson (1927), doi:10.1080/01621459.1927.10502953.
+    """
+    if known.n < 2 or not np.isfinite(share):
+        return NO_INTERVAL
+    variance = spread**2 * known.half_width**2 / 1.959964**2
+    size = known.n_effective if variance <= 0 else share * (1 - share) / variance
+    size = float(np.clip(size, 1.0, known.n))
+    z2 = 1.959964**2
+    centre = (share + z2 / (2 * size)) / (1 + z2 / size)
+    reach = np.sqrt(z2 * (share * (1 - share) / size + z2 / (4 * size**2))) / (1 + z2 / size)
+    return max(0.0, float(centre - reach)), min(1.0, float(centre + reach))
+
+
+@dataclass(frozen=True, slots=True)
+class Repeatability:
+    """What two passes of the same places differ by: no model can be expected to do better.
+
+    Parameters
+    ----------
+    rmse_db : float
+        Root mean square difference after the best constant [dB]; NaN without a pair.
+    offset_db : float
+        That constant (second pass minus first) [dB].
+    n : int
+        Pairs.
+    interval_db : (low, high)
+        95 % interval of ``rmse_db``.
+    """
+
+    rmse_db: float
+    offset_db: float
+    n: int
+    interval_db: Interval
+
+
+def same_places(
+    position_m: FloatArray,
+    other_position_m: FloatArray,
+    *,
+    radius_m: float = 2.0,
+    heading_deg: FloatArray | None = None,
+    other_heading_deg: FloatArray | None = None,
+    heading_within_deg: float = 20.0,
+) -> tuple[IntArray, IntArray]:
+    """Samples of two passes at the same places: flights of one route laid over each other.
+
+    Parameters
+    ----------
+    position_m, other_position_m : (n, 3), (m, 3)
+        Places [m]; rows with NaN pair with nothing.
+    radius_m : float
+        A sample pairs with the nearest one of the other pass within this distance [m].
+    heading_deg, other_heading_deg : (n,), (m,), optional
+        Where given, the headings of a pair agree within ``heading_within_deg``.
+
+    Returns
+    -------
+    (here, there) : each (pairs,) int
+        Indices into both passes.
+    """
+    from scipy.spatial import cKDTree
+
+    here = np.flatnonzero(np.isfinite(position_m).all(axis=1))
+    there = np.flatnonzero(np.isfinite(other_position_m).all(axis=1))
+    if not len(here) or not len(there):
+        return here[:0], there[:0]
+    distance, nearest = cKDTree(other_position_m[there]).query(position_m[here], distance_upper_bound=radius_m)
+    paired = np.isfinite(distance)
+    here, there = here[paired], there[nearest[paired]]
+    if heading_deg is not None and other_heading_deg is not None:
+        turn = wrap_degrees(other_heading_deg[there] - heading_deg[here])
+        same = np.abs(turn) <= heading_within_deg
+        here, there = here[same], there[same]
+    return here, there
+
+
+def repeatability(
+    position_m: FloatArray,
+    level_db: FloatArray,
+    other_position_m: FloatArray,
+    other_level_db: FloatArray,
+    *,
+    radius_m: float = 2.0,
+    heading_deg: FloatArray | None = None,
+    other_heading_deg: FloatArray | None = None,
+    heading_within_deg: float = 20.0,
+) -> Repeatability:
+    """Repeatability floor of two passes (two flights, or two parts of one); arguments as in :func:`same_places`.
+
+    ``level_db`` (n,) and ``other_level_db`` (m,) are the levels [dB]; NaN is left out.
+    """
+    heard, other_heard = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
+    here, there = same_places(
+        position_m[heard],
+        other_position_m[other_heard],
+        radius_m=radius_m,
+        heading_deg=None if heading_deg is None else heading_deg[heard],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+        heading_within_deg=heading_within_deg,
+    )
+    here, there = heard[here], other_heard[there]
+    if not len(here):
+        return Repeatability(float("nan"), float("nan"), 0, NO_INTERVAL)
+    difference = other_level_db[there] - level_db[here]
+    bounds = error_intervals(level_db[here], other_level_db[there])
+    return Repeatability(float(difference.std()), float(difference.mean()), len(here), bounds.rmse_db)

@@ -1,0 +1,256 @@
+"""From a checked flight file to the data of one flight: site, logs, track, RSS and rank series."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from .config import FlightFile, LinkSettings, LogSettings, SiteChoice
+from .errors import InputError, UsageError
+from .ingest import IngestedFile, ingest, read_bytes
+from .readers import HEAD_BYTES, Reader, by_name, catalogue
+from .records import Stream
+from .site.site import Site
+from .site.siteyaml import load_site
+from .track import Track, clock_trap
+from .units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+
+Times = NDArray[np.datetime64]
+
+
+@dataclass(frozen=True, slots=True)
+class RssSeries:
+    """Measured RSS of one tower and channel: ``time`` (n,) UTC, ``measured_db`` (n,), NaN = out of coverage."""
+
+    tower: str
+    channel: str
+    unit: str
+    time: Times
+    measured_db: FloatArray
+    link: LinkSettings
+    settings_key: str
+    """Equal for series whose link settings are equal: they share a replay."""
+
+
+@dataclass(frozen=True, slots=True)
+class RankSeries:
+    """Reported rank at a tower: ``rank`` (n,) with NaN for no CSI, ``position_m`` (n, 3) or None (then the track)."""
+
+    tower: str
+    time: Times
+    rank: FloatArray
+    sinr_db: FloatArray
+    position_m: FloatArray | None
+
+
+@dataclass(frozen=True, slots=True)
+class FlightData:
+    """Everything the comparison needs, nothing replayed yet."""
+
+    settings: FlightFile
+    folder: Path
+    """Where logs and antenna files resolve: ``--logs-root``, else the folder of the flight file."""
+    site: Site
+    files: tuple[IngestedFile, ...]
+    track: Track | None
+    rss: tuple[RssSeries, ...]
+    rank: tuple[RankSeries, ...]
+    warnings: tuple[str, ...]
+
+
+def choose_site(choice: SiteChoice, folder: Path) -> Site:
+    """The site of a flight, with the flight's own changes."""
+    name = choice.file
+    path = folder / name
+    site = load_site(path if path.is_file() else name, coordinates=choice.coordinates)
+    if choice.antenna_height_m is not None:
+        towers = {
+            key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
+            for key, tower in site.towers.items()
+        }
+        site = dataclasses.replace(site, towers=towers)
+    if choice.without_buildings:
+        note = "this flight is replayed without the buildings of the site (site.without_buildings)"
+        site = dataclasses.replace(site, buildings=(), notes=(*site.notes, note))
+    return site
+
+
+def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
+    """Every log of the flight file, in its order.
+
+    Raises
+    ------
+    InputError
+        A missing file, a log of another kind than the flight file says, a log without any record.
+    """
+    files = []
+    for log in settings.logs:
+        path = (logs_root or folder) / log.path
+        if not path.exists():
+            root = logs_root or folder
+            raise InputError(
+                "there is no such log",
+                expected=f"the file below {root}",
+                cause="a wrong path, or --logs-root",
+                path=path,
+            )
+        reader = None if log.reader is None else by_name(log.reader)
+        if reader is not None:
+            _refuse_other_kind(path, reader)
+        (file,) = ingest([path], options=log.options(settings.timezone), reader=log.reader)
+        if not file.result.streams:
+            raise InputError(
+                "no record could be read",
+                expected=f"records of reader {file.result.reader!r}",
+                cause=file.result.rejected[0].reason if file.result.rejected else "an aborted run",
+                path=path,
+            )
+        files.append(file)
+    return tuple(files)
+
+
+def _refuse_other_kind(path: Path, reader: Reader) -> None:
+    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    head = read_bytes(path)[0][:HEAD_BYTES]
+    others = [r.name for r in catalogue() if r.sniff(head)]
+    if not others or reader.name in others:
+        return
+    raise InputError(
+        f"the content is that of {' or '.join(others)}",
+        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
+        cause="the wrong file, or the wrong 'reader:'",
+        path=path,
+    )
+
+
+def gather(
+    settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
+) -> FlightData:
+    """Sort the streams into track, RSS and rank, and check that they belong together."""
+    site = choose_site(settings.site, folder)
+    warnings: list[str] = []
+    telemetry: list[tuple[str, Stream]] = []
+    rss: list[RssSeries] = []
+    rank: list[RankSeries] = []
+    for log, file in zip(settings.logs, files, strict=True):
+        warnings += [f"{Path(file.path).name}: {text}" for text in file.result.warnings]
+        for stream in file.result.streams:
+            if stream.name in log.skip:
+                continue
+            if stream.kind == "telemetry":
+                telemetry.append((log.path, stream))
+            elif stream.kind == "rss":
+                rss.append(_rss_series(settings, log, stream, site))
+            else:
+                rank.append(_rank_series(settings, log, stream, site))
+    if len(telemetry) > 1:
+        warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
+    track = (
+        Track(
+            telemetry[0][1].frame,
+            site.frame,
+            maximum_gap_s=settings.rt.maximum_gap_s,
+            ground_m=site.datum.takeoff_ground_m,
+        )
+        if telemetry
+        else None
+    )
+    data = FlightData(
+        settings, logs_root or folder, site, tuple(files), track, tuple(rss), tuple(rank), tuple(warnings)
+    )
+    _check_overlap(data)
+    return data
+
+
+def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
+    if name is None:
+        raise UsageError(
+            f"log {log.path!r} does not say which tower it belongs to",
+            expected="'node: LW1', say, beside its path in flight.yaml",
+        )
+    if name not in site.towers:
+        raise UsageError(
+            f"log {log.path!r} names tower {name!r}, which site {site.name!r} does not have",
+            expected="one of " + ", ".join(site.towers),
+        )
+    return name
+
+
+def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RssSeries:
+    tower = _known_tower(log.node or _text(stream, "node"), log, site)
+    channel = log.channel or _text(stream, "channel") or stream.name
+    link = settings.link.channels.get(channel, settings.link.rss)
+    return RssSeries(
+        tower=tower,
+        channel=channel,
+        unit=str(stream.attributes.get("unit", "dB re full scale")),
+        time=stream.frame["time"].to_numpy("datetime64[ns]"),
+        measured_db=stream.frame["rss_db"].to_numpy(np.float64),
+        link=link,
+        settings_key=link.model_dump_json(),
+    )
+
+
+def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RankSeries:
+    tower = _known_tower(log.node or settings.rank.tower, log, site)
+    frame = stream.frame
+    position = None
+    if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
+        east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
+        up = np.fmax(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)
+        position = np.stack([east, north, up], axis=-1)
+    sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
+    return RankSeries(
+        tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position
+    )
+
+
+def _text(stream: Stream, key: str) -> str | None:
+    value = stream.attributes.get(key)
+    return None if value is None else str(value)
+
+
+def _check_overlap(data: FlightData) -> None:
+    needs_track = [("RSS", s.tower, s.time) for s in data.rss] + [
+        ("rank", s.tower, s.time) for s in data.rank if s.position_m is None
+    ]
+    if needs_track and data.track is None:
+        raise UsageError(
+            f"{needs_track[0][0]} of {needs_track[0][1]} has no positions of its own and there is no telemetry log",
+            expected="a telemetry log (vehicle_out, say) under 'logs'",
+        )
+    for kind, tower, time in needs_track:
+        assert data.track is not None
+        start, end = np.datetime64(data.track.start_ns, "ns"), np.datetime64(data.track.end_ns, "ns")
+        if len(time) == 0 or time.min() > end or time.max() < start:
+            shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
+            flown = f"{pd.Timestamp(start)} .. {pd.Timestamp(end)}"
+            raise InputError(
+                f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
+                expected="logs of the same flight",
+                cause=_clock_cause(data, time, start, end),
+            )
+
+
+def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+    trap = None
+    if len(time):
+        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+    if trap is None:
+        return "logs of different flights, or a wrong 'timezone' or 'clock'"
+    return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
+
+
+def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
+    """Positions (n, 3) [m] and which of them are known."""
+    if series.position_m is not None:
+        return series.position_m, np.asarray(np.isfinite(series.position_m).all(axis=1))
+    assert track is not None
+    pose = track.pose_at(series.time)
+    return pose.position_m, pose.valid

@@ -1,0 +1,264 @@
+"""How good is an interpolator? The paper's leave-one-out, and the tests that do not let neighbours give it away.
+
+Errors are in the unit of the field (rank, dB). Rank is not rounded: the paper's MAE (section VII-C) compares the
+interpolated number. A position without a value (NaN, out of coverage) is not scored; a position with a value but
+without an estimate is counted as ``unpredicted`` and not averaged in.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import UsageError
+from ..units import BoolArray, FloatArray, IntArray
+from .grid import Grid
+
+
+class Predictor(Protocol):
+    """What :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` and the baselines have in common."""
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Any:
+        """Store samples; returns itself."""
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance at targets."""
+        ...
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance at each sample from the others."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Errors of each field; every array has the shape of the fields, such as (altitudes, K).
+
+    Parameters
+    ----------
+    mae, rmse, bias : ndarray
+        Mean absolute, root mean square and mean (estimate - value) error; NaN where nothing was scored.
+    n : ndarray of int
+        Scored positions.
+    unpredicted : ndarray of int
+        Positions with a value but no estimate.
+    """
+
+    mae: FloatArray
+    rmse: FloatArray
+    bias: FloatArray
+    n: IntArray
+    unpredicted: IntArray
+
+
+def score(values: ArrayLike, estimate: ArrayLike) -> Score:
+    """Score estimates (n, ...) against values (n, ...)."""
+    truth, guess = np.asarray(values, dtype=np.float64), np.asarray(estimate, dtype=np.float64)
+    if truth.shape != guess.shape:
+        raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")
+    known = np.isfinite(truth)
+    scored = known & np.isfinite(guess)
+    error = np.where(scored, guess - np.where(known, truth, 0.0), 0.0)
+    n = scored.sum(axis=0)
+
+    def mean(x: FloatArray) -> FloatArray:
+        return np.asarray(np.where(n > 0, x.sum(axis=0) / np.maximum(n, 1), np.nan))
+
+    return Score(
+        mean(np.abs(error)),
+        np.sqrt(mean(error**2)),
+        mean(error),
+        np.asarray(n, dtype=np.int64),
+        np.asarray((known & ~scored).sum(axis=0), dtype=np.int64),
+    )
+
+
+def leave_one_out(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> Score:
+    """The paper's evaluation: each position from all others; values (n, altitudes, K) give MAE (altitudes, K)."""
+    return score(values, leave_one_out_estimate(model, points_m, values)[0])
+
+
+def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Leave-one-out estimate and variance in the shape of ``values`` (n, ...)."""
+    data = np.asarray(values, dtype=np.float64)
+    estimate, variance = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
+    return estimate.reshape(data.shape), variance.reshape(data.shape)
+
+
+def leave_one_out_table(models: Mapping[str, Predictor], points_m: ArrayLike, values: ArrayLike) -> dict[str, Score]:
+    """Leave-one-out of several interpolators on the same samples."""
+    return {name: leave_one_out(model, points_m, values) for name, model in models.items()}
+
+
+def held_out_estimate(
+    model: Predictor, points_m: ArrayLike, values: ArrayLike, test: BoolArray
+) -> tuple[FloatArray, FloatArray]:
+    """Train on the positions outside ``test`` (n,), predict those inside; NaN elsewhere; shape of ``values``."""
+    points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    flat = data.reshape(len(data), -1)
+    estimate, variance = np.full_like(flat, np.nan), np.full_like(flat, np.nan)
+    if test.any() and not test.all():
+        estimate[test], variance[test] = model.fit(points[~test], flat[~test]).predict(points[test])
+    return estimate.reshape(data.shape), variance.reshape(data.shape)
+
+
+def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: float = 300.0) -> Score:
+    """Leave out one square block of the area at a time.
+
+    Near neighbours of a left-out position are left out with it, so that the score says how the interpolator
+    bridges gaps of about ``block_m``. Blocks start at the south-western position.
+    """
+    if not block_m > 0:
+        raise UsageError(f"blocks of {block_m} m", expected="a positive length")
+    points = np.asarray(points_m, dtype=np.float64)
+    cell = np.floor((points[:, :2] - points[:, :2].min(axis=0)) / block_m + 1e-9).astype(np.int64)
+    _, block = np.unique(cell, axis=0, return_inverse=True)
+    return grouped(model, points, values, block.ravel())
+
+
+def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: IntArray) -> Score:
+    """Leave out one group of positions (n,) at a time: blocks, flights, days."""
+    data = np.asarray(values, dtype=np.float64)
+    estimate = np.full_like(data, np.nan)
+    for number in np.unique(group):
+        test = group == number
+        estimate[test] = held_out_estimate(model, points_m, data, test)[0][test]
+    return score(data, estimate)
+
+
+def altitude_held_out(model: Predictor, points_m: ArrayLike, altitudes_m: ArrayLike, values: ArrayLike) -> Score:
+    """Leave out one whole altitude at a time and predict it from the others, in 3-D.
+
+    Parameters
+    ----------
+    model : Predictor
+        Such as ``OrdinaryKriging(..., vertical_scale=5.0)``; its radius and scale decide which altitudes count.
+    points_m : (n, 2)
+        East, north [m].
+    altitudes_m : (altitudes,)
+        Heights [m].
+    values : (n, altitudes, K)
+        Rank or RSS.
+
+    Returns
+    -------
+    Score
+        Arrays of shape (altitudes, K).
+    """
+    points, heights = np.asarray(points_m, dtype=np.float64), np.asarray(altitudes_m, dtype=np.float64)
+    data = np.asarray(values, dtype=np.float64)
+    if data.ndim != 3 or data.shape[:2] != (len(points), len(heights)):
+        raise UsageError(f"values of shape {data.shape}", expected=f"({len(points)}, {len(heights)}, K)")
+    space = np.column_stack([np.tile(points[:, :2], (len(heights), 1)), np.repeat(heights, len(points))])
+    stacked = data.transpose(1, 0, 2).reshape(len(space), -1)
+    level = np.repeat(np.arange(len(heights)), len(points))
+    estimate = np.full_like(stacked, np.nan)
+    for held in range(len(heights)):
+        test = level == held
+        estimate[test] = held_out_estimate(model, space, stacked, test)[0][test]
+    shape = (len(heights), len(points), -1)
+    return score(data, estimate.reshape(shape).transpose(1, 0, 2))
+
+
+def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory_m: ArrayLike) -> Score:
+    """Train on the cells that a flight crosses, predict all others.
+
+    Parameters
+    ----------
+    model : Predictor
+        Its radius should reach beyond the flight, or cells far from it stay unpredicted (and are counted).
+    grid : Grid
+        The map.
+    values : (n, ...)
+        The map's values.
+    trajectory_m : (samples, 2+)
+        East, north [m] of the flight; samples outside the map do not count.
+
+    Raises
+    ------
+    UsageError
+        If the flight never crosses the map.
+    """
+    visited = np.unique(grid.index_of(trajectory_m))
+    visited = visited[visited >= 0]
+    if not len(visited):
+        raise UsageError("the flight does not cross the map", expected="a trajectory in the site frame [m]")
+    test = np.ones(len(grid), dtype=bool)
+    test[visited] = False
+    data = np.asarray(values, dtype=np.float64)
+    return score(data[test], held_out_estimate(model, grid.points_m, data, test)[0][test])
+
+
+@dataclass(frozen=True, slots=True)
+class IntervalCoverage:
+    """Whether the Kriging variance tells the truth.
+
+    Parameters
+    ----------
+    level : (levels,)
+        Nominal probability of the interval.
+    observed : (levels,)
+        Share of values inside; equal to ``level`` for an honest variance and normal errors.
+    standardised_variance : float
+        Mean of error^2 / variance: 1 for an honest variance, above 1 when it is too small.
+    n : int
+        Values with an estimate and a variance above 0.
+    """
+
+    level: FloatArray
+    observed: FloatArray
+    standardised_variance: float
+    n: int
+
+
+def interval_coverage(
+    values: ArrayLike,
+    estimate: ArrayLike,
+    variance: ArrayLike,
+    levels: Sequence[float] = (0.5, 0.8, 0.9, 0.95),
+) -> IntervalCoverage:
+    """Share of values within the central normal intervals of estimate and variance, all of the same shape."""
+    from scipy.stats import norm
+
+    truth, guess, spread = (np.asarray(a, dtype=np.float64) for a in (values, estimate, variance))
+    good = np.isfinite(truth) & np.isfinite(guess) & (spread > 0)
+    level = np.asarray(levels, dtype=np.float64)
+    if not good.any():
+        return IntervalCoverage(level, np.full(len(level), np.nan), float("nan"), 0)
+    z = np.abs(guess[good] - truth[good]) / np.sqrt(spread[good])
+    inside = (z[:, None] <= norm.ppf((1 + level) / 2)).mean(axis=0)
+    return IntervalCoverage(level, np.asarray(inside), float((z**2).mean()), int(good.sum()))
+
+
+def learning_curve(
+    model: Predictor,
+    points_m: ArrayLike,
+    values: ArrayLike,
+    sizes: Sequence[int],
+    *,
+    repeats: int = 3,
+    seed: int = 0,
+) -> FloatArray:
+    """MAE (sizes, ...) on the positions not sampled, against the number of random samples, mean over repeats.
+
+    The samples of a smaller size are part of those of a larger one, so that the curve is not blurred by luck.
+    """
+    points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
+    wrong = [size for size in sizes if not 0 < size < len(points)]
+    if wrong:
+        raise UsageError(f"sample sizes {wrong} for {len(points)} positions", expected="at least one left to predict")
+    generator = np.random.default_rng(seed)
+    error = np.empty((repeats, len(sizes), *data.shape[1:]))
+    for repeat in range(repeats):
+        order = generator.permutation(len(points))
+        for row, size in enumerate(sizes):
+            test = np.ones(len(points), dtype=bool)
+            test[order[:size]] = False
+            error[repeat, row] = score(data[test], held_out_estimate(model, points, data, test)[0][test]).mae
+    known = np.isfinite(error)
+    total = np.where(known, error, 0.0).sum(axis=0)
+    return np.asarray(np.where(known.any(axis=0), total / np.maximum(known.sum(axis=0), 1), np.nan))

@@ -1,0 +1,256 @@
+"""The map grid in the paper's order, the tower that serves each position, and coverage as a class of its own.
+
+Positions are numbered from the south-west corner, east first, then one row north (arXiv 2502.10324,
+section VI-A), so that position ``i`` of ``columns`` lies in row ``i // columns`` and column ``i % columns``.
+Each position is the centre of its cell: 1080 m x 2130 m at 30 m gives 36 x 71 = 2556 positions.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import UsageError
+from ..units import AnyArray, FloatArray, IntArray
+
+PAPER_SPACING_M = 30.0
+"""Horizontal interval d_rx of the UAV positions."""
+
+OUT_OF_COVERAGE = "Z"
+"""How plots and tables name a position without any path."""
+
+
+@dataclass(frozen=True, slots=True)
+class Grid:
+    """Regular horizontal grid of UAV positions.
+
+    Parameters
+    ----------
+    east_m : (columns,)
+        Ascending, evenly spaced [m].
+    north_m : (rows,)
+        Ascending, evenly spaced [m].
+    spacing_m : float
+        Cell size, the paper's d_rx [m].
+
+    Examples
+    --------
+    >>> grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    >>> len(grid), grid.shape
+    (2556, (71, 36))
+    >>> grid.points_m[0].tolist(), grid.points_m[1].tolist(), grid.points_m[36].tolist()
+    ([-525.0, -1050.0], [-495.0, -1050.0], [-525.0, -1020.0])
+    """
+
+    east_m: FloatArray
+    north_m: FloatArray
+    spacing_m: float
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.spacing_m) and self.spacing_m > 0):
+            raise ValueError(f"grid spacing is {self.spacing_m} m; expected a positive length")
+        for name, axis in (("east_m", self.east_m), ("north_m", self.north_m)):
+            if axis.ndim != 1 or len(axis) == 0 or not np.allclose(np.diff(axis), self.spacing_m, rtol=1e-9):
+                raise ValueError(f"{name} is no ascending axis with a step of {self.spacing_m} m")
+
+    @classmethod
+    def over_area(cls, area_m: tuple[float, float, float, float], spacing_m: float = PAPER_SPACING_M) -> Grid:
+        """Cells of ``spacing_m`` centred in ``(east_min, east_max, north_min, north_max)``; a remainder is left out.
+
+        Raises
+        ------
+        UsageError
+            If not one cell fits into the area.
+        """
+        east_min, east_max, north_min, north_max = area_m
+        axes = []
+        for low, high in ((east_min, east_max), (north_min, north_max)):
+            # 1080 / 30 must not become 35.999 cells
+            cells = int(np.floor((high - low) / spacing_m + 1e-9)) if spacing_m > 0 else 0
+            if cells < 1:
+                raise UsageError(
+                    f"a map of {high - low:g} m with a spacing of {spacing_m:g} m has no cell",
+                    expected="a positive spacing smaller than the area",
+                )
+            axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))
+        return cls(np.asarray(axes[0], dtype=np.float64), np.asarray(axes[1], dtype=np.float64), float(spacing_m))
+
+    def __len__(self) -> int:
+        return len(self.east_m) * len(self.north_m)
+
+    @property
+    def shape(self) -> tuple[int, int]:
+        """(rows, columns): south to north, west to east."""
+        return len(self.north_m), len(self.east_m)
+
+    @property
+    def points_m(self) -> FloatArray:
+        """Positions (n, 2), east and north [m], in index order."""
+        north, east = np.meshgrid(self.north_m, self.east_m, indexing="ij")
+        return np.column_stack([east.ravel(), north.ravel()])
+
+    def positions_m(self, altitude_m: float) -> FloatArray:
+        """Positions (n, 3) at one height above ground [m]."""
+        return np.column_stack([self.points_m, np.full(len(self), float(altitude_m))])
+
+    def raster(self, values: ArrayLike) -> AnyArray:
+        """Values ``(n, ...)`` in index order as ``(rows, columns, ...)``; row 0 is the south."""
+        array = np.asarray(values)
+        return array.reshape(*self.shape, *array.shape[1:])
+
+    def index_of(self, points_m: ArrayLike) -> IntArray:
+        """Position index of the cell that holds each point (n, 2+); -1 outside the grid."""
+        points = np.asarray(points_m, dtype=np.float64)
+        rows, columns = self.shape
+        # a point on the border of two cells belongs to the eastern or northern one
+        column = np.floor((points[..., 0] - self.east_m[0]) / self.spacing_m + 0.5)
+        row = np.floor((points[..., 1] - self.north_m[0]) / self.spacing_m + 0.5)
+        inside = (column >= 0) & (column < columns) & (row >= 0) & (row < rows)
+        return np.where(inside, np.where(inside, row, 0) * columns + np.where(inside, column, 0), -1).astype(np.int64)
+
+
+def serving_tower(points_m: ArrayLike, towers_m: ArrayLike) -> IntArray:
+    """Index of the nearest tower (horizontal distance) of each point; a tie goes to the first in drawing order.
+
+    Parameters
+    ----------
+    points_m : (n, 2) or (n, 3)
+        East, north (, up) [m].
+    towers_m : (towers, 2) or (towers, 3)
+        The same for towers; heights do not count.
+
+    Returns
+    -------
+    ndarray of int, (n,)
+    """
+    points = np.asarray(points_m, dtype=np.float64)[:, :2]
+    towers = np.asarray(towers_m, dtype=np.float64)[:, :2]
+    if len(towers) == 0:
+        raise UsageError("the site has no tower", expected="at least one tower to serve the map")
+    squared = ((points[:, None, :] - towers[None, :, :]) ** 2).sum(axis=-1)
+    # tied to the micrometre squared scale, so that the rule and not rounding decides
+    return np.asarray(np.argmin(np.round(squared, 6), axis=1), dtype=np.int64)
+
+
+@dataclass(frozen=True, slots=True)
+class Border:
+    """The line between the areas that two towers serve: two end points (2, 2), east and north [m]."""
+
+    towers: tuple[int, int]
+    line_m: FloatArray
+
+
+def voronoi_borders(towers_m: ArrayLike, area_m: tuple[float, float, float, float]) -> tuple[Border, ...]:
+    """Borders of the serving areas, clipped to the map.
+
+    The border of towers a and b is the part of their perpendicular bisector that is inside the area and no
+    nearer to any third tower. Along the bisector each of these conditions is linear, so the part is one segment.
+
+    Parameters
+    ----------
+    towers_m : (towers, 2) or (towers, 3)
+        East, north [m]. Towers at the same place have no border.
+    area_m : (east_min, east_max, north_min, north_max)
+        Extent of the map [m].
+
+    Returns
+    -------
+    tuple of Border
+        Pairs that share no border are left out.
+    """
+    towers = np.asarray(towers_m, dtype=np.float64)[:, :2]
+    borders = []
+    for a in range(len(towers)):
+        for b in range(a + 1, len(towers)):
+            line = _bisector_segment(a, b, towers, area_m)
+            if line is not None:
+                borders.append(Border((a, b), line))
+    return tuple(borders)
+
+
+def _bisector_segment(
+    a: int, b: int, towers: FloatArray, area_m: tuple[float, float, float, float]
+) -> FloatArray | None:
+    """Part (2, 2) of the bisector of towers a and b that is their border, or None."""
+    between = towers[b] - towers[a]
+    length = float(np.hypot(*between))
+    if length < 1e-6:
+        return None
+    middle = (towers[a] + towers[b]) / 2
+    along = np.array([-between[1], between[0]]) / length
+    # conditions slope * t <= bound on the point middle + t * along
+    slopes = [-along[0], along[0], -along[1], along[1]]
+    bounds = [middle[0] - area_m[0], area_m[1] - middle[0], middle[1] - area_m[2], area_m[3] - middle[1]]
+    for c in range(len(towers)):
+        if c not in (a, b):
+            # |p - a|^2 <= |p - c|^2
+            slopes.append(float(2 * along @ (towers[c] - towers[a])))
+            bounds.append(float(towers[c] @ towers[c] - towers[a] @ towers[a] - 2 * middle @ (towers[c] - towers[a])))
+    low, high = -np.inf, np.inf
+    for slope, bound in zip(slopes, bounds, strict=True):
+        if abs(slope) < 1e-12:
+            if bound < 0:
+                return None
+        elif slope > 0:
+            high = min(high, bound / slope)
+        else:
+            low = max(low, bound / slope)
+    if high - low < 1e-9:
+        return None
+    return np.stack([middle + low * along, middle + high * along])
+
+
+def without_coverage_as_nan(rank: ArrayLike) -> FloatArray:
+    """Ranks as floats with 0 (no path, "Z") as NaN, so that no average takes it for a number."""
+    array = np.asarray(rank, dtype=np.float64)
+    return np.where(array > 0, array, np.nan)
+
+
+def coverage_share(covered: ArrayLike) -> float:
+    """Share of positions with coverage (bool array), the paper's probability of coverage; NaN for no position."""
+    array = np.asarray(covered, dtype=bool)
+    return float(array.mean()) if array.size else float("nan")
+
+
+def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
+    """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1."""
+    counts = np.bincount(np.asarray(rank, dtype=np.int64).ravel(), minlength=highest + 1)
+    if len(counts) > highest + 1:
+        raise ValueError(f"rank {len(counts) - 1} exceeds the highest class {highest}")
+    return np.asarray(counts / max(counts.sum(), 1))
+
+
+def class_names(highest: int = 4) -> tuple[str, ...]:
+    """Names of the rank classes: ``Z``, ``1``, ..."""
+    return (OUT_OF_COVERAGE, *(str(rank) for rank in range(1, highest + 1)))
+
+
+@dataclass(frozen=True, slots=True)
+class Layer:
+    """One map to draw or to export.
+
+    Parameters
+    ----------
+    name : str
+        Identifier such as ``"rank_k10_h030m_joint"``: letters, digits, underscores.
+    values : (n,)
+        In index order; NaN (classes: 0) is out of coverage.
+    unit : str
+        Such as ``"dBm"``; ``"1"`` for classes and ratios.
+    title : str
+        For legends.
+    classes : tuple of str
+        Names of the values 0, 1, ... when the layer holds classes.
+    """
+
+    name: str
+    values: AnyArray
+    unit: str
+    title: str
+    classes: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.name.replace("_", "").isalnum():
+            raise ValueError(f"layer name {self.name!r} holds more than letters, digits and underscores")

@@ -1,0 +1,351 @@
+"""Baselines that Kriging is measured against.
+
+The paper's two (arXiv 2502.10324, section VI-C): the samples near a target are sorted by position index, and a
+one-dimensional interpolant over the index is read at the target's index. They follow MATLAB's ``interp1`` with
+``'extrap'``:
+
+- ``spline``: cubic with not-a-knot ends; three samples give the parabola, two the line.
+- ``makima``: modified Akima piecewise cubic Hermite; two samples give the line.
+
+Beyond the first and last sample the end piece is continued; one sample gives its value, none NaN.
+
+A reader will ask for three more: the nearest sample, inverse distance, and the mean over the area that a tower serves.
+All classes share ``fit(points_m, values)``, ``predict(targets_m)`` and ``leave_one_out()`` with
+:class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`; none knows its error, so the variance they return is NaN.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import UsageError
+from ..units import FloatArray, IntArray
+from . import neighbours as choose
+from .grid import Grid, serving_tower
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+CHUNK = 512
+
+
+# --- pure functions, batched ----------------------------------------------------------------------------------------
+
+
+def makima(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
+    """Modified Akima interpolation, one curve per row.
+
+    Parameters
+    ----------
+    index : (..., m)
+        Distinct abscissae in any order, m >= 1.
+    values : (..., m, fields)
+        Ordinates.
+    at : (...)
+        One abscissa per row; outside the data the end piece is continued.
+
+    Returns
+    -------
+    ndarray, (..., fields)
+
+    References
+    ----------
+    .. [1] Akima, J. ACM 17 (1970) 589, doi:10.1145/321607.321609; the modification is that of MATLAB's ``makima``.
+
+    Examples
+    --------
+    >>> makima([[3.0, 1.0, 2.0]], [[[9.0], [1.0], [4.0]]], [4.0]).shape
+    (1, 1)
+    """
+    x, y, at = _sorted(index, values, at)
+    m = x.shape[-1]
+    if m == 1:
+        return y[..., 0, :]
+    slope = np.diff(y, axis=-2) / np.diff(x, axis=-1)[..., None]
+    tangent = np.repeat(slope, 2, axis=-2) if m == 2 else _makima_tangents(slope)
+    return _hermite(x, y, tangent, at)
+
+
+def _makima_tangents(slope: FloatArray) -> FloatArray:
+    """Tangents (..., m, fields) from slopes (..., m - 1, fields), m >= 3."""
+    before = 2 * slope[..., :1, :] - slope[..., 1:2, :]
+    after = 2 * slope[..., -1:, :] - slope[..., -2:-1, :]
+    padded = np.concatenate(
+        [2 * before - slope[..., :1, :], before, slope, after, 2 * after - slope[..., -1:, :]], axis=-2
+    )
+    weight = np.abs(np.diff(padded, axis=-2)) + np.abs(padded[..., 1:, :] + padded[..., :-1, :]) / 2
+    left, right = weight[..., 2:, :], weight[..., :-2, :]
+    total = left + right
+    some = total > 0
+    # both weights vanish only where the data are flat on both sides: the tangent is 0 there
+    mixed = left * padded[..., 1:-2, :] + right * padded[..., 2:-1, :]
+    return np.where(some, mixed / np.where(some, total, 1.0), 0.0)
+
+
+def spline(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> FloatArray:
+    """Cubic spline with not-a-knot ends, one curve per row; shapes as in :func:`makima`."""
+    x, y, at = _sorted(index, values, at)
+    m = x.shape[-1]
+    if m == 1:
+        return y[..., 0, :]
+    step = np.diff(x, axis=-1)
+    slope = np.diff(y, axis=-2) / step[..., None]
+    if m == 2:
+        tangent = np.repeat(slope, 2, axis=-2)
+    elif m == 3:
+        tangent = _parabola_tangents(step, slope)
+    else:
+        tangent = _not_a_knot_tangents(step, slope)
+    return _hermite(x, y, tangent, at)
+
+
+def _parabola_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
+    first, second = step[..., :1, None], step[..., 1:, None]
+    bend = (slope[..., 1:, :] - slope[..., :1, :]) / (first + second)
+    start = slope[..., :1, :] - bend * first
+    return np.concatenate([start, start + 2 * bend * first, start + 2 * bend * (first + second)], axis=-2)
+
+
+def _not_a_knot_tangents(step: FloatArray, slope: FloatArray) -> FloatArray:
+    """Tangents of the C2 cubic whose first two and last two pieces are one polynomial each (de Boor, chapter IV)."""
+    rows, m = step.shape[:-1], step.shape[-1] + 1
+    system = np.zeros((*rows, m, m))
+    inner = np.arange(1, m - 1)
+    system[..., inner, inner - 1] = step[..., 1:]
+    system[..., inner, inner] = 2 * (step[..., :-1] + step[..., 1:])
+    system[..., inner, inner + 1] = step[..., :-1]
+    right = np.empty((*rows, m, slope.shape[-1]))
+    h = step[..., None]
+    right[..., 1:-1, :] = 3 * (h[..., 1:, :] * slope[..., :-1, :] + h[..., :-1, :] * slope[..., 1:, :])
+    for end, a, b in ((0, 0, 1), (m - 1, -1, -2)):
+        near, far = step[..., a], step[..., b]
+        both = near + far
+        system[..., end, end] = far
+        system[..., end, 1 if end == 0 else m - 2] = both
+        right[..., end, :] = (
+            (near + 2 * both)[..., None] * far[..., None] * slope[..., a, :] + near[..., None] ** 2 * slope[..., b, :]
+        ) / both[..., None]
+    return np.asarray(np.linalg.solve(system, right))
+
+
+def _hermite(x: FloatArray, y: FloatArray, tangent: FloatArray, at: FloatArray) -> FloatArray:
+    """Piecewise cubic Hermite at one abscissa per row; the end pieces continue outside."""
+    m = x.shape[-1]
+    piece = np.clip((x <= at[..., None]).sum(axis=-1) - 1, 0, m - 2)[..., None]
+    left, right = np.take_along_axis(x, piece, -1), np.take_along_axis(x, piece + 1, -1)
+    low, high = piece[..., None], piece[..., None] + 1
+    y0, y1 = np.take_along_axis(y, low, -2)[..., 0, :], np.take_along_axis(y, high, -2)[..., 0, :]
+    t0, t1 = np.take_along_axis(tangent, low, -2)[..., 0, :], np.take_along_axis(tangent, high, -2)[..., 0, :]
+    h = right - left
+    u = (at[..., None] - left) / h
+    rise = y1 - y0
+    return np.asarray(y0 + u * (h * t0 + u * (3 * rise - h * (2 * t0 + t1) + u * (h * (t0 + t1) - 2 * rise))))
+
+
+def _sorted(index: ArrayLike, values: ArrayLike, at: ArrayLike) -> tuple[FloatArray, FloatArray, FloatArray]:
+    x = np.asarray(index, dtype=np.float64)
+    y = np.asarray(values, dtype=np.float64)
+    if y.ndim != x.ndim + 1 or y.shape[:-1] != x.shape or x.shape[-1] < 1:
+        raise UsageError(
+            f"index of shape {x.shape}, values of shape {y.shape}", expected="(..., m) and (..., m, fields)"
+        )
+    order = np.argsort(x, axis=-1, kind="stable")
+    x = np.take_along_axis(x, order, -1)
+    if (np.diff(x, axis=-1) <= 0).any():
+        raise UsageError("two samples with the same position index", expected="distinct positions")
+    return x, np.take_along_axis(y, order[..., None], -2), np.asarray(at, dtype=np.float64)
+
+
+# --- predictors -----------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class _Near:
+    """What an interpolant gets of t targets: m samples each (t, m, dims), their values (t, m, fields), distances."""
+
+    points_m: FloatArray
+    values: FloatArray
+    distance_m: FloatArray
+    targets_m: FloatArray
+
+
+class _Local:
+    """Samples, neighbours and field-by-field handling of NaN, shared by the predictors that use near samples."""
+
+    def __init__(
+        self,
+        neighbours: int = 20,
+        radius_m: float = 150.0,
+        *,
+        selection: Literal["nearest", "random"] = "nearest",
+        seed: int = 0,
+    ) -> None:
+        self.neighbours = neighbours
+        self.radius_m = radius_m
+        self.selection = selection
+        self.seed = seed
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
+        """Store samples (n, dims) with values (n,) or (n, fields); NaN is out of coverage."""
+        self.points_m_ = np.asarray(points_m, dtype=np.float64)
+        fields = np.asarray(values, dtype=np.float64)
+        if len(fields) != len(self.points_m_):
+            raise UsageError(f"{len(fields)} values for {len(self.points_m_)} points")
+        self._one_field = fields.ndim == 1
+        self.values_ = fields.reshape(len(fields), -1)
+        return self
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Estimate at targets (t, dims), ``(t,)`` or ``(t, fields)``, and NaN for the variance."""
+        return self._estimate(np.asarray(targets_m, dtype=np.float64), leave_out=False)
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate at each sample from the others, and NaN for the variance."""
+        return self._estimate(self.points_m_, leave_out=True)
+
+    def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:
+        estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
+        patterns, group = np.unique(np.isfinite(self.values_), axis=1, return_inverse=True)
+        for number in range(patterns.shape[1]):
+            kept, columns = patterns[:, number], np.flatnonzero(group.ravel() == number)
+            samples, values = self.points_m_[kept], self.values_[np.ix_(kept, columns)]
+            skip = None
+            if leave_out:
+                skip = np.full(len(kept), -1, dtype=np.int64)
+                skip[kept] = np.arange(kept.sum())
+            estimate[:, columns] = self._one_pattern(samples, values, targets, skip)
+        estimate = estimate[:, 0] if self._one_field else estimate
+        return estimate, np.full_like(estimate, np.nan)
+
+    def _one_pattern(
+        self, samples: FloatArray, values: FloatArray, targets: FloatArray, skip: IntArray | None
+    ) -> FloatArray:
+        if self.selection == "random":
+            chosen = choose.random_within(samples, targets, self.neighbours, self.radius_m, self.seed, skip)
+        else:
+            chosen = choose.nearest(samples, targets, self.neighbours, self.radius_m, skip)
+        estimate = np.full((len(targets), values.shape[1]), np.nan)
+        count = chosen.count
+        for m in np.unique(count[count > 0]):
+            same = np.flatnonzero(count == m)
+            for start in range(0, len(same), CHUNK):
+                rows = same[start : start + CHUNK]
+                index = chosen.index[rows, :m]
+                estimate[rows] = self._combine(
+                    _Near(samples[index], values[index], chosen.distance_m[rows, :m], targets[rows])
+                )
+        return estimate
+
+    def _combine(self, near: _Near) -> FloatArray:
+        """Estimate (t, fields)."""
+        raise NotImplementedError
+
+
+class IndexInterpolation(_Local):
+    """The paper's baselines: spline or makima over the position index of the M samples within the radius.
+
+    Parameters
+    ----------
+    kind : {"spline", "makima"}
+        The interpolant.
+    grid : Grid
+        Gives each sample and target its index; all must lie on distinct cells.
+    neighbours, radius_m, selection, seed
+        As in :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging`.
+    """
+
+    def __init__(
+        self,
+        kind: Literal["spline", "makima"],
+        grid: Grid,
+        neighbours: int = 20,
+        radius_m: float = 150.0,
+        *,
+        selection: Literal["nearest", "random"] = "nearest",
+        seed: int = 0,
+    ) -> None:
+        super().__init__(neighbours, radius_m, selection=selection, seed=seed)
+        self.kind = kind
+        self.grid = grid
+
+    def _combine(self, near: _Near) -> FloatArray:
+        curve: Callable[..., FloatArray] = {"spline": spline, "makima": makima}[self.kind]
+        index, at = self.grid.index_of(near.points_m), self.grid.index_of(near.targets_m)
+        if (index < 0).any() or (at < 0).any():
+            raise UsageError("a point outside the grid has no position index", expected="points on the grid")
+        return curve(index, near.values, at)
+
+
+class Nearest(_Local):
+    """The value of the nearest sample; ties by the rule of :mod:`~aerpaw_cmp.maps.neighbours`."""
+
+    def __init__(self, radius_m: float = 150.0) -> None:
+        super().__init__(1, radius_m)
+
+    def _combine(self, near: _Near) -> FloatArray:
+        return near.values[:, 0]
+
+
+class InverseDistance(_Local):
+    """Mean weighted by ``distance ** -power`` (Shepard 1968, doi:10.1145/800186.810616); exact at samples."""
+
+    def __init__(self, neighbours: int = 20, radius_m: float = 150.0, power: float = 2.0) -> None:
+        super().__init__(neighbours, radius_m)
+        self.power = power
+
+    def _combine(self, near: _Near) -> FloatArray:
+        at = near.distance_m < choose.TIE_M
+        # relative to the nearest, so that no power overflows
+        ratio = near.distance_m[:, :1] / np.where(at, 1.0, near.distance_m)
+        weight = np.where(at.any(axis=1, keepdims=True), at.astype(np.float64), ratio**self.power)
+        weight /= weight.sum(axis=1, keepdims=True)
+        first = near.values[:, :1]
+        return np.asarray(first[:, 0] + (weight[:, :, None] * (near.values - first)).sum(axis=1))
+
+
+class ServingTowerMean:
+    """Mean of all samples in the area of the target's serving tower.
+
+    Parameters
+    ----------
+    towers_m : (towers, 2+)
+        East, north [m].
+    """
+
+    def __init__(self, towers_m: ArrayLike) -> None:
+        self.towers_m = towers_m
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Self:
+        """Sum the samples (n, dims) with values (n,) or (n, fields) by tower; NaN does not count."""
+        fields = np.asarray(values, dtype=np.float64)
+        self._one_field = fields.ndim == 1
+        self.values_ = fields.reshape(len(fields), -1)
+        self.tower_ = serving_tower(points_m, self.towers_m)
+        finite = np.isfinite(self.values_)
+        towers = len(np.asarray(self.towers_m))
+        self.total_ = np.zeros((towers, self.values_.shape[1]))
+        self.count_ = np.zeros_like(self.total_)
+        np.add.at(self.total_, self.tower_, np.where(finite, self.values_, 0.0))
+        np.add.at(self.count_, self.tower_, finite)
+        return self
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Mean of each target's tower, NaN for a tower without samples, and NaN for the variance."""
+        tower = serving_tower(targets_m, self.towers_m)
+        return self._mean(self.total_[tower], self.count_[tower])
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """The same without the sample itself."""
+        finite = np.isfinite(self.values_)
+        total = self.total_[self.tower_] - np.where(finite, self.values_, 0.0)
+        return self._mean(total, self.count_[self.tower_] - finite)
+
+    def _mean(self, total: FloatArray, count: FloatArray) -> tuple[FloatArray, FloatArray]:
+        mean = np.where(count > 0, total / np.maximum(count, 1.0), np.nan)
+        mean = mean[:, 0] if self._one_field else mean
+        return mean, np.full_like(mean, np.nan)

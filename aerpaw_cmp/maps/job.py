@@ -1,0 +1,532 @@
+"""The map job: RSS and rank of every tower at every position and altitude, alone and jointly.
+
+The replay engine is handed in as a function, so that nothing here knows an engine::
+
+    evaluate(position_m (n, 3), tower_names) -> Evaluation
+
+It is called for one altitude and at most ``chunk`` positions at a time; what grows with the number of altitudes is
+the result alone (RSS 8 bytes, rank 1 byte per tower, position and K).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from ..errors import UsageError
+from ..units import BoolArray, FloatArray, IntArray, db_from_power
+from .evaluate import (
+    IntervalCoverage,
+    Predictor,
+    Score,
+    along_trajectory,
+    altitude_held_out,
+    blocked,
+    interval_coverage,
+    learning_curve,
+    leave_one_out_estimate,
+    score,
+)
+from .grid import (
+    Border,
+    Grid,
+    Layer,
+    class_names,
+    class_shares,
+    serving_tower,
+    voronoi_borders,
+    without_coverage_as_nan,
+)
+from .interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
+from .kriging import OrdinaryKriging
+from .variogram import (
+    PAPER_BIEXPONENTIAL,
+    BiExponential,
+    BinnedCorrelation,
+    field_correlation,
+    fit_biexponential,
+    fit_vertical_scale,
+    vector_correlation,
+    vertical_correlation,
+)
+
+PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
+PAPER_RANK_ALTITUDES_M = (3.0, *(float(h) for h in range(30, 111, 10)))
+PAPER_KS = (10.0, 100.0, 1000.0)
+CHUNK = 512
+HIGHEST_RANK = 4
+
+Antennas = Literal["siso", "mimo"]
+
+
+@dataclass(frozen=True, slots=True)
+class Evaluation:
+    """What the engine says of n positions and t towers; NaN (singular values: NaN or 0) where there is no path.
+
+    Parameters
+    ----------
+    rss_siso_dbm, rss_mimo_dbm : (n, t)
+        Received power with one element at both ends, and with the arrays.
+    singular_values : (n, t, r)
+        Of the channel matrix, descending.
+    """
+
+    rss_siso_dbm: FloatArray
+    rss_mimo_dbm: FloatArray
+    singular_values: FloatArray
+
+
+Evaluate = Callable[[FloatArray, tuple[str, ...]], Evaluation]
+
+
+@dataclass(frozen=True, slots=True)
+class MapResult:
+    """Maps of one foliage mode. Axes: altitude, (K,) tower, position; positions in the grid's index order.
+
+    Parameters
+    ----------
+    grid : Grid
+        The positions.
+    tower_names : tuple of str
+        In drawing order.
+    towers_m : (towers, 3)
+        East, north, up [m].
+    rss_altitudes_m, rank_altitudes_m, ks : tuple of float
+        The axes.
+    rss_siso_dbm, rss_mimo_dbm : (RSS altitudes, towers, n)
+        NaN out of coverage.
+    rank : (rank altitudes, K, towers, n) int8
+        0 out of coverage.
+    spread_db, condition_db : (rank altitudes, towers, n)
+        20 log10 of sigma_1 / sigma_2 and sigma_1 / sigma_last; NaN out of coverage, infinite for a zero value.
+    serving : (n,) int
+        Nearest tower.
+    borders : tuple of Border
+        Between the serving areas.
+    """
+
+    grid: Grid
+    tower_names: tuple[str, ...]
+    towers_m: FloatArray
+    rss_altitudes_m: tuple[float, ...]
+    rank_altitudes_m: tuple[float, ...]
+    ks: tuple[float, ...]
+    rss_siso_dbm: FloatArray
+    rss_mimo_dbm: FloatArray
+    rank: NDArray[np.int8]
+    spread_db: FloatArray
+    condition_db: FloatArray
+    serving: IntArray
+    borders: tuple[Border, ...]
+
+    def rss(self, antennas: Antennas = "mimo", tower: str | None = None) -> FloatArray:
+        """RSS (altitudes, n) of one tower, or jointly: of the serving tower of each position."""
+        return self._of(self.rss_siso_dbm if antennas == "siso" else self.rss_mimo_dbm, tower)
+
+    def ranks(self, tower: str | None = None) -> NDArray[np.int8]:
+        """Rank (altitudes, K, n) of one tower, or jointly."""
+        return np.asarray(self._of(self.rank, tower), dtype=np.int8)
+
+    def rank_shares(self, tower: str | None = None) -> FloatArray:
+        """Shares (altitudes, K, 1 + highest rank) of the classes Z, 1, 2, ... (the paper's rank distributions)."""
+        rank = self.ranks(tower)
+        shares = [[class_shares(rank[a, k], HIGHEST_RANK) for k in range(rank.shape[1])] for a in range(rank.shape[0])]
+        return np.array(shares).reshape(*rank.shape[:2], HIGHEST_RANK + 1)
+
+    def coverage(
+        self, antennas: Antennas = "mimo", tower: str | None = None, threshold_dbm: float = -np.inf
+    ) -> FloatArray:
+        """Probability of coverage per RSS altitude: share of positions with a path and at least the threshold."""
+        rss = self.rss(antennas, tower)
+        return np.asarray((np.isfinite(rss) & (np.nan_to_num(rss, nan=-np.inf) >= threshold_dbm)).mean(axis=1))
+
+    def _of(self, values: NDArray[np.generic], tower: str | None) -> FloatArray:
+        if tower is not None:
+            if tower not in self.tower_names:
+                raise UsageError(f"unknown tower {tower!r}", expected=f"one of {', '.join(self.tower_names)}")
+            return np.asarray(values[..., self.tower_names.index(tower), :])
+        return np.asarray(values[..., self.serving, np.arange(len(self.grid))])
+
+
+def map_job(
+    grid: Grid,
+    towers: Mapping[str, ArrayLike],
+    evaluate: Evaluate,
+    *,
+    rss_altitudes_m: Sequence[float] = PAPER_RSS_ALTITUDES_M,
+    rank_altitudes_m: Sequence[float] = PAPER_RANK_ALTITUDES_M,
+    ks: Sequence[float] = PAPER_KS,
+    chunk: int = CHUNK,
+    progress: Callable[[float], None] | None = None,
+) -> MapResult:
+    """Evaluate the grid at all altitudes.
+
+    Parameters
+    ----------
+    grid : Grid
+        Positions.
+    towers : mapping of str to (3,)
+        Array centres [m], in drawing order.
+    evaluate : callable
+        The engine, see the module text.
+    rss_altitudes_m, rank_altitudes_m : sequence of float
+        Heights above ground [m]; one that is in both is evaluated once.
+    ks : sequence of float
+        Singular-value ratios.
+    chunk : int
+        Positions per call of ``evaluate``.
+    progress : callable, optional
+        Called with the share done after each chunk.
+
+    Returns
+    -------
+    MapResult
+    """
+    if not towers:
+        raise UsageError("the site has no tower", expected="at least one tower to map")
+    names = tuple(towers)
+    places = np.array([np.asarray(towers[name], dtype=np.float64) for name in names])
+    at = {"rss": tuple(map(float, rss_altitudes_m)), "rank": tuple(map(float, rank_altitudes_m))}
+    t, n = len(names), len(grid)
+    rss = np.full((2, len(at["rss"]), t, n), np.nan)
+    rank = np.zeros((len(at["rank"]), len(ks), t, n), dtype=np.int8)
+    ratio = np.full((2, len(at["rank"]), t, n), np.nan)
+    heights = sorted({*at["rss"], *at["rank"]})
+    for step, height in enumerate(heights):
+        positions = grid.positions_m(height)
+        for start in range(0, n, chunk):
+            part = slice(start, min(start + chunk, n))
+            found = evaluate(positions[part], names)
+            _check(found, part.stop - part.start, t)
+            if height in at["rss"]:
+                row = at["rss"].index(height)
+                rss[0, row, :, part] = found.rss_siso_dbm.T
+                rss[1, row, :, part] = found.rss_mimo_dbm.T
+            if height in at["rank"]:
+                row = at["rank"].index(height)
+                rank[row, :, :, part] = np.moveaxis(
+                    rank_of_singular_values(found.singular_values, ks), (0, 1, 2), (2, 1, 0)
+                )
+                ratio[:, row, :, part] = np.moveaxis(_ratios_db(found.singular_values), (1, 2), (2, 1))
+            if progress is not None:
+                progress((step * n + part.stop) / (len(heights) * n))
+    area = (grid.east_m[0], grid.east_m[-1], grid.north_m[0], grid.north_m[-1])
+    half = grid.spacing_m / 2
+    borders = voronoi_borders(places, (area[0] - half, area[1] + half, area[2] - half, area[3] + half))
+    return MapResult(
+        grid, names, places, at["rss"], at["rank"], tuple(map(float, ks)), rss[0], rss[1], rank, ratio[0], ratio[1],
+        serving_tower(grid.points_m, places), borders,
+    )  # fmt: skip
+
+
+def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
+    """Channel rank (..., K): how many of ``sigma`` (..., r), descending, exceed ``sigma_1 / k``; 0 for no channel."""
+    sigma = np.nan_to_num(np.asarray(singular_values, dtype=np.float64))
+    above = sigma[..., None, :] > sigma[..., None, :1] / np.asarray(ks, dtype=np.float64)[:, None]
+    return np.asarray(above.sum(axis=-1), dtype=np.int64)
+
+
+def _ratios_db(singular_values: FloatArray) -> FloatArray:
+    """sigma_1 / sigma_2 and sigma_1 / sigma_last (2, n, t) [dB]."""
+    sigma = np.nan_to_num(singular_values)
+    covered = sigma[..., 0] > 0
+    if sigma.shape[-1] < 2:
+        return np.where(covered, 0.0, np.full((2, *covered.shape), np.nan))
+    strongest = db_from_power(np.where(covered, sigma[..., 0], 1.0) ** 2)
+    return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
+
+
+def _check(found: Evaluation, n: int, towers: int) -> None:
+    shapes = found.rss_siso_dbm.shape, found.rss_mimo_dbm.shape, found.singular_values.shape[:2]
+    if set(shapes) != {(n, towers)}:
+        raise ValueError(f"the engine returned shapes {shapes} for {n} positions and {towers} towers")
+
+
+def empirical_cdf(values: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """Distribution function of a map as (value, share of positions at or below).
+
+    Positions out of coverage count as below every value: the curve starts at their share.
+    """
+    array = np.asarray(values, dtype=np.float64).ravel()
+    finite = np.sort(array[np.isfinite(array)])
+    out = array.size - finite.size
+    return finite, (out + np.arange(1, finite.size + 1)) / max(array.size, 1)
+
+
+@dataclass(frozen=True, slots=True)
+class FoliageDifference:
+    """What foliage does to the joint maps.
+
+    Parameters
+    ----------
+    rss_loss_db : (RSS altitudes, n)
+        RSS without minus with foliage (arrays); NaN where either is out of coverage.
+    lost : (RSS altitudes, n) bool
+        Positions that foliage takes out of coverage.
+    rank_change : (rank altitudes, K, n) int
+        Rank with minus without foliage; 0 where either is out of coverage.
+    """
+
+    rss_loss_db: FloatArray
+    lost: BoolArray
+    rank_change: IntArray
+
+
+def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDifference:
+    """Compare two runs over the same grid, altitudes and K."""
+    for name in ("rss_altitudes_m", "rank_altitudes_m", "ks", "tower_names"):
+        if getattr(without, name) != getattr(foliage, name):
+            raise UsageError(f"the two maps differ in {name}")
+    clear, shaded = without.rss(), foliage.rss()
+    before, after = without.ranks().astype(np.int64), foliage.ranks().astype(np.int64)
+    return FoliageDifference(
+        clear - shaded,
+        np.isfinite(clear) & ~np.isfinite(shaded),
+        np.where((before > 0) & (after > 0), after - before, 0),
+    )
+
+
+def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
+    """Maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
+    found = []
+    for tower in (None, *(result.tower_names if towers_too else ())):
+        who, of = tower or "joint", f", {tower}" if tower else ", nearest tower"
+        for antennas in ("siso", "mimo"):
+            for row, height in enumerate(result.rss_altitudes_m):
+                values = result.rss("siso" if antennas == "siso" else "mimo", tower)[row]
+                found.append(
+                    Layer(
+                        f"rss_{antennas}_h{height:03.0f}m_{who}",
+                        values,
+                        "dBm",
+                        f"RSS {antennas.upper()}, {height:g} m{of}",
+                    )
+                )
+        for row, height in enumerate(result.rank_altitudes_m):
+            for column, k in enumerate(result.ks):
+                found.append(
+                    Layer(
+                        f"rank_k{k:g}_h{height:03.0f}m_{who}".replace("+", ""),
+                        result.ranks(tower)[row, column],
+                        "1",
+                        f"Rank, K = {k:g}, {height:g} m{of}",
+                        class_names(HIGHEST_RANK),
+                    )
+                )
+            for name, title, values in (
+                ("spread", "Singular-value spread s1/s2", result.spread_db),
+                ("condition", "Condition number s1/s4", result.condition_db),
+            ):
+                found.append(
+                    Layer(
+                        f"{name}_h{height:03.0f}m_{who}",
+                        result._of(values, tower)[row],
+                        "dB",
+                        f"{title}, {height:g} m{of}",
+                    )
+                )
+    serving = Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)
+    return [serving, *found]
+
+
+# --- correlation and interpolation of the maps ---------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """The paper's section VII-C on maps: correlation, curve, and leave-one-out errors of each interpolator.
+
+    Parameters
+    ----------
+    correlation : BinnedCorrelation
+        Of the positions' vectors.
+    fit : BiExponential
+        The curve through it.
+    scores : mapping of str to Score
+        "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
+        shape (altitudes, K).
+    intervals : IntervalCoverage
+        Of the Kriging variance with one v^2 per map: its sample variance.
+    intervals_paper : IntervalCoverage
+        With the paper's v^2, the variance over the altitudes at each position; positions with v^2 = 0 do not count.
+    """
+
+    correlation: BinnedCorrelation
+    fit: BiExponential
+    scores: Mapping[str, Score]
+    intervals: IntervalCoverage
+    intervals_paper: IntervalCoverage
+
+
+def rank_fields(
+    result: MapResult, lowest_altitude_m: float = 30.0, out_of_coverage: Literal["missing", "zero"] = "missing"
+) -> tuple[tuple[float, ...], FloatArray]:
+    """Altitudes and joint ranks (n, altitudes, K) to interpolate; the paper leaves 3 m out.
+
+    ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
+    """
+    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= lowest_altitude_m]
+    rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
+    heights = tuple(result.rank_altitudes_m[i] for i in rows)
+    return heights, without_coverage_as_nan(rank) if out_of_coverage == "missing" else rank
+
+
+def rank_study(
+    result: MapResult,
+    *,
+    lowest_altitude_m: float = 30.0,
+    out_of_coverage: Literal["missing", "zero"] = "missing",
+    neighbours: int = 20,
+    radius_m: float = 150.0,
+    selection: Literal["nearest", "random"] = "nearest",
+    seed: int = 0,
+) -> Study:
+    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`."""
+    _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
+    return interpolation_study(
+        result.grid, rank, result.towers_m, neighbours=neighbours, radius_m=radius_m, selection=selection, seed=seed
+    )
+
+
+def interpolation_study(
+    grid: Grid,
+    values: FloatArray,
+    towers_m: FloatArray,
+    *,
+    neighbours: int = 20,
+    radius_m: float = 150.0,
+    selection: Literal["nearest", "random"] = "nearest",
+    seed: int = 0,
+) -> Study:
+    """Correlation and leave-one-out interpolation of maps.
+
+    Parameters
+    ----------
+    grid : Grid
+        Positions.
+    values : (n, altitudes, K)
+        Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
+    towers_m : (towers, 2+)
+        For the serving-tower mean.
+    neighbours, radius_m, selection, seed
+        M, r0 and the choice of samples, the same for every local interpolator.
+    """
+    points = grid.points_m
+    correlation = vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
+    fit = _curve(correlation)
+    kriging = OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed)
+    estimate, variance = leave_one_out_estimate(kriging, points, values)
+    peers: dict[str, Predictor] = {
+        "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
+        "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
+        "nearest": Nearest(radius_m),
+        "inverse distance": InverseDistance(neighbours, radius_m),
+        "serving-tower mean": ServingTowerMean(towers_m),
+    }
+    scores = {"Kriging": score(values, estimate)}
+    scores |= {name: score(values, leave_one_out_estimate(peer, points, values)[0]) for name, peer in peers.items()}
+    sill = kriging.sill_.reshape(values.shape[1:])
+    relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
+    return Study(
+        correlation,
+        fit,
+        scores,
+        interval_coverage(values, estimate, variance),
+        interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
+    )
+
+
+def altitude_variance(values: FloatArray) -> FloatArray:
+    """The paper's v^2 (n, K): sample variance over the altitudes of (n, altitudes, K); NaN below two values."""
+    known = np.isfinite(values)
+    count = known.sum(axis=1)
+    mean = np.where(known, values, 0.0).sum(axis=1) / np.maximum(count, 1)
+    squares = np.where(known, values - mean[:, None], 0.0) ** 2
+    return np.asarray(np.where(count > 1, squares.sum(axis=1) / np.maximum(count - 1, 1), np.nan))
+
+
+def _curve(correlation: BinnedCorrelation) -> BiExponential:
+    if np.isfinite(correlation.correlation[1:]).any():
+        return fit_biexponential(correlation.distance_m, correlation.correlation)
+    reason = "no two positions have varying rank vectors: the paper's curve stands in"
+    return replace(PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class HonestStudy:
+    """Kriging where no near neighbour gives the answer away. Scores have the shape (altitudes, K).
+
+    Parameters
+    ----------
+    blocked : Score
+        One square block of the area left out at a time.
+    altitude_held_out : Score
+        One altitude left out at a time, predicted in 3-D.
+    vertical_scale : float
+        Anisotropy used for it, fitted to the correlation of the altitudes' maps.
+    trajectory : Score or None
+        Trained on the cells of a flight only.
+    learning_sizes : tuple of int
+        Numbers of random samples.
+    learning_mae : (sizes, altitudes, K)
+        MAE at the other positions.
+    """
+
+    blocked: Score
+    altitude_held_out: Score
+    vertical_scale: float
+    trajectory: Score | None
+    learning_sizes: tuple[int, ...]
+    learning_mae: FloatArray
+
+
+def honest_study(
+    grid: Grid,
+    altitudes_m: Sequence[float],
+    values: FloatArray,
+    fit: BiExponential,
+    *,
+    trajectory_m: ArrayLike | None = None,
+    block_m: float = 300.0,
+    learning_sizes: Sequence[int] = (25, 50, 100, 200, 400, 800, 1600),
+    neighbours: int = 20,
+    seed: int = 0,
+) -> HonestStudy:
+    """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
+
+    Parameters
+    ----------
+    grid, altitudes_m, values
+        Maps (n, altitudes, K), as in :func:`interpolation_study`.
+    fit : BiExponential
+        Of :class:`Study`.
+    trajectory_m : (samples, 2+), optional
+        A flight [m].
+    block_m : float
+        Side of the blocks.
+    learning_sizes : sequence of int
+        Those not below the number of positions are left out.
+    neighbours, seed
+        M; seed of the learning curve.
+    """
+    points = grid.points_m
+    wide = OrdinaryKriging(fit, neighbours, outside="nearest")
+    horizontal = field_correlation(points, values, width_m=grid.spacing_m)
+    across = vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
+    in_space = _curve(horizontal)
+    varies = np.isfinite(across.correlation[1:]).any()
+    scale = fit_vertical_scale(in_space, across) if varies else 1.0
+    space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
+    sizes = tuple(size for size in learning_sizes if size < len(grid))
+    return HonestStudy(
+        blocked(wide, points, values, block_m),
+        altitude_held_out(space, points, altitudes_m, values),
+        scale,
+        None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
+        sizes,
+        learning_curve(wide, points, values, sizes, seed=seed),
+    )

@@ -1,0 +1,426 @@
+"""Ordinary Kriging in moving neighbourhoods, in the plane or in space.
+
+The semivariogram of the paper is ``gamma = v^2 (1 - Phi)`` (arXiv 2502.10324, section VI-B). The weights do not
+depend on ``v^2``, and ``v^2 = 0`` would make the textbook system singular, so the system is solved for
+``1 - Phi`` and ``v^2`` enters only the variance::
+
+    [ 1 - Phi  1 ] [ w ]   [ 1 - Phi_0 ]
+    [    1     0 ] [ L ] = [     1     ]        variance = v^2 (w . (1 - Phi_0) + L)
+
+Rules, each with a test:
+
+nugget
+    ``1 - Phi(0+)``. It is a jump, not a smoothing: gamma of a sample with itself is 0, so that a target at the
+    place of a sample takes its value with variance 0. ``exact=False`` takes the nugget for measurement noise
+    instead and predicts the smooth field there.
+places
+    Samples at the same place (to a micrometre) become one, their mean; leaving one out leaves out the place.
+near-singular systems
+    A system whose condition number (1-norm) exceeds 1e10 is solved in the space of weights that sum to 1 by an
+    eigenvalue decomposition; directions with less than 1e-10 of the largest variance, and those that an invalid
+    correlation makes negative, are dropped. In dropped directions the weights stay equal.
+out of coverage
+    NaN values take no part, field by field.
+too few samples
+    With fewer than M within the radius all of them are used; with one, its value; with none the estimate and its
+    variance are NaN, or (``outside="nearest"``) the M nearest are used whatever their distance.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import UsageError
+from ..units import BoolArray, FloatArray, IntArray
+from . import neighbours as choose
+
+Correlation = Callable[[FloatArray], FloatArray]
+"""Correlation as a function of distance [m]; vectorised."""
+
+CONDITION_LIMIT = 1e10
+SHARE_M = 1e-9
+"""Targets whose neighbours' offsets agree to this share one set of weights."""
+CHUNK = 2048
+"""Targets solved at once; bounds the memory."""
+
+
+@dataclass(frozen=True, slots=True)
+class Weights:
+    """The linear rule of each target: estimate = sum of weight * sample.
+
+    Parameters
+    ----------
+    index : (targets, M) int
+        Places used, -1 past the last.
+    weight : (targets, M)
+        Sums to 1 in each row with a sample; 0 past the last.
+    variance : (targets,)
+        Kriging variance for ``v^2 = 1``; NaN without a sample.
+    regularised : (targets,) bool
+        True where the near-singular rule was used.
+    """
+
+    index: IntArray
+    weight: FloatArray
+    variance: FloatArray
+    regularised: BoolArray
+
+
+class OrdinaryKriging:
+    """Ordinary Kriging of one or many fields sampled at the same points.
+
+    Parameters
+    ----------
+    correlation : callable
+        Phi(distance [m]), such as a fitted :class:`~aerpaw_cmp.maps.variogram.BiExponential`. Values above 1
+        count as 1.
+    neighbours : int
+        M, the largest number of samples per target.
+    radius_m : float
+        r0; samples at larger distance do not count. May be infinite.
+    selection : {"nearest", "random"}
+        The M nearest (ties by the rule of :mod:`~aerpaw_cmp.maps.neighbours`), or M drawn within the radius.
+    seed : int
+        Of the random selection.
+    sill : float or (fields,), optional
+        v^2 of the variance; by default the sample variance of each field.
+    exact : bool
+        Whether the nugget is variation of the field (True) or measurement noise (False).
+    vertical_scale : float
+        In 3-D one metre of height counts as this many horizontal metres (geometric anisotropy).
+    vertical_correlation : callable, optional
+        In 3-D, Phi = correlation(horizontal) * vertical_correlation(vertical), as in Maeng et al. 2023; the scale
+        then only serves to choose neighbours.
+    outside : {"nan", "nearest"}
+        What happens where no sample lies within the radius.
+
+    Attributes
+    ----------
+    points_m_ : (places, dims)
+        Distinct sample places.
+    values_ : (places, fields)
+        Their values.
+    place_ : (samples,) int
+        Place of each sample.
+    sill_ : (fields,)
+        v^2 used.
+
+    Examples
+    --------
+    >>> model = OrdinaryKriging(lambda d: np.exp(-d / 100.0)).fit([[0.0, 0.0], [60.0, 0.0]], [1.0, 3.0])
+    >>> estimate, variance = model.predict([[30.0, 0.0], [0.0, 0.0]])
+    >>> estimate.round(12).tolist(), bool(variance[0] > 0), float(variance[1])
+    ([2.0, 1.0], True, 0.0)
+    """
+
+    def __init__(
+        self,
+        correlation: Correlation,
+        neighbours: int = 20,
+        radius_m: float = 150.0,
+        *,
+        selection: Literal["nearest", "random"] = "nearest",
+        seed: int = 0,
+        sill: ArrayLike | None = None,
+        exact: bool = True,
+        vertical_scale: float = 1.0,
+        vertical_correlation: Correlation | None = None,
+        outside: Literal["nan", "nearest"] = "nan",
+    ) -> None:
+        self.correlation = correlation
+        self.neighbours = neighbours
+        self.radius_m = radius_m
+        self.selection = selection
+        self.seed = seed
+        self.sill = sill
+        self.exact = exact
+        self.vertical_scale = vertical_scale
+        self.vertical_correlation = vertical_correlation
+        self.outside = outside
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> OrdinaryKriging:
+        """Store the samples.
+
+        Parameters
+        ----------
+        points_m : (n, 2) or (n, 3)
+            East, north (, up) [m].
+        values : (n,) or (n, fields)
+            NaN where out of coverage.
+
+        Raises
+        ------
+        UsageError
+            If a setting or a shape does not make sense; the message names it.
+        """
+        self._check_settings()
+        points = _as_points(points_m)
+        fields = np.asarray(values, dtype=np.float64)
+        if len(fields) != len(points) or fields.ndim not in (1, 2):
+            raise UsageError(
+                f"values of shape {fields.shape} for {len(points)} points", expected="(n,) or (n, fields) with n points"
+            )
+        if np.isinf(fields).any():
+            raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
+        self._one_field = fields.ndim == 1
+        fields = fields.reshape(len(points), -1)
+        self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
+        self.sill_ = self._sill_of(self.values_)
+        return self
+
+    def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Estimate and Kriging variance at targets (t, dims), each ``(t,)`` or ``(t, fields)`` like the values."""
+        targets = _as_points(targets_m)
+        if targets.shape[1] != self.points_m_.shape[1]:
+            raise UsageError(f"targets with {targets.shape[1]} coordinates, samples with {self.points_m_.shape[1]}")
+        return self._shaped(*self._estimate(targets, None))
+
+    def leave_one_out(self) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance at every sample from the others; shapes as the values given to ``fit``."""
+        own = np.arange(len(self.points_m_))
+        estimate, variance = self._estimate(self.points_m_, own)
+        return self._shaped(estimate[self.place_], variance[self.place_])
+
+    def weights(self, targets_m: ArrayLike) -> Weights:
+        """Weights at targets for a field with a value at every place."""
+        return self._weights(self.points_m_, _as_points(targets_m), None)
+
+    # --- settings and shapes -------------------------------------------------------------------------------------
+
+    def _check_settings(self) -> None:
+        wrong = []
+        if int(self.neighbours) != self.neighbours or self.neighbours < 1:
+            wrong.append(f"neighbours = {self.neighbours}: expected a whole number of at least 1")
+        if not self.radius_m > 0:
+            wrong.append(f"radius_m = {self.radius_m}: expected a positive length")
+        if not self.vertical_scale > 0:
+            wrong.append(f"vertical_scale = {self.vertical_scale}: expected a positive ratio")
+        if self.selection not in ("nearest", "random"):
+            wrong.append(f"selection = {self.selection!r}: expected 'nearest' or 'random'")
+        if self.outside not in ("nan", "nearest"):
+            wrong.append(f"outside = {self.outside!r}: expected 'nan' or 'nearest'")
+        if wrong:
+            raise UsageError("; ".join(wrong))
+
+    def _sill_of(self, values: FloatArray) -> FloatArray:
+        if self.sill is not None:
+            sill = np.broadcast_to(np.asarray(self.sill, dtype=np.float64), (values.shape[1],)).copy()
+            if not (sill >= 0).all():
+                raise UsageError(f"a sill of {sill.min()}", expected="a variance of at least 0")
+            return np.asarray(sill)
+        finite = np.isfinite(values)
+        count = finite.sum(axis=0)
+        # relative to a value of the field, so that a constant field has variance 0 and not 1e-32
+        centred = np.where(finite, values - _reference(values), 0.0)
+        mean = centred.sum(axis=0) / np.maximum(count, 1)
+        squares = np.where(finite, centred - mean, 0.0) ** 2
+        return np.asarray(squares.sum(axis=0) / np.maximum(count - 1, 1))
+
+    def _shaped(self, estimate: FloatArray, variance: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return (estimate[:, 0], variance[:, 0]) if self._one_field else (estimate, variance)
+
+    # --- estimation ----------------------------------------------------------------------------------------------
+
+    def _estimate(self, targets: FloatArray, own: IntArray | None) -> tuple[FloatArray, FloatArray]:
+        """Estimate and variance (targets, fields); ``own`` is the place that each target must not use."""
+        estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
+        variance = np.full_like(estimate, np.nan)
+        for kept, columns in _coverage_patterns(self.values_):
+            skip = None
+            if own is not None:
+                new_number = np.full(len(self.points_m_), -1, dtype=np.int64)
+                new_number[kept] = np.arange(kept.sum())
+                skip = new_number[own]
+            rule = self._weights(self.points_m_[kept], targets, skip)
+            estimate[:, columns] = _apply(rule, self.values_[np.ix_(kept, columns)])
+            variance[:, columns] = rule.variance[:, None] * self.sill_[columns]
+        return estimate, variance
+
+    def _weights(self, samples: FloatArray, targets: FloatArray, skip: IntArray | None) -> Weights:
+        chosen = self._neighbours(samples, targets, skip)
+        count = chosen.count
+        weight = np.zeros(chosen.index.shape)
+        variance = np.full(len(targets), np.nan)
+        regularised = np.zeros(len(targets), dtype=bool)
+        for m in np.unique(count[count > 0]):
+            same = np.flatnonzero(count == m)
+            for start in range(0, len(same), CHUNK):
+                rows = same[start : start + CHUNK]
+                offset = samples[chosen.index[rows, :m]] - targets[rows, None, :]
+                example, group = _same_geometry(offset)
+                w, v, r = self._solve(offset[example])
+                weight[rows, :m], variance[rows], regularised[rows] = w[group], v[group], r[group]
+        return Weights(chosen.index, weight, variance, regularised)
+
+    def _neighbours(self, samples: FloatArray, targets: FloatArray, skip: IntArray | None) -> choose.Neighbours:
+        scale = np.ones(samples.shape[1])
+        scale[2:] = self.vertical_scale
+        samples, targets = samples * scale, targets * scale
+        if self.selection == "random":
+            chosen = choose.random_within(samples, targets, self.neighbours, self.radius_m, self.seed, skip)
+        else:
+            chosen = choose.nearest(samples, targets, self.neighbours, self.radius_m, skip)
+        if self.outside == "nearest":
+            empty = np.flatnonzero(chosen.count == 0)
+            wider = choose.nearest(
+                samples, targets[empty], self.neighbours, np.inf, None if skip is None else skip[empty]
+            )
+            chosen.index[empty], chosen.distance_m[empty] = wider.index, wider.distance_m
+        return chosen
+
+    def _semivariance(self, offset_m: FloatArray) -> FloatArray:
+        """1 - Phi of offsets (..., dims) between different places."""
+        horizontal = np.hypot(offset_m[..., 0], offset_m[..., 1])
+        if offset_m.shape[-1] == 2:
+            phi = self.correlation(horizontal)
+        elif self.vertical_correlation is not None:
+            phi = self.correlation(horizontal) * self.vertical_correlation(np.abs(offset_m[..., 2]))
+        else:
+            phi = self.correlation(np.hypot(horizontal, self.vertical_scale * offset_m[..., 2]))
+        gamma = 1.0 - np.asarray(phi, dtype=np.float64)
+        if not np.isfinite(gamma).all():
+            raise UsageError("the correlation is not finite at some distance", expected="a number at every distance")
+        return np.asarray(np.maximum(gamma, 0.0))
+
+    def _solve(self, offset_m: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+        """Weights (t, m), normalised variance (t,), near-singular flag (t,) of neighbours at offsets (t, m, dims)."""
+        m = offset_m.shape[1]
+        gamma = self._semivariance(offset_m[:, :, None, :] - offset_m[:, None, :, :])
+        gamma[:, np.arange(m), np.arange(m)] = 0.0
+        to_target = self._semivariance(offset_m)
+        here = np.sqrt((offset_m**2).sum(axis=-1)) < choose.TIE_M
+        if self.exact:
+            to_target = np.where(here, 0.0, to_target)
+        weight, lagrange, fine = _solve_bordered(gamma, to_target)
+        variance = (weight * to_target).sum(axis=1) + lagrange
+        fine &= variance >= -1e-9
+        if not fine.all():
+            weight[~fine] = _solve_reduced(gamma[~fine], to_target[~fine])
+            variance[~fine] = _variance_of(weight[~fine], gamma[~fine], to_target[~fine])
+        variance = np.maximum(variance, 0.0)
+        if self.exact:
+            # the solution is known there; rounding must not blur it
+            at = here.any(axis=1)
+            weight[at], variance[at] = here[at].astype(np.float64), 0.0
+        return weight, variance, ~fine
+
+
+def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
+    """Weights, Lagrange multiplier and whether the system is well conditioned, by batched inversion."""
+    t, m = to_target.shape
+    system = np.ones((t, m + 1, m + 1))
+    system[:, :m, :m] = gamma
+    system[:, m, m] = 0.0
+    right = np.ones((t, m + 1, 1))
+    right[:, :m, 0] = to_target
+    try:
+        inverse = np.linalg.inv(system)
+    except np.linalg.LinAlgError:
+        # one singular system fails the whole batch; the reduced form serves all of it
+        return np.zeros((t, m)), np.zeros(t), np.zeros(t, dtype=bool)
+    with np.errstate(all="ignore"):  # what overflows here is not fine, and is solved again
+        condition = np.abs(system).sum(axis=1).max(axis=1) * np.abs(inverse).sum(axis=1).max(axis=1)
+        solution = inverse @ right
+        solution += inverse @ (right - system @ solution)
+    fine = condition < CONDITION_LIMIT
+    return solution[:, :m, 0], solution[:, m, 0], fine
+
+
+def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
+    """Weights (t, m) that sum to 1 and minimise the variance over directions that carry any."""
+    from scipy.linalg import helmert
+
+    m = to_target.shape[1]
+    if m == 1:
+        return np.ones((len(to_target), 1))
+    basis = helmert(m)  # (m - 1, m): orthonormal, each row sums to 0
+    spread = -basis @ gamma @ basis.T
+    right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
+    level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
+    kept = level > np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT
+    along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
+    along = np.where(kept, along / np.where(kept, level, 1.0), 0.0)
+    return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
+
+
+def _variance_of(weight: FloatArray, gamma: FloatArray, to_target: FloatArray) -> FloatArray:
+    """Normalised variance of any weights that sum to 1: 2 w.g0 - w.G.w."""
+    return np.asarray(2 * (weight * to_target).sum(axis=1) - np.einsum("ti,tij,tj->t", weight, gamma, weight))
+
+
+def _apply(rule: Weights, values: FloatArray) -> FloatArray:
+    """Estimates (targets, fields) of values (places, fields)."""
+    from scipy.sparse import csr_array
+
+    used = rule.index >= 0
+    start = np.concatenate([[0], np.cumsum(used.sum(axis=1))])
+    matrix = csr_array((rule.weight[used], rule.index[used], start), shape=(len(used), len(values)))
+    # relative to one value of the field: a constant field comes back exactly although weights sum to 1 +- 1e-16
+    reference = _reference(values)
+    estimate = reference + matrix @ (values - reference)
+    target, column = np.nonzero(rule.weight == 1.0)
+    estimate[target] = values[rule.index[target, column]]  # at a sample, or with one only: its value to the last bit
+    estimate[~used.any(axis=1)] = np.nan
+    return np.asarray(estimate)
+
+
+def _reference(values: FloatArray) -> FloatArray:
+    """First finite value of each field (fields,); 0 for a field without any."""
+    finite = np.isfinite(values)
+    if not len(values):
+        return np.zeros(values.shape[1])
+    first = values[finite.argmax(axis=0), np.arange(values.shape[1])]
+    return np.asarray(np.where(finite.any(axis=0), first, 0.0))
+
+
+def _coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
+    """Fields grouped by where they have values: (kept places, field numbers)."""
+    patterns, group = np.unique(np.isfinite(values), axis=1, return_inverse=True)
+    for number in range(patterns.shape[1]):
+        yield patterns[:, number], np.flatnonzero(group.ravel() == number)
+
+
+def _merge_places(points: FloatArray, fields: FloatArray) -> tuple[FloatArray, FloatArray, IntArray]:
+    """Distinct places in order of appearance, mean of their values, and the place of each sample."""
+    _, first, place = np.unique(np.round(points / choose.TIE_M), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty_like(order)
+    rank[order] = np.arange(len(order))
+    place = rank[place.ravel()]
+    if len(first) == len(points):
+        return points, fields, place
+    # sums relative to one sample of the place, so that equal values stay exactly equal
+    base = fields[first[order]]
+    base = np.where(np.isfinite(base), base, 0.0)
+    finite = np.isfinite(fields)
+    total, count = np.zeros_like(base), np.zeros_like(base)
+    np.add.at(total, place, np.where(finite, fields - base[place], 0.0))
+    np.add.at(count, place, finite)
+    mean = np.where(count > 0, base + total / np.maximum(count, 1), np.nan)
+    return points[first[order]], mean, place
+
+
+def _same_geometry(offset_m: FloatArray) -> tuple[IntArray, IntArray]:
+    """Targets whose neighbours lie at the same offsets (t, m, dims): (one of each group, group of each target)."""
+    alone = np.arange(len(offset_m)), np.arange(len(offset_m))
+    offset = np.round(offset_m.reshape(len(offset_m), -1) / SHARE_M).astype(np.int64)
+    # a row is told by one number: the sum with random odd factors, modulo 2^64
+    factors = np.random.default_rng(0).integers(1, 2**62, offset.shape[1], dtype=np.int64) | 1
+    _, example, group = np.unique(offset @ factors, return_index=True, return_inverse=True)
+    if not (offset[example[group]] == offset).all():
+        return alone  # two rows with one number: nothing is shared, the result is the same
+    return example, group
+
+
+def _as_points(points_m: ArrayLike) -> FloatArray:
+    points = np.asarray(points_m, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] not in (2, 3):
+        raise UsageError(f"points of shape {points.shape}", expected="(n, 2) or (n, 3): east, north (, up) in metres")
+    if not np.isfinite(points).all():
+        raise UsageError("a point without finite coordinates", expected="finite east, north (, up) in metres")
+    return points

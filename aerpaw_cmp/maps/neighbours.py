@@ -1,0 +1,165 @@
+"""Which samples an interpolator may use: the M nearest within a radius, or M at random within it.
+
+The tie rule. Distances that agree to a micrometre are tied. Tied samples are taken by their offset from the
+target: lower first, then southern first, then western first. On a regular grid the rule gives every inner
+target the same pattern of neighbours, and it does not depend on the order in which samples were given (only samples
+at the same place are taken in that order).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..units import FloatArray, IntArray
+
+CHUNK = 4096
+"""Targets per query; bounds the memory."""
+
+TIE_M = 1e-6
+"""Distances closer than this are tied; a sample closer than this to a target is at its place."""
+
+
+@dataclass(frozen=True, slots=True)
+class Neighbours:
+    """Chosen samples of each target, in the order of the tie rule (random choice: by index).
+
+    Parameters
+    ----------
+    index : (targets, M) int
+        Sample numbers, -1 past the last one.
+    distance_m : (targets, M)
+        Infinite past the last one.
+    """
+
+    index: IntArray
+    distance_m: FloatArray
+
+    @property
+    def count(self) -> IntArray:
+        """Number of samples of each target (targets,)."""
+        return np.asarray((self.index >= 0).sum(axis=1), dtype=np.int64)
+
+
+def nearest(
+    samples_m: FloatArray, targets_m: FloatArray, m: int, radius_m: float, skip: IntArray | None = None
+) -> Neighbours:
+    """The M nearest samples within the radius (inclusive, to the micrometre), ties by the rule above.
+
+    Parameters
+    ----------
+    samples_m : (samples, dims)
+        At distinct places, in a metric frame (anisotropy already applied).
+    targets_m : (targets, dims)
+        The same frame.
+    m : int
+        Largest number of samples per target.
+    radius_m : float
+        May be infinite.
+    skip : (targets,) int, optional
+        One sample per target that does not count (leave-one-out); -1 for none.
+
+    Returns
+    -------
+    Neighbours
+    """
+    from scipy.spatial import cKDTree
+
+    index = np.full((len(targets_m), m), -1, dtype=np.int64)
+    distance = np.full((len(targets_m), m), np.inf)
+    if len(samples_m) == 0 or len(targets_m) == 0:
+        return Neighbours(index, distance)
+    tree = cKDTree(samples_m)
+    for start in range(0, len(targets_m), CHUNK):
+        part = np.arange(start, min(start + CHUNK, len(targets_m)))
+        _fill_nearest(tree, targets_m, part, radius_m, skip, index, distance)
+    return Neighbours(index, distance)
+
+
+def _fill_nearest(
+    tree: Any,
+    targets_m: FloatArray,
+    todo: IntArray,
+    radius_m: float,
+    skip: IntArray | None,
+    index: IntArray,
+    distance: FloatArray,
+) -> None:
+    """Fill the rows ``todo`` of index and distance; ask for more candidates where a tie reaches the last one."""
+    samples_m, m = tree.data, index.shape[1]
+    # a ring of equal distance holds at most 12 cells on the paper's grid; where a ring is larger, ask again
+    wanted = m + 13
+    while len(todo):
+        wanted = min(wanted, len(samples_m))
+        bound = radius_m + TIE_M
+        found, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=bound)
+        exhausted = (wanted == len(samples_m)) | ~np.isfinite(found[:, -1])
+        last = _in_micrometres(found[:, -1])
+        if skip is not None:
+            found[who == skip[todo, None]] = np.inf
+        order = _tie_order(found, np.where(np.isfinite(found), who, 0), samples_m, targets_m[todo])[:, :m]
+        chosen = np.take_along_axis(who, order, axis=1)
+        chosen_distance = np.take_along_axis(found, order, axis=1)
+        if order.shape[1] == m:
+            complete = exhausted | (_in_micrometres(chosen_distance[:, -1]) < last)
+        else:
+            complete = exhausted
+        rows = todo[complete]
+        width = order.shape[1]
+        index[rows, :width] = np.where(np.isfinite(chosen_distance), chosen, -1)[complete]
+        distance[rows, :width] = chosen_distance[complete]
+        todo = todo[~complete]
+        wanted *= 2
+
+
+def _in_micrometres(distance_m: FloatArray) -> FloatArray:
+    return np.round(distance_m / TIE_M)
+
+
+def _tie_order(found: FloatArray, who: IntArray, samples_m: FloatArray, targets_m: FloatArray) -> IntArray:
+    """Order of candidates by distance, then offset (up, north, east), then number."""
+    offset = _in_micrometres(samples_m[who] - targets_m[:, None, :])
+    keys = [offset[:, :, axis] for axis in range(offset.shape[2])]
+    return np.lexsort((who, *keys, _in_micrometres(found)), axis=-1)
+
+
+def random_within(
+    samples_m: FloatArray,
+    targets_m: FloatArray,
+    m: int,
+    radius_m: float,
+    seed: int,
+    skip: IntArray | None = None,
+    chunk: int = 256,
+) -> Neighbours:
+    """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read.
+
+    Parameters as in :func:`nearest`; ``seed`` fixes the draw, ``chunk`` bounds the memory and does not change it.
+    """
+    from scipy.spatial import cKDTree
+
+    index = np.full((len(targets_m), m), -1, dtype=np.int64)
+    distance = np.full((len(targets_m), m), np.inf)
+    if len(samples_m) == 0:
+        return Neighbours(index, distance)
+    generator = np.random.default_rng(seed)
+    tree = cKDTree(samples_m)
+    for start in range(0, len(targets_m), chunk):
+        part = slice(start, start + chunk)
+        pairs = cKDTree(targets_m[part]).sparse_distance_matrix(tree, radius_m + TIE_M, output_type="ndarray")
+        pairs = pairs[np.lexsort((pairs["j"], pairs["i"]))]
+        target, sample, far = pairs["i"], pairs["j"], pairs["v"]
+        # one number per pair in a fixed order: the stream does not depend on the chunk
+        draw = generator.random(len(pairs))
+        if skip is not None:
+            keep = sample != skip[part][target]
+            target, sample, far, draw = target[keep], sample[keep], far[keep], draw[keep]
+        order = np.lexsort((draw, target))
+        target, sample, far = target[order], sample[order], far[order]
+        rank = np.arange(len(target)) - np.searchsorted(target, target)
+        taken = rank < m
+        index[start + target[taken], rank[taken]] = sample[taken]
+        distance[start + target[taken], rank[taken]] = far[taken]
+    return Neighbours(index, distance)

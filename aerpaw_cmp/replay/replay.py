@@ -1,0 +1,326 @@
+"""The replay of a flight: paths by an engine, channel matrices and RSS from the paths."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..errors import UsageError
+from ..site.site import Site
+from ..units import BoolArray, ComplexArray, FloatArray
+from . import image
+from .arrays import Link, Poses
+from .cache import PathCache
+from .faces import inside_solids, site_faces, smaller_than_fresnel_zone
+from .field import channel_matrices, mean_pair_power, rss_dbm
+from .paths import Faces, PathSet
+from .relevance import Relevance
+
+Engine = Literal["sionna", "image"]
+Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
+"""``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What a replay found.
+
+    Parameters
+    ----------
+    rss_dbm : (poses, towers)
+        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.replay.field.rss_dbm`. NaN without a path.
+    rss_power_dbm : (poses, towers)
+        From the sum of the paths' powers.
+    h : (poses, towers, n_rx, n_tx) complex128
+        Zero without a path.
+    has_path : (poses, towers) bool
+    paths : PathSet
+    faces : Faces
+    seconds : float
+        Of path search and fields.
+    search_seconds : float
+        Of the path search alone; nearly zero when the paths came from the cache.
+    engine : str
+    left_out : list of str
+        What was not modelled, for the report.
+    towers : tuple of str
+        Order of the tower axis.
+    """
+
+    rss_dbm: FloatArray
+    rss_power_dbm: FloatArray
+    h: ComplexArray
+    has_path: BoolArray
+    paths: PathSet
+    faces: Faces
+    seconds: float
+    search_seconds: float
+    engine: str
+    towers: tuple[str, ...]
+    left_out: list[str] = field(default_factory=list)
+
+
+def replay(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    engine: Engine = "image",
+    *,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    loss: Loss | None = None,
+    cache_dir: str | Path | None = None,
+    relevance_db: float | None = None,
+    drop_small_faces: bool = False,
+    variant: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Replay:
+    """Replay a flight.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+        Its ``tower_arrays`` name towers of the site.
+    poses : Poses
+    engine : {"image", "sionna"}
+        Exhaustive image method, or Sionna's PathSolver as path finder.
+    max_depth : int
+        Largest number of reflections, 0 to 3.
+    samples, batch : int
+        ``sionna`` only: rays per tower, poses per call.
+    loss : callable, optional
+        Further loss per path [dB], such as foliage.
+    cache_dir : path, optional
+        Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
+        ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
+    relevance_db : float, optional
+        ``image`` only: leave out face sequences that cannot change the RSS of any link by more than this
+        (:mod:`aerpaw_cmp.replay.relevance`).
+    drop_small_faces : bool
+        Leave out faces smaller than the first Fresnel zone of every link.
+    variant : {"cuda", "llvm"}, optional
+        ``sionna`` only.
+    progress : callable, optional
+        Called with the share done.
+
+    Returns
+    -------
+    Replay
+
+    Raises
+    ------
+    UsageError
+        Unknown tower or engine, a scene too large for ``image``, ``relevance_db`` with ``sionna``.
+    """
+    started = time.perf_counter()
+    scene = Scene.of(site, link, poses)
+    scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
+    settings = Settings(engine, max_depth, samples, batch, variant)
+    if relevance_db is None:
+        paths = _search(scene, link, poses, settings, _cache(engine, cache_dir), progress)
+    elif engine == "image":
+        paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
+        left_out += idle
+    else:
+        raise UsageError(
+            "relevance_db with the sionna engine",
+            expected="engine 'image'",
+            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
+        )
+    searched = time.perf_counter()
+    return _evaluate(scene, link, poses, paths, engine, loss, left_out, started, searched)
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides the paths besides the scene."""
+
+    engine: str
+    max_depth: int = 2
+    samples: int = 1_000_000
+    batch: int = 50
+    variant: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Geometry of a replay.
+
+    Parameters
+    ----------
+    faces : Faces
+    sources_m : (towers, 3)
+    usable : (towers, faces) bool
+        Faces that reflect for each tower.
+    excluded : (towers, poses) bool
+        Links without a path: an end inside a building or under the ground.
+    """
+
+    faces: Faces
+    sources_m: FloatArray
+    usable: BoolArray
+    excluded: BoolArray
+
+    @classmethod
+    def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
+        """Scene of a site as the towers of a link see it."""
+        names = tuple(link.tower_arrays)
+        unknown = [name for name in names if name not in site.towers]
+        if unknown:
+            raise UsageError(
+                f"the site has no tower {unknown[0]!r}",
+                expected="one of " + ", ".join(site.towers),
+                cause="a typing error",
+            )
+        faces = site_faces(site, names)
+        towers = [site.towers[name] for name in names]
+        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
+        ground = np.array([tower.ground_m for tower in towers])
+        is_ground = faces.solid < 0
+        usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
+        up = poses.position_m[:, 2]
+        # terrain is not traced: a pose below a tower's own plane but above the lowest ground is no buried pose
+        buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
+        excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
+        return cls(faces, sources, usable, excluded)
+
+
+def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
+    """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
+    good = np.isfinite(poses.position_m).all(axis=1)
+    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
+    left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
+    return replace(scene, usable=scene.usable & ~small), left_out
+
+
+def _search_relevant(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    relevance_db: float,
+    progress: Callable[[float], None] | None,
+) -> tuple[PathSet, list[str]]:
+    """Paths without the sequences that cannot matter; poses at which they might are searched with all."""
+    if not relevance_db > 0.0:
+        raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
+
+    def field_of(paths: PathSet) -> FloatArray:
+        return np.sqrt(mean_pair_power(channel_matrices(paths, scene.faces, scene.sources_m, poses, link).h))
+
+    ground = replace(scene, usable=scene.usable & (scene.faces.solid < 0))
+    kept = field_of(_search(ground, link, poses, settings, None, None))
+    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    chooser = Relevance(scene.faces, poses.position_m[known], link, relevance_db, kept[known])
+    paths = image.find_paths(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        max_depth=settings.max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        select=chooser,
+        progress=progress,
+    )
+    again = np.zeros(len(poses), dtype=np.bool_)
+    again[known] = chooser.failing(field_of(paths)[known])
+    if again.any():
+        all_of_them = replace(scene, excluded=scene.excluded | ~again)
+        full = _search(all_of_them, link, poses, settings, None, None)
+        paths = image.merge([paths.select(~again[paths.pose]), full], settings.max_depth, None)
+    return paths, chooser.report(tuple(link.tower_arrays), int(again.sum()), len(known))
+
+
+def _search(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    cache: PathCache | None,
+    progress: Callable[[float], None] | None,
+) -> PathSet:
+    """Paths, from the cache when it has them."""
+    if settings.engine not in ("image", "sionna"):
+        raise UsageError(f"unknown engine {settings.engine!r}", expected="'image' or 'sionna'")
+    key = ""
+    if cache is not None:
+        key = cache.key(scene, poses.position_m, link.carrier_hz, settings)
+        kept = cache.load(key)
+        if kept is not None:
+            return kept
+    if settings.engine == "image":
+        paths = image.find_paths(
+            scene.faces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )
+    else:
+        from . import sionna
+
+        paths = sionna.find_paths(
+            scene.faces,
+            scene.sources_m,
+            poses.position_m,
+            carrier_hz=link.carrier_hz,
+            max_depth=settings.max_depth,
+            samples=settings.samples,
+            batch=settings.batch,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            variant=settings.variant,
+            progress=progress,
+        )
+    if cache is not None:
+        cache.save(key, paths)
+    return paths
+
+
+def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
+    if cache_dir is None:
+        if engine != "sionna":
+            return None
+        cache_dir = os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp"
+    return PathCache(Path(cache_dir)) if str(cache_dir) else None
+
+
+def _evaluate(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    paths: PathSet,
+    engine: str,
+    loss: Loss | None,
+    left_out: list[str],
+    started: float,
+    searched: float,
+) -> Replay:
+    loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
+    has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
+    open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
+    has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
+    return Replay(
+        rss_dbm=rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm),
+        rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm),
+        h=fields.h,
+        has_path=has_path,
+        paths=paths,
+        faces=scene.faces,
+        seconds=time.perf_counter() - started,
+        search_seconds=searched - started,
+        engine=engine,
+        towers=tuple(link.tower_arrays),
+        left_out=left_out,
+    )

@@ -1,0 +1,451 @@
+"""What a report is made of: finished numbers, nothing to be computed.
+
+``run`` fills these records; :mod:`aerpaw_cmp.report` turns them into files. Whatever a flight may lack is optional:
+a flight with rank only has ``rss=()``, one without a path anywhere has NaN numbers, never invented ones.
+Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in ``metrics.json``: ``null``).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..records import RejectedLine
+from ..site.site import Site
+from ..units import AnyArray, BoolArray, FloatArray, IntArray
+
+Interval = tuple[float, float]
+
+RANKS = (1, 2, 3, 4)
+"""Ranks of a 4 x 4 channel, the bars of every histogram."""
+
+GEOMETRY = {
+    "distance_m": "Distance tower to UAV [m]",
+    "elevation_deg": "Elevation of the UAV seen from the tower [deg]",
+    "azimuth_deg": "Azimuth of the UAV in the frame of the tower antenna [deg]",
+    "heading_deg": "UAV heading [deg clockwise from north]",
+    "altitude_m": "Height of the UAV above ground [m]",
+    "foliage_depth_m": "Path length inside tree crowns [m]",
+}
+"""Quantities that residuals are drawn against, and their axis labels."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class InputFile:
+    """The account of one log file: ``lines == accepted + rejected + blank``.
+
+    ``rejected_lines`` may hold all of them or a sample; ``rejected`` is the count.
+    """
+
+    path: str
+    sha256: str
+    reader: str
+    lines: int
+    accepted: int
+    rejected: int
+    blank: int
+    role: str = ""
+    warnings: tuple[str, ...] = ()
+    rejected_lines: tuple[RejectedLine, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Track:
+    """The flown line: ``time`` (n,), positions (n,) in the site frame [m]."""
+
+    time: AnyArray
+    east_m: FloatArray
+    north_m: FloatArray
+    up_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Waypoint:
+    """A named moment of the flight, e.g. ``A`` to ``F`` of the paper."""
+
+    label: str
+    time: np.datetime64
+    east_m: float
+    north_m: float
+    up_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Baseline:
+    """A closed-form model beside the ray tracing, with its own best offset.
+
+    Parameters
+    ----------
+    name : str
+        Key in ``metrics.json``: ``"free_space"``, ``"two_ray"``.
+    level_dbm : (n,)
+        Received power at the samples of the panel.
+    offset_db, rmse_db : float
+        Best offset of the measurement against this model, and what it leaves.
+    """
+
+    name: str
+    level_dbm: FloatArray
+    offset_db: float
+    rmse_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Variant:
+    """Another way to simulate the same panel, as a row of one table: iso arrays, measured patterns, with trees ...
+
+    ``fitted`` names what was fitted, and on which flight.
+    """
+
+    name: str
+    offset_db: float
+    rmse_db: float
+    rmse_ci95_db: Interval | None = None
+    fitted: str = "offset, on this flight"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ChannelPair:
+    """Difference of two channels of one tower over the same instants.
+
+    Parameters
+    ----------
+    tower, first, second : str
+    time, difference_db : (n,)
+        First minus second, after each one's offset; NaN where one has no signal.
+    simulated_difference_db : (n,), optional
+        The same from the simulation.
+    apart : tuple of ErrorSpan
+        Where they part by more than ``limit_db``.
+    """
+
+    tower: str
+    first: str
+    second: str
+    time: AnyArray
+    difference_db: FloatArray
+    simulated_difference_db: FloatArray | None = None
+    limit_db: float = 10.0
+    apart: tuple[ErrorSpan, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OffsetCurve:
+    """RMSE [dB] against candidate offset [dB], both (m,)."""
+
+    offset_db: FloatArray
+    rmse_db: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ErrorSpan:
+    """A stretch of the flight with a large error: when, where, how much, and the likely cause."""
+
+    start: np.datetime64
+    end: np.datetime64
+    east_m: float
+    north_m: float
+    up_m: float
+    mean_error_db: float
+    cause: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssPanel:
+    """RSS of one tower and channel, measured against simulated.
+
+    Parameters
+    ----------
+    tower, channel : str
+        Together unique in a report.
+    unit : str
+        Of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
+    time : (n,) datetime64[ns]
+        Instants of the samples, in order.
+    measured_db : (n,)
+        As logged, before the offset; NaN where the log has no signal.
+    simulated_dbm : (n,)
+        Ray tracing; NaN where no path was found.
+    measured_out_of_coverage, simulated_out_of_coverage : (n,) bool
+        ``Z`` in the plots.
+    offset_db, rmse_db, correlation : float
+        Offset added to the measurement, what it leaves, Pearson correlation.
+    n, n_out_of_coverage : int
+        Pairs compared, and samples left out because one side has no signal.
+    at_search_edge : bool
+        The best offset lies at the end of the searched span: not a result.
+    rmse_ci95_db, offset_ci95_db, correlation_ci95 : (low, high), optional
+        95 % intervals.
+    n_effective : float
+        Sample size after autocorrelation; NaN when not estimated.
+    lag_s, lag_verdict : float, str
+        Radio clock minus telemetry clock as estimated, and ``"ok"``, ``"ambiguous"``, ``"failed"`` or ``""``.
+    fitted : tuple of str
+        Names of the numbers that were fitted on the very data they are scored on.
+    geometry : mapping
+        Keys of :data:`GEOMETRY` to arrays (n,), for the residual plots.
+    line_of_sight : (n,) bool, optional
+        For the residual plots.
+    variants : tuple of Variant
+        Other simulations of the same samples, for one table of RMSE.
+    extra : mapping
+        More numbers for ``metrics.json`` and the table of this panel.
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    time: AnyArray
+    measured_db: FloatArray
+    simulated_dbm: FloatArray
+    measured_out_of_coverage: BoolArray
+    simulated_out_of_coverage: BoolArray
+    offset_db: float
+    rmse_db: float
+    correlation: float
+    n: int
+    n_out_of_coverage: int
+    at_search_edge: bool = False
+    rmse_ci95_db: Interval | None = None
+    offset_ci95_db: Interval | None = None
+    correlation_ci95: Interval | None = None
+    n_effective: float = float("nan")
+    lag_s: float = float("nan")
+    lag_verdict: str = ""
+    fitted: tuple[str, ...] = ("offset",)
+    baselines: tuple[Baseline, ...] = ()
+    offset_curve: OffsetCurve | None = None
+    east_m: FloatArray | None = None
+    north_m: FloatArray | None = None
+    up_m: FloatArray | None = None
+    geometry: Mapping[str, FloatArray] = field(default_factory=dict)
+    line_of_sight: BoolArray | None = None
+    worst: tuple[ErrorSpan, ...] = ()
+    variants: tuple[Variant, ...] = ()
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        """Tower and channel as one label."""
+        return f"{self.tower} {self.channel}".strip()
+
+    @property
+    def calibrated_db(self) -> FloatArray:
+        """Measurement plus offset (n,), comparable with ``simulated_dbm``."""
+        return self.measured_db + self.offset_db
+
+    @property
+    def residual_db(self) -> FloatArray:
+        """Calibrated measurement minus simulation (n,); NaN where a side is missing."""
+        return self.calibrated_db - self.simulated_dbm
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Histogram:
+    """Shares of rank 1 to 4, each (4,); they sum to 1 over the samples in coverage. Intervals are 95 %."""
+
+    share: FloatArray
+    low: FloatArray | None = None
+    high: FloatArray | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankAtK:
+    """Simulated rank for one threshold K, against the measured rank.
+
+    Parameters
+    ----------
+    k : float
+        Singular values above ``sigma_1 / k`` count.
+    rank : (n,) int
+        At the samples of the panel; 0 = no path (out of coverage).
+    histogram : Histogram
+    n_out_of_coverage : int
+    agreement, total_variation, wasserstein, kappa : float
+    agreement_ci95, total_variation_ci95 : (low, high), optional
+    p_value : float
+        Permutation test of equal distributions; NaN when not done.
+    confusion : (4, 5) int, optional
+        Rows: measured rank 1 to 4. Columns: simulated rank 0 (Z) to 4.
+    """
+
+    k: float
+    rank: IntArray
+    histogram: Histogram
+    n_out_of_coverage: int
+    agreement: float
+    total_variation: float
+    wasserstein: float
+    kappa: float = float("nan")
+    agreement_ci95: Interval | None = None
+    total_variation_ci95: Interval | None = None
+    p_value: float = float("nan")
+    confusion: IntArray | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KCurve:
+    """Agreement and total variation against continuous K, each (m,)."""
+
+    k: FloatArray
+    agreement: FloatArray
+    total_variation: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankPanel:
+    """Rank of one tower: what the modem reported against what each K says.
+
+    Parameters
+    ----------
+    tower : str
+    time : (n,) datetime64[ns]
+    east_m, north_m, up_m : (n,)
+    measured : (n,) float
+        NaN = no CSI, never 0.
+    histogram : Histogram
+        Of the measured rank.
+    simulated : tuple of RankAtK
+        In rising K.
+    best_k, best_k_ci95 : float, (low, high)
+        K of the best agreement or distance, as the comparison defines it.
+    curve : KCurve, optional
+    singular_ratio_db : (n, 3), optional
+        20 log10 (sigma_i / sigma_1), i = 2, 3, 4; shows why a rank is what it is.
+    sinr_db : (n,), optional
+    stale : (n,) bool, optional
+        RI held constant between reports.
+    """
+
+    tower: str
+    time: AnyArray
+    east_m: FloatArray
+    north_m: FloatArray
+    up_m: FloatArray
+    measured: FloatArray
+    histogram: Histogram
+    simulated: tuple[RankAtK, ...] = ()
+    best_k: float = float("nan")
+    best_k_ci95: Interval | None = None
+    curve: KCurve | None = None
+    singular_ratio_db: FloatArray | None = None
+    sinr_db: FloatArray | None = None
+    stale: BoolArray | None = None
+    extra: Mapping[str, Any] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Audit:
+    """The engine checked against another one on a spread of links."""
+
+    reference: str
+    links: int
+    missing_paths: int
+    extra_paths: int
+    rss_max_error_db: float
+    rank_disagreement: Mapping[float, float] = field(default_factory=dict)
+    seconds: float = float("nan")
+    reference_seconds: float = float("nan")
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Engine:
+    """Which engine replayed the flight, at what price, what it left out, and its audit."""
+
+    engine: str
+    links: int
+    seconds: float
+    paths: int | None = None
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    audit: Audit | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class SpeedRow:
+    """One row of speed against error; errors are against ``reference`` rows of the same run."""
+
+    engine: str
+    samples: int | None
+    arrays: str
+    depth: int
+    seconds: float
+    links_per_s: float
+    peak_mib: float = float("nan")
+    missing_paths: int | None = None
+    extra_paths: int | None = None
+    rss_max_error_db: float = float("nan")
+    rss_rms_error_db: float = float("nan")
+    rank_disagreement: Mapping[float, float] = field(default_factory=dict)
+    thinning: int = 1
+    reference: bool = False
+
+    @property
+    def samples_label(self) -> str:
+        """Samples per source as ``1e6``; empty for an engine without samples."""
+        return "" if self.samples is None else f"{self.samples:.0e}".replace("e+0", "e").replace("e+", "e")
+
+    @property
+    def family(self) -> str:
+        """The setting but for the number of samples."""
+        thin = "" if self.thinning == 1 else f", 1 pose in {self.thinning}"
+        return f"{self.engine}, {self.arrays}, depth {self.depth}{thin}"
+
+    @property
+    def label(self) -> str:
+        """Name of the row."""
+        return self.family.replace(",", f" {self.samples_label},", 1) if self.samples_label else self.family
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReportData:
+    """Everything a report shows.
+
+    Parameters
+    ----------
+    title, flight : str
+        Headline, and the short name that is the folder's name too.
+    site : Site
+    generated : str
+        UTC, ISO 8601.
+    versions : mapping of str to str
+    inputs : tuple of InputFile
+    track, waypoints, rss, rank, pairs, engine, speed
+        See their classes.
+    synthetic : bool
+        The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
+    warnings : tuple of str
+        What the reader must know before believing a number, one sentence each.
+    notes : tuple of str
+        Remarks for the end of the report.
+    settings : mapping
+        The checked flight.yaml, nested mappings of plain values.
+    stages_s : mapping of str to float
+        Seconds per named stage.
+    extra_metrics : mapping
+        Merged into ``metrics.json`` last, key by key.
+    """
+
+    title: str
+    flight: str
+    site: Site
+    generated: str
+    versions: Mapping[str, str] = field(default_factory=dict)
+    inputs: tuple[InputFile, ...] = ()
+    track: Track | None = None
+    waypoints: tuple[Waypoint, ...] = ()
+    rss: tuple[RssPanel, ...] = ()
+    rank: tuple[RankPanel, ...] = ()
+    pairs: tuple[ChannelPair, ...] = ()
+    engine: Engine | None = None
+    speed: tuple[SpeedRow, ...] = ()
+    synthetic: bool = False
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    extra_metrics: Mapping[str, Any] = field(default_factory=dict)

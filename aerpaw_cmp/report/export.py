@@ -1,0 +1,381 @@
+"""metrics.json, rss.csv, rank.csv and the whole folder, each file written beside its place and moved there."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import re
+import tempfile
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+RSS_COLUMNS: dict[str, str] = {
+    "time_utc": "instant of the sample, ISO 8601, UTC",
+    "tower": "name of the tower",
+    "channel": "name of the channel",
+    "unit": "unit of measured_db",
+    "east_m": "UAV position, metres east of the site origin",
+    "north_m": "metres north",
+    "up_m": "metres above the ground at the origin",
+    "measured_db": "as logged; empty: no signal",
+    "calibrated_db": "measured_db plus the offset of this tower and channel",
+    "simulated_dbm": "ray tracing; empty: no path",
+    "residual_db": "calibrated_db minus simulated_dbm",
+    "measured_out_of_coverage": "1: the log has no signal here",
+    "simulated_out_of_coverage": "1: the ray tracing has no path here",
+}
+"""Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline."""
+
+RANK_COLUMNS: dict[str, str] = {
+    "time_utc": "instant of the report, ISO 8601, UTC",
+    "tower": "name of the tower",
+    "east_m": "UAV position, metres east of the site origin",
+    "north_m": "metres north",
+    "up_m": "metres above the ground at the origin",
+    "measured_rank": "reported rank 1 to 4; empty: no CSI",
+}
+"""Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path)."""
+
+_DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
+
+
+def k_key(k: float) -> str:
+    """K as a key of metrics.json and of rank.csv.
+
+    Examples
+    --------
+    >>> k_key(1000.0), k_key(12.5)
+    ('1000', '12.5')
+    """
+    return f"{k:.10g}"
+
+
+def json_safe(value: Any) -> Any:
+    """A copy that JSON can hold: NaN and infinity become None, arrays become lists, keys become strings.
+
+    Examples
+    --------
+    >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
+    {'rmse_db': None, '10': [1, 2]}
+    """
+    if isinstance(value, Mapping):
+        return {k_key(key) if isinstance(key, float) else str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return json_safe(value.tolist() if value.dtype.kind != "M" else value.astype(str).tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        number = float(value)
+        return number if math.isfinite(number) else None
+    return value if value is None else str(value)
+
+
+def metrics(data: ReportData) -> dict[str, Any]:
+    """The numbers of a report under their stable names; plain JSON values only.
+
+    Keys keep one order: that of the report. ``extra_metrics`` of the data is merged in last, key by key.
+    """
+    rss: dict[str, dict[str, Any]] = {}
+    for panel in data.rss:
+        rss.setdefault(panel.tower, {})[panel.channel] = _rss_metrics(panel)
+    result: dict[str, Any] = {
+        "flight": data.flight,
+        "title": data.title,
+        "generated": data.generated,
+        "synthetic": data.synthetic,
+        "site": {"name": data.site.name, "illustrative": data.site.illustrative},
+        "versions": dict(sorted(data.versions.items())),
+        "inputs": [
+            {
+                "path": f.path,
+                "sha256": f.sha256,
+                "reader": f.reader,
+                "lines": f.lines,
+                "accepted": f.accepted,
+                "rejected": f.rejected,
+                "blank": f.blank,
+                "warnings": list(f.warnings),
+            }
+            for f in data.inputs
+        ],
+        "rss": rss,
+        "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},
+        "rt": None if data.engine is None else _engine_metrics(data.engine),
+        "speed": [_speed_metrics(row) for row in data.speed],
+        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        "warnings": list(data.warnings),
+    }
+    safe: dict[str, Any] = json_safe(result)
+    merge(safe, json_safe(data.extra_metrics))
+    return safe
+
+
+def _interval(value: Interval | None) -> list[float] | None:
+    return None if value is None else [value[0], value[1]]
+
+
+def _rss_metrics(panel: RssPanel) -> dict[str, Any]:
+    return {
+        "offset_db": panel.offset_db,
+        "rmse_db": panel.rmse_db,
+        "n": panel.n,
+        "n_out_of_coverage": panel.n_out_of_coverage,
+        "at_search_edge": panel.at_search_edge,
+        "correlation": panel.correlation,
+        "rmse_ci95_db": _interval(panel.rmse_ci95_db),
+        "offset_ci95_db": _interval(panel.offset_ci95_db),
+        "correlation_ci95": _interval(panel.correlation_ci95),
+        "n_effective": panel.n_effective,
+        "lag_s": panel.lag_s,
+        "lag_verdict": panel.lag_verdict,
+        "unit": panel.unit,
+        "fitted": list(panel.fitted),
+        "baselines": {b.name: {"offset_db": b.offset_db, "rmse_db": b.rmse_db} for b in panel.baselines},
+        "variants": {
+            v.name: {"offset_db": v.offset_db, "rmse_db": v.rmse_db, "fitted": v.fitted} for v in panel.variants
+        },
+        **panel.extra,
+    }
+
+
+def _histogram(histogram: Histogram) -> dict[str, Any]:
+    result: dict[str, Any] = {"histogram": dict(zip(map(str, RANKS), histogram.share, strict=True))}
+    if histogram.low is not None and histogram.high is not None:
+        pairs = zip(histogram.low, histogram.high, strict=True)
+        result["histogram_ci95"] = {str(r): [low, high] for r, (low, high) in zip(RANKS, pairs, strict=True)}
+    return result
+
+
+def _rank_metrics(panel: RankPanel) -> dict[str, Any]:
+    simulated = {
+        k_key(at.k): {
+            **_histogram(at.histogram),
+            "out_of_coverage": at.n_out_of_coverage,
+            "agreement": at.agreement,
+            "agreement_ci95": _interval(at.agreement_ci95),
+            "kappa": at.kappa,
+            "total_variation": at.total_variation,
+            "total_variation_ci95": _interval(at.total_variation_ci95),
+            "wasserstein": at.wasserstein,
+            "p_value": at.p_value,
+            "confusion": at.confusion,
+        }
+        for at in panel.simulated
+    }
+    return {
+        "measured": {
+            **_histogram(panel.histogram),
+            "n": int(np.isfinite(panel.measured).sum()),
+            "n_no_csi": int((~np.isfinite(panel.measured)).sum()),
+        },
+        "simulated": simulated,
+        "best_k": panel.best_k,
+        "best_k_ci95": _interval(panel.best_k_ci95),
+        **panel.extra,
+    }
+
+
+def _engine_metrics(engine: Engine) -> dict[str, Any]:
+    audit = engine.audit
+    return {
+        "engine": engine.engine,
+        "links": engine.links,
+        "seconds": engine.seconds,
+        "paths": engine.paths,
+        "left_out": list(engine.left_out),
+        "audit": None
+        if audit is None
+        else {
+            "reference": audit.reference,
+            "links": audit.links,
+            "missing_paths": audit.missing_paths,
+            "extra_paths": audit.extra_paths,
+            "rss_max_error_db": audit.rss_max_error_db,
+            "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
+            "seconds": audit.seconds,
+            "reference_seconds": audit.reference_seconds,
+        },
+    }
+
+
+def _speed_metrics(row: SpeedRow) -> dict[str, Any]:
+    names = ["engine", "samples", "arrays", "depth", "thinning", "seconds", "links_per_s", "peak_mib"]
+    names += ["missing_paths", "extra_paths", "rss_max_error_db", "rss_rms_error_db"]
+    result: dict[str, Any] = {name: getattr(row, name) for name in names}
+    result["rank_disagreement"] = {k_key(k): v for k, v in row.rank_disagreement.items()}
+    return result
+
+
+def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
+    """Put ``other`` into ``into``, key by key; what is only in ``into`` stays."""
+    for key, value in other.items():
+        if isinstance(value, Mapping) and isinstance(into.get(key), dict):
+            merge(into[key], value)
+        else:
+            into[key] = value
+
+
+def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
+    """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
+    import pandas as pd
+
+    panels = list(panels)
+    names = list(dict.fromkeys(b.name for panel in panels for b in panel.baselines))
+    frames = []
+    for panel in panels:
+        n = len(panel.time)
+        nowhere = np.full(n, np.nan)
+        columns: dict[str, Any] = {
+            "time_utc": iso_time(panel.time),
+            "tower": panel.tower,
+            "channel": panel.channel,
+            "unit": panel.unit,
+            "east_m": nowhere if panel.east_m is None else panel.east_m,
+            "north_m": nowhere if panel.north_m is None else panel.north_m,
+            "up_m": nowhere if panel.up_m is None else panel.up_m,
+            "measured_db": panel.measured_db,
+            "calibrated_db": panel.calibrated_db,
+            "simulated_dbm": panel.simulated_dbm,
+            "residual_db": panel.residual_db,
+            "measured_out_of_coverage": panel.measured_out_of_coverage.astype(int),
+            "simulated_out_of_coverage": panel.simulated_out_of_coverage.astype(int),
+        }
+        levels = {b.name: b.level_dbm for b in panel.baselines}
+        columns.update({f"{name}_dbm": levels.get(name, nowhere) for name in names})
+        frames.append(pd.DataFrame(columns, index=range(n)))
+    return _stacked(frames, RSS_COLUMNS)
+
+
+def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
+    """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
+    import pandas as pd
+
+    def integers(values: Any) -> Any:
+        return pd.Series(values, dtype="float64").astype("Int64")  # NaN becomes an empty cell, 2.0 becomes 2
+
+    panels = list(panels)
+    ks = sorted({at.k for panel in panels for at in panel.simulated})
+    frames = []
+    for panel in panels:
+        columns: dict[str, Any] = {
+            "time_utc": iso_time(panel.time),
+            "tower": panel.tower,
+            "east_m": panel.east_m,
+            "north_m": panel.north_m,
+            "up_m": panel.up_m,
+            "measured_rank": integers(panel.measured),
+        }
+        ranks = {at.k: at.rank for at in panel.simulated}
+        for k in ks:
+            columns[f"simulated_rank_k{k_key(k)}"] = integers(ranks.get(k, np.full(len(panel.time), np.nan)))
+        frames.append(pd.DataFrame(columns, index=range(len(panel.time))))
+    return _stacked(frames, RANK_COLUMNS)
+
+
+def _stacked(frames: list[pd.DataFrame], columns: Iterable[str]) -> pd.DataFrame:
+    """Frames below each other, rounded; without any, the bare columns."""
+    import pandas as pd
+
+    table: pd.DataFrame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+    rounded: pd.DataFrame = table.round(_DECIMALS)
+    return rounded
+
+
+def iso_time(time: Any) -> Any:
+    """Instants as ISO 8601 text with milliseconds and ``Z``; empty where not a time."""
+    instants = np.asarray(time, dtype="datetime64[ns]")
+    # half a unit added: numpy truncates, and a stored 0.9999999 s must not lose a millisecond
+    text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
+    return np.where(np.isnat(instants), "", text)
+
+
+def safe_name(text: str) -> str:
+    """A part of a file name from any text.
+
+    Examples
+    --------
+    >>> safe_name("LW1 USRP1"), safe_name("../a b"), safe_name("")
+    ('LW1_USRP1', 'a_b', '_')
+    """
+    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
+
+
+def write_atomic(path: Path, content: str | bytes) -> Path:
+    """Write a file so that a reader sees the old one or the new one, never a part."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:40]}.", dir=path.parent)
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            stream.write(content.encode("utf-8") if isinstance(content, str) else content)
+        Path(temporary).chmod(0o644)  # mkstemp makes files private
+        Path(temporary).replace(path)
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+    return path
+
+
+_OWN_FIGURES = re.compile(
+    r"(trajectory|altitude|speed_against_error"
+    r"|(rss|rss_check|rss_residual|rss_angles|pair|rank_(map|histogram|time|confusion|k))_[A-Za-z0-9._-]+)\.(svg|png)"
+)
+
+
+def remove_stale(folder: Path, kept: set[str]) -> None:
+    """Remove figures of an earlier report that this one no longer has; other files are left alone."""
+    for path in folder.glob("*"):
+        if path.name not in kept and _OWN_FIGURES.fullmatch(path.name):
+            path.unlink()
+
+
+def write_report(data: ReportData, folder: str | Path) -> list[Path]:
+    """Write the whole report.
+
+    Parameters
+    ----------
+    data : ReportData
+    folder : path
+        Made when missing. Files of an earlier report with the same names are replaced.
+
+    Returns
+    -------
+    list of Path
+        ``report.html`` first, then ``metrics.json``, the CSVs (header only when they have no rows), the figures.
+
+    Raises
+    ------
+    OSError
+        If the folder cannot be written.
+    """
+    from . import figures, html
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    written = [write_atomic(folder / "metrics.json", numbers)]
+    for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
+        # written even without rows, so that the table of an earlier report never stands beside this one
+        written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))
+    drawn = []
+    for plate in figures.plates(data):
+        picture = figures.render(plate)
+        drawn.append(picture)
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    remove_stale(folder / "figures", {path.name for path in written})
+    files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
+    page = write_atomic(folder / "report.html", html.page(data, drawn, files))
+    return [page, *written]

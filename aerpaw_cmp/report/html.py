@@ -1,0 +1,121 @@
+"""report.html: one file that needs nothing else, no network, no script.
+
+Figures stand inside the page as SVG data. Every text that comes from a log or a configuration is escaped by the
+template engine.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from functools import cache
+from typing import Any
+
+from . import words
+from .data import RANKS, ReportData
+from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
+from .figures import Picture
+
+REJECTED_SHOWN = 20
+"""Rejected lines shown per file; the flight file holds all."""
+
+CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'none'"
+"""Lets a browser refuse whatever would be loaded from elsewhere, should a hostile log ever get past the escaping."""
+
+
+def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
+    """A number for a table; an en dash where there is none.
+
+    Examples
+    --------
+    >>> number(-3.14159, 2), number(float("nan"))
+    ('−3.14', '–')
+    """
+    if value is None or not math.isfinite(value):
+        return "–"
+    text = f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
+    return f"{text}\u202f{unit}" if unit else text
+
+
+def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
+    """An interval as ``[low, high]``, or nothing."""
+    if value is None or not all(map(math.isfinite, value)):
+        return ""
+    return f"[{number(value[0], decimals)}, {number(value[1], decimals)}]"
+
+
+def percent(share: float | None, decimals: int = 0) -> str:
+    """A share as a percentage; an en dash where there is none."""
+    return number(None if share is None else 100 * share, decimals, "%")
+
+
+def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
+    """Nested settings as dotted names and plain text."""
+    for key, value in settings.items():
+        name = f"{above}.{key}" if above else str(key)
+        if isinstance(value, Mapping):
+            yield from flat(value, name)
+        else:
+            yield name, ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+
+
+def data_uri(svg: bytes) -> str:
+    """An SVG as an address that holds the picture itself.
+
+    An ``img`` keeps the identifiers of one figure apart from those of the next, which inline SVG would mix up.
+    """
+    return "data:image/svg+xml;base64," + base64.b64encode(svg).decode("ascii")
+
+
+@cache
+def environment() -> Any:
+    """The template engine: everything escaped, an undefined name is an error."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined
+
+    environment = Environment(
+        loader=PackageLoader("aerpaw_cmp.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(
+        num=number, interval=interval, percent=percent, data_uri=data_uri, k=k_key, flat=lambda s: list(flat(s)),
+        clock=lambda t: str(iso_time([t])[0])[11:19],
+    )  # fmt: skip
+    return environment
+
+
+def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+    """The whole page.
+
+    Parameters
+    ----------
+    data : ReportData
+    pictures : sequence of Picture
+        Drawn plates; each stands in its section.
+    files : sequence of str
+        Names of the files beside the page.
+    """
+    sections: dict[str, list[Picture]] = {}
+    for picture in pictures:
+        sections.setdefault(picture.section, []).append(picture)
+    template = environment().get_template("report.html.jinja")
+    text: str = template.render(
+        data=data,
+        sections=sections,
+        files=files,
+        ranks=RANKS,
+        headline=words.headline(data),
+        verdicts=words.verdicts(data),
+        warnings=words.warnings(data),
+        baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
+        speed_ks=sorted({k for row in data.speed for k in row.rank_disagreement}),
+        rss_columns=RSS_COLUMNS,
+        rank_columns=RANK_COLUMNS,
+        rejected_shown=REJECTED_SHOWN,
+        pretty=words.pretty,
+        content_policy=CONTENT_POLICY,
+    )
+    return text

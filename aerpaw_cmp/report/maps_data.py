@@ -1,0 +1,145 @@
+"""What the page of the `map` job is made of: finished maps and tables, nothing to be computed.
+
+All maps of a page lie on one grid. Row 0 is the south, column 0 the west. A position without any path ("Z") is NaN
+in a map of levels and 0 in a map of ranks.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..site.site import Site
+from ..units import FloatArray, IntArray
+from .data import Interval
+
+JOINT = "joint"
+"""Name of the map in which the nearest tower serves."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssMap:
+    """RSS [dBm] of one tower, or of the nearest tower (``tower="joint"``), at one height.
+
+    ``rss_dbm`` (rows, columns) with NaN for Z; ``coverage`` is the share of positions with a path.
+    """
+
+    tower: str
+    antennas: str
+    altitude_m: float
+    rss_dbm: FloatArray
+    coverage: float
+    foliage: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankMap:
+    """Rank (rows, columns) for one K at one height, 0 for Z; ``share`` (5,) of Z and rank 1 to 4."""
+
+    k: float
+    altitude_m: float
+    rank: IntArray
+    share: FloatArray
+    foliage: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Layer:
+    """Any further quantity (rows, columns) at one height; ``difference`` asks for a scale around zero."""
+
+    name: str
+    label: str
+    altitude_m: float
+    values: FloatArray
+    difference: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Correlation:
+    """Correlation against distance, each (bins,), and a fitted model on its own distances."""
+
+    title: str
+    distance_m: FloatArray
+    correlation: FloatArray
+    fit_distance_m: FloatArray | None = None
+    fit: FloatArray | None = None
+    fit_label: str = ""
+    excluded: int = 0
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapError:
+    """Mean absolute error of one method for one K and height, under one way of evaluation.
+
+    ``evaluation`` is e.g. ``"leave one out"``, ``"blocks"``, ``"altitude held out"``, ``"along a flight"``.
+    """
+
+    evaluation: str
+    method: str
+    k: float
+    altitude_m: float
+    mae: float
+    n: int
+    mae_ci95: Interval | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LearningCurve:
+    """MAE of a method against the number of samples it was given, each (m,)."""
+
+    method: str
+    samples: IntArray
+    mae: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PaperRow:
+    """A number that the paper states, beside ours, and where to see it."""
+
+    where: str
+    what: str
+    paper: str
+    ours: str
+    plate: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapsData:
+    """Everything the page of a `map` job shows.
+
+    Parameters
+    ----------
+    title, name : str
+        Headline and short name.
+    site : Site
+    generated : str
+        UTC, ISO 8601.
+    east_m, north_m : (columns,), (rows,)
+        Centres of the cells [m].
+    borders_m : tuple of (2, 2) arrays
+        Lines between the areas of two towers (Voronoi), east and north [m].
+    metrics : mapping
+        Written to ``metrics.json`` after the tables of this page.
+    """
+
+    title: str
+    name: str
+    site: Site
+    generated: str
+    east_m: FloatArray
+    north_m: FloatArray
+    borders_m: tuple[FloatArray, ...] = ()
+    rss: tuple[RssMap, ...] = ()
+    rank: tuple[RankMap, ...] = ()
+    layers: tuple[Layer, ...] = ()
+    correlation: tuple[Correlation, ...] = ()
+    errors: tuple[MapError, ...] = ()
+    learning: tuple[LearningCurve, ...] = ()
+    paper: tuple[PaperRow, ...] = ()
+    warnings: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()
+    versions: Mapping[str, str] = field(default_factory=dict)
+    settings: Mapping[str, Any] = field(default_factory=dict)
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    metrics: Mapping[str, Any] = field(default_factory=dict)

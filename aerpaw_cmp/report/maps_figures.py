@@ -1,0 +1,415 @@
+"""Figures of the `map` job: RSS and rank over the grid, distributions, correlation, errors of interpolation."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from typing import TYPE_CHECKING, Any, TypeVar
+
+import numpy as np
+
+from ..site.site import Site
+from ..units import FloatArray
+from .data import RANKS
+from .export import k_key, safe_name
+from .figures import RANK_HATCH, TOWER, Plate, colour_bar, figure, rank_colour, spread_out
+from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+T = TypeVar("T")
+LINES = ("-", (0, (5, 2)), (0, (1, 1.3)), (0, (6, 2, 1, 2)), (0, (8, 3)), (0, (3, 1, 1, 1, 1, 1)))
+MARKERS = "os^Dv<>P"
+COLOURS = ("#111111", "#D55E00", "#0072B2", "#009E73", "#CC79A7", "#56B4E9")
+MISSING: dict[str, Any] = {"facecolor": "#F2F2F2", "edgecolor": "#888888", "hatch": "//////", "linewidth": 0.0}
+COLUMNS = 6
+"""Maps side by side, at most."""
+
+
+def grouped(items: Iterable[T], key: Callable[[T], Any]) -> dict[Any, list[T]]:
+    """Items under their keys, in the order of first appearance."""
+    result: dict[Any, list[T]] = {}
+    for item in items:
+        result.setdefault(key(item), []).append(item)
+    return result
+
+
+# --- one map ------------------------------------------------------------------------------------
+
+
+def extent_m(data: MapsData) -> tuple[float, float, float, float]:
+    """Outer edges of the grid: west, east, south, north [m]."""
+    half_east = (data.east_m[1] - data.east_m[0]) / 2 if len(data.east_m) > 1 else 15.0
+    half_north = (data.north_m[1] - data.north_m[0]) / 2 if len(data.north_m) > 1 else 15.0
+    return (
+        float(data.east_m[0] - half_east),
+        float(data.east_m[-1] + half_east),
+        float(data.north_m[0] - half_north),
+        float(data.north_m[-1] + half_north),
+    )
+
+
+def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
+    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers."""
+    ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
+    image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
+    draw_overlay(ax, data.site, highlight)
+    for line in data.borders_m if highlight is None else ():
+        ax.plot(line[:, 0], line[:, 1], color="white", linewidth=1.8, zorder=3)
+        ax.plot(line[:, 0], line[:, 1], color="black", linewidth=0.9, linestyle=(0, (4, 2)), zorder=3.1)
+    west, east, south, north = extent_m(data)
+    ax.set_xlim(west, east)
+    ax.set_ylim(south, north)
+    ax.set_aspect("equal", adjustable="box")
+    ax.grid(visible=False)
+    ax.tick_params(labelsize=7)
+    ax.locator_params(axis="x", nbins=4)
+    return image
+
+
+def draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
+    """Outlines of buildings and forests, and the towers; only the named tower when one is named."""
+    for forest in site.forests:
+        outline = np.asarray(forest.area.exterior.coords)
+        ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
+        ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
+    for building in site.buildings:
+        outline = np.asarray(building.footprint.exterior.coords)
+        ax.fill(outline[:, 0], outline[:, 1], facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2)
+    for name, tower in site.towers.items():
+        if highlight is None or name == highlight:
+            ax.plot(
+                tower.east_m, tower.north_m, marker="^", markersize=7, color=TOWER, markeredgecolor="white",
+                linestyle="none", zorder=5,
+            )  # fmt: skip
+
+
+def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
+    """Legend entries of what :func:`draw_map` draws."""
+    from matplotlib.lines import Line2D
+    from matplotlib.patches import Patch
+
+    invented = " (illustrative)" if data.site.illustrative else ""
+    entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
+    entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
+    if data.site.buildings:
+        entries.append(Patch(facecolor="white", edgecolor="black", label=f"building{invented}"))
+    if data.site.forests:
+        entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label=f"forest{invented}"))
+    if borders and data.borders_m:
+        entries.append(Line2D([], [], color="black", linestyle=(0, (4, 2)), label="border of the towers' areas"))
+    return entries
+
+
+def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
+    """A figure with room for ``count`` maps and a legend, outer axes labelled."""
+    west, east, south, north = extent_m(data)
+    columns = min(count, COLUMNS)
+    rows = -(-count // columns)
+    columns = -(-count // rows)
+    width = min(7.4 / columns, 3.2)  # what a colour bar and the labels leave
+    height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
+    fig = figure((9.2, rows * (height + 0.35) + 1.0))
+    grid = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
+    axes: list[Axes] = list(grid.ravel())
+    for ax in axes[count:]:
+        ax.set_visible(False)
+    for row in grid:
+        row[0].set_ylabel("North [m]")
+    for number in range(count):
+        if number + columns >= count:
+            axes[number].set_xlabel("East [m]")
+            axes[number].tick_params(labelbottom=True)
+    return fig, axes[:count]
+
+
+# --- figures ------------------------------------------------------------------------------------
+
+
+def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]) -> Figure:
+    """Each tower alone and all jointly, for one antenna choice and height, on one colour scale [dBm]."""
+    fig, axes = map_axes(data, len(maps))
+    image = None
+    for ax, one in zip(axes, maps, strict=True):
+        alone = None if one.tower == JOINT else one.tower
+        image = draw_map(ax, data, one.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
+        ax.set_title(f"{one.tower}: {100 * one.coverage:.0f} %", fontsize=9)
+    colour_bar(fig, image, axes, "RSS [dBm]")
+    entries = overlay_legend(data, borders=any(one.tower == JOINT for one in maps))
+    fig.legend(handles=entries, loc="outside lower center", ncols=3)
+    return fig
+
+
+def rank_grid(data: MapsData, maps: Sequence[RankMap]) -> Figure:
+    """Rank at every height for one K."""
+    from matplotlib.colors import BoundaryNorm, ListedColormap
+    from matplotlib.patches import Patch
+
+    fig, axes = map_axes(data, len(maps))
+    colours = ListedColormap([rank_colour(r) for r in RANKS])
+    norm = BoundaryNorm([0.5, 1.5, 2.5, 3.5, 4.5], 4)
+    for ax, one in zip(axes, maps, strict=True):
+        draw_map(ax, data, np.where(one.rank > 0, one.rank, np.nan), cmap=colours, norm=norm)
+        ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
+    entries = [Patch(facecolor=rank_colour(r), edgecolor="black", label=f"rank {r}") for r in RANKS]
+    fig.legend(handles=[*entries, *overlay_legend(data, borders=True)], loc="outside lower center", ncols=5)
+    return fig
+
+
+def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
+    """One further quantity at every height, on one colour scale."""
+    fig, axes = map_axes(data, len(layers))
+    finite = np.concatenate([one.values[np.isfinite(one.values)] for one in layers])
+    low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
+    options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
+    if layers[0].difference:
+        reach = max(abs(low), abs(high), 1e-9)
+        options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
+    image = None
+    for ax, one in zip(axes, layers, strict=True):
+        image = draw_map(ax, data, one.values, **options)
+        ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
+    colour_bar(fig, image, axes, layers[0].label)
+    fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
+    return fig
+
+
+def cdfs(maps: Sequence[RssMap]) -> Figure:
+    """Distribution of RSS per tower and jointly: a panel per height, positions out of coverage counted as below."""
+    panels = grouped(maps, lambda one: one.altitude_m)
+    fig = figure((9.2, 3.4))
+    axes = fig.subplots(1, len(panels), sharey=True, sharex=True, squeeze=False)[0]
+    for ax, (height, members) in zip(axes, panels.items(), strict=True):
+        for number, one in enumerate(members):
+            level = np.sort(one.rss_dbm[np.isfinite(one.rss_dbm)])
+            missing = one.rss_dbm.size - len(level)
+            share = (missing + np.arange(1, len(level) + 1)) / one.rss_dbm.size
+            shown = spread_out(len(level), 400)  # steps of a four-hundredth cannot be seen
+            joint = one.tower == JOINT
+            ax.plot(
+                level[shown], share[shown], color=COLOURS[number % 6], linestyle=LINES[number % 6],
+                linewidth=2.0 if joint else 1.2, label=one.tower,
+            )  # fmt: skip
+        ax.set_title(f"{height:g} m")
+        ax.set_xlabel("RSS [dBm]")
+        ax.set_ylim(0, 1.0)
+    axes[0].set_ylabel("Share of positions below")
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=6)
+    return fig
+
+
+def rank_shares(maps: Sequence[RankMap]) -> Figure:
+    """Shares of Z and rank 1 to 4 against height, a panel per K."""
+    panels = grouped(maps, lambda one: one.k)
+    fig = figure((9.2, 3.4))
+    axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for ax, (k, members) in zip(axes, panels.items(), strict=True):
+        at = np.arange(len(members))
+        share = 100 * np.array([one.share for one in members])
+        below = np.zeros(len(members))
+        for column, value in enumerate((0, *RANKS)):
+            face: Any = "white" if value == 0 else rank_colour(value)
+            hatch = "//////" if value == 0 else RANK_HATCH[value]
+            ax.bar(
+                at, share[:, column], 0.82, bottom=below, color=face, linewidth=0.5, hatch=hatch,
+                edgecolor="#777777" if value in (0, 1) else "black",
+                label="Z: out of coverage" if value == 0 else f"rank {value}",
+            )  # fmt: skip
+            below = below + share[:, column]
+        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members])
+        ax.set_title(f"K = {k_key(k)}")
+        ax.set_xlabel("Height [m]")
+        ax.grid(visible=False)
+    axes[0].set_ylabel("Share of positions [%]")
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=5)
+    return fig
+
+
+def correlations(curves: Sequence[Correlation]) -> Figure:
+    """Correlation against distance and its model, a panel per kind."""
+    fig = figure((9.2, 3.2))
+    axes = fig.subplots(1, len(curves), squeeze=False)[0]
+    for ax, curve in zip(axes, curves, strict=True):
+        ax.plot(
+            curve.distance_m, curve.correlation, marker="o", markersize=5, linestyle="none", color="#0072B2",
+            label="data",
+        )  # fmt: skip
+        if curve.fit is not None and curve.fit_distance_m is not None:
+            ax.plot(curve.fit_distance_m, curve.fit, color="#111111", linewidth=1.3, label=curve.fit_label or "model")
+        ax.set_title(curve.title)
+        ax.set_xlabel("Distance [m]")
+        ax.set_ylabel("Correlation")
+        ax.legend(loc="best", fontsize=7.5)
+    return fig
+
+
+def error_curves(errors: Sequence[MapError]) -> Figure:
+    """MAE against height for every method, a panel per K."""
+    panels = grouped(errors, lambda one: one.k)
+    fig = figure((9.2, 3.4))
+    axes = fig.subplots(1, len(panels), sharey=True, squeeze=False)[0]
+    for ax, (k, members) in zip(axes, panels.items(), strict=True):
+        for number, (method, rows) in enumerate(grouped(members, lambda one: one.method).items()):
+            rows = sorted(rows, key=lambda one: one.altitude_m)
+            ax.plot(
+                [one.altitude_m for one in rows], [one.mae for one in rows], color=COLOURS[number % 6],
+                linestyle=LINES[number % 6], marker=MARKERS[number % 8], markersize=5, linewidth=1.2, label=method,
+            )  # fmt: skip
+        ax.set_title(f"K = {k_key(k)}")
+        ax.set_xlabel("Height [m]")
+    worst = max((one.mae for one in errors if np.isfinite(one.mae)), default=1.0)
+    axes[0].set_ylim(0.0, 1.08 * worst if worst > 0 else 1.0)  # shared by all panels
+    axes[0].set_ylabel("Mean absolute error of the rank")
+    handles, labels = axes[0].get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=4)
+    return fig
+
+
+def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
+    """MAE against the number of samples."""
+    fig = figure((9.2, 3.0))
+    ax = fig.subplots()
+    for number, curve in enumerate(curves):
+        ax.semilogx(
+            curve.samples, curve.mae, color=COLOURS[number % 6], linestyle=LINES[number % 6],
+            marker=MARKERS[number % 8], markersize=5, label=curve.method,
+        )  # fmt: skip
+    ax.set_ylim(bottom=0)
+    ax.set_xlabel("Number of samples")
+    ax.set_ylabel("Mean absolute error of the rank")
+    ax.legend(loc="best")
+    return fig
+
+
+# --- all plates ---------------------------------------------------------------------------------
+
+
+def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
+    """One colour scale for all maps [dBm]: the 1 to 99.5 % range, to whole 5 dB."""
+    parts = [one.rss_dbm[np.isfinite(one.rss_dbm)] for one in maps]
+    finite = np.concatenate(parts) if parts else np.zeros(0)
+    if not len(finite):
+        return -100.0, -50.0
+    low, high = np.percentile(finite, [1.0, 99.5])
+    return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
+
+
+def plates(data: MapsData) -> list[Plate]:
+    """Every figure that the data allow, in reading order."""
+    result: list[Plate] = []
+    limits = level_limits(data.rss)
+    for (antennas, foliage, height), maps in grouped(
+        data.rss, lambda one: (one.antennas, one.foliage, one.altitude_m)
+    ).items():
+        words = f"{antennas}{f', foliage {foliage}' if foliage else ''}, {height:g} m"
+        result.append(_rss_plate(data, maps, limits, words))
+    for (antennas, foliage), maps in grouped(data.rss, lambda one: (one.antennas, one.foliage)).items():
+        words = f"{antennas}{f', foliage {foliage}' if foliage else ''}"
+        result.append(
+            Plate(
+                name=f"rss_cdf_{safe_name(words)}",
+                section="rss",
+                title=f"Distribution of RSS, {words}",
+                caption="Share of positions with an RSS below the value; a curve starts at its share of Z.",
+                alt=f"Distribution functions of RSS, {words}.",
+                draw=lambda maps=maps: cdfs(maps),  # type: ignore[misc]
+            )
+        )
+    return result + _rank_plates(data) + _layer_plates(data) + _kriging_plates(data)
+
+
+def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> Plate:
+    return Plate(
+        name=f"rss_map_{safe_name(words)}",
+        section="rss",
+        title=f"RSS, {words}",
+        caption="Each tower alone and, where shown, jointly with the nearest tower serving. Percentages: positions in "
+        "coverage. One colour scale for all RSS maps.",
+        alt=f"RSS maps of {', '.join(one.tower for one in maps)}, {words}.",
+        draw=lambda: rss_maps(data, maps, limits),
+    )
+
+
+def _rank_plates(data: MapsData) -> list[Plate]:
+    result = []
+    for (k, foliage), maps in grouped(data.rank, lambda one: (one.k, one.foliage)).items():
+        words = f"K = {k_key(k)}{f', foliage {foliage}' if foliage else ''}"
+        result.append(
+            Plate(
+                name=f"rank_map_{safe_name(words)}",
+                section="rank",
+                title=f"Rank, {words}",
+                caption="The nearest tower serves. Hatched: no path.",
+                alt=f"Rank maps at {', '.join(f'{one.altitude_m:g} m' for one in maps)}, {words}.",
+                draw=lambda maps=maps: rank_grid(data, maps),  # type: ignore[misc]
+            )
+        )
+    for foliage, maps in grouped(data.rank, lambda one: one.foliage).items():
+        words = f", foliage {foliage}" if foliage else ""
+        result.append(
+            Plate(
+                name=f"rank_share{safe_name(words) if words else ''}",
+                section="rank",
+                title=f"Rank against height{words}",
+                caption="Share of positions with each rank; Z is out of coverage.",
+                alt="Stacked bars of rank shares against height for each K.",
+                draw=lambda maps=maps: rank_shares(maps),  # type: ignore[misc]
+            )
+        )
+    return result
+
+
+def _layer_plates(data: MapsData) -> list[Plate]:
+    return [
+        Plate(
+            name=f"layer_{safe_name(name)}",
+            section="layers",
+            title=name,
+            caption=f"{layers[0].label}. Hatched: no path.",
+            alt=f"Maps of {name}.",
+            draw=lambda layers=layers: layer_maps(data, layers),  # type: ignore[misc]
+        )
+        for name, layers in grouped(data.layers, lambda one: one.name).items()
+    ]
+
+
+def _kriging_plates(data: MapsData) -> list[Plate]:
+    result = []
+    if data.correlation:
+        result.append(
+            Plate(
+                name="correlation",
+                section="kriging",
+                title="Spatial correlation",
+                caption="Pearson correlation between positions against their distance, and the fitted model. "
+                + " ".join(f"{c.title}: {c.excluded} constant positions left out." for c in data.correlation),
+                alt="Correlation against distance with its model.",
+                draw=lambda: correlations(data.correlation),
+            )
+        )
+    for evaluation, errors in grouped(data.errors, lambda one: one.evaluation).items():
+        result.append(
+            Plate(
+                name=f"mae_{safe_name(evaluation)}",
+                section="kriging",
+                title=f"Error of interpolated rank, {evaluation}",
+                caption="Mean absolute error against height; lower is better.",
+                alt=f"Error against height for each method, {evaluation}.",
+                draw=lambda errors=errors: error_curves(errors),  # type: ignore[misc]
+            )
+        )
+    if data.learning:
+        result.append(
+            Plate(
+                name="learning_curve",
+                section="kriging",
+                title="How many samples are needed",
+                caption="Mean absolute error against the number of samples given.",
+                alt="Error against number of samples for each method.",
+                draw=lambda: learning_curves(data.learning),
+            )
+        )
+    return result

@@ -1,0 +1,106 @@
+"""map.html of the `map` job, with metrics.json and the figures beside it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from . import figures, maps_figures
+from .data import RANKS
+from .export import json_safe, k_key, merge, write_atomic
+from .figures import Picture
+from .html import CONTENT_POLICY, environment
+from .maps_data import MapError, MapsData
+
+
+def maps_metrics(data: MapsData) -> dict[str, Any]:
+    """The numbers of the page under stable names; ``data.metrics`` is merged in last."""
+
+    def picked(item: Any, *names: str) -> dict[str, Any]:
+        return {name: getattr(item, name) for name in names}
+
+    columns, rows = len(data.east_m), len(data.north_m)
+    result: dict[str, Any] = {
+        "name": data.name,
+        "title": data.title,
+        "generated": data.generated,
+        "site": {"name": data.site.name, "illustrative": data.site.illustrative},
+        "versions": dict(sorted(data.versions.items())),
+        "grid": {"columns": columns, "rows": rows, "positions": columns * rows},
+        "coverage": [picked(m, "tower", "antennas", "foliage", "altitude_m", "coverage") for m in data.rss],
+        "rank": [
+            {
+                **picked(m, "k", "foliage", "altitude_m"),
+                "share": dict(zip(("Z", *map(str, RANKS)), m.share, strict=True)),
+            }
+            for m in data.rank
+        ],
+        "mae": [picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
+        "paper": [picked(p, "where", "what", "paper", "ours") for p in data.paper],
+        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+        "warnings": list(data.warnings),
+    }
+    safe: dict[str, Any] = json_safe(result)
+    merge(safe, json_safe(data.metrics))
+    return safe
+
+
+def coverage_table(data: MapsData) -> tuple[list[str], list[tuple[list[str], list[float | None]]]]:
+    """Column heads (heights) and rows (antennas, foliage, tower; share per height)."""
+    heights = sorted({m.altitude_m for m in data.rss})
+    rows = []
+    for key, maps in maps_figures.grouped(data.rss, lambda m: (m.antennas, m.foliage, m.tower)).items():
+        share = {m.altitude_m: m.coverage for m in maps}
+        rows.append(([str(part) for part in key], [share.get(h) for h in heights]))
+    return [f"{h:g} m" for h in heights], rows
+
+
+def error_tables(
+    errors: Sequence[MapError],
+) -> list[tuple[str, list[str], list[tuple[str, str, list[float | None], float]]]]:
+    """Per evaluation: title, heights, and rows of (method, K, MAE per height, mean over heights)."""
+    result = []
+    for evaluation, members in maps_figures.grouped(errors, lambda e: e.evaluation).items():
+        heights = sorted({e.altitude_m for e in members})
+        rows = []
+        for (method, k), group in maps_figures.grouped(members, lambda e: (e.method, e.k)).items():
+            mae = {e.altitude_m: e.mae for e in group}
+            mean = sum(mae.values()) / len(mae)
+            rows.append((method, k_key(k), [mae.get(h) for h in heights], mean))
+        result.append((evaluation, [f"{h:g} m" for h in heights], rows))
+    return result
+
+
+def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+    """The whole page."""
+    sections: dict[str, list[Picture]] = {}
+    for picture in pictures:
+        sections.setdefault(picture.section, []).append(picture)
+    text: str = environment().get_template("map.html.jinja").render(
+        data=data,
+        sections=sections,
+        coverage=coverage_table(data),
+        errors=error_tables(data.errors),
+        names={picture.name for picture in pictures},
+        files=files,
+        content_policy=CONTENT_POLICY,
+    )  # fmt: skip
+    return text
+
+
+def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
+    """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
+    folder = Path(folder)
+    written = [
+        write_atomic(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")
+    ]
+    drawn = []
+    for plate in maps_figures.plates(data):
+        picture = figures.render(plate)
+        drawn.append(picture)
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    page = write_atomic(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
+    return [page, *written]

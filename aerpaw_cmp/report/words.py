@@ -1,0 +1,131 @@
+"""The report's sentences: what the numbers say, in plain words and without flattery."""
+
+from __future__ import annotations
+
+import math
+
+from .data import Interval, RankPanel, ReportData, RssPanel
+
+_TITLES = {"free_space": "free space", "two_ray": "two-ray ground"}
+FEW_SAMPLES = 30
+"""Below this a panel is called too short for a verdict."""
+
+
+def pretty(name: str) -> str:
+    """A baseline's name in words."""
+    return _TITLES.get(name, name.replace("_", " "))
+
+
+def _within(value: Interval | None, decimals: int = 1) -> str:
+    if value is None or not all(map(math.isfinite, value)):
+        return ""
+    return f" (95 % interval {value[0]:.{decimals}f} to {value[1]:.{decimals}f})"
+
+
+def headline(data: ReportData) -> str:
+    """One paragraph: what was compared with what."""
+    parts = []
+    if data.rss:
+        towers = list(dict.fromkeys(panel.tower for panel in data.rss))
+        samples = sum(len(panel.time) for panel in data.rss)
+        panels = "1 channel" if len(data.rss) == 1 else f"{len(data.rss)} tower channels"
+        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {samples:,} samples)")
+    if data.rank:
+        samples = sum(len(panel.time) for panel in data.rank)
+        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({samples:,} samples)")
+    if not parts:
+        return "This flight holds no radio measurement that could be compared; only its track and inputs are shown."
+    engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
+    kind = "A synthetic" if data.synthetic else "The"
+    return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
+
+
+def _listed(names: list[str]) -> str:
+    return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
+
+
+def verdicts(data: ReportData) -> list[str]:
+    """One or two sentences per panel: how well the ray tracing predicts, and against what."""
+    return [rss_verdict(panel) for panel in data.rss] + [rank_verdict(panel) for panel in data.rank]
+
+
+def rss_verdict(panel: RssPanel) -> str:
+    """How well one channel is predicted, and whether the baselines do better."""
+    if panel.n == 0 or not math.isfinite(panel.rmse_db):
+        return f"{panel.name}: nothing to score; all {len(panel.time):,} samples are out of coverage on one side."
+    text = (
+        f"{panel.name}: ray tracing misses the measurement by {panel.rmse_db:.1f} dB RMSE{_within(panel.rmse_ci95_db)} "
+        f"after an offset of {panel.offset_db:+.1f} dB"
+    )
+    scored = [b for b in panel.baselines if math.isfinite(b.rmse_db)]
+    if not scored:
+        return text + "."
+    best = min(scored, key=lambda b: b.rmse_db)
+    gain = best.rmse_db - panel.rmse_db
+    if abs(gain) < 0.05:
+        return f"{text}; {pretty(best.name)} does as well ({best.rmse_db:.1f} dB)."
+    judged = "better" if gain > 0 else "WORSE"
+    doubt = ""
+    if panel.rmse_ci95_db is not None and panel.rmse_ci95_db[0] <= best.rmse_db <= panel.rmse_ci95_db[1]:
+        doubt = ", a difference within the interval"
+    return f"{text}, {abs(gain):.1f} dB {judged} than {pretty(best.name)} ({best.rmse_db:.1f} dB){doubt}."
+
+
+def rank_verdict(panel: RankPanel) -> str:
+    """Which K comes nearest to the modem, and how near."""
+    scored = [at for at in panel.simulated if math.isfinite(at.total_variation)]
+    if not scored:
+        return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
+    best = min(scored, key=lambda at: at.total_variation)
+    agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
+    kappa = f" (kappa {best.kappa:.2f}; 0 is chance)" if math.isfinite(best.kappa) else ""
+    return (
+        f"{panel.tower} rank: of the K shown, K = {best.k:.10g} comes nearest to the reported distribution "
+        f"(total variation {best.total_variation:.2f}){agree}{kappa}."
+    )
+
+
+def warnings(data: ReportData) -> list[str]:
+    """What must be known before a number is believed; those of the data first."""
+    found = list(data.warnings)
+    if data.synthetic:
+        found.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
+    if data.site.illustrative:
+        found.append(
+            f"Buildings and forests of {data.site.name} are illustrative, not surveyed: reflections and blockage "
+            "show the method, not the place."
+        )
+    for panel in data.rss:
+        found += _rss_warnings(panel)
+    audit = None if data.engine is None else data.engine.audit
+    if data.engine is not None and audit is None:
+        found.append("The replay engine was not audited against the other engine in this report.")
+    if audit is not None and (audit.missing_paths or audit.extra_paths):
+        found.append(
+            f"The audit found {audit.missing_paths:,} paths that only the {audit.reference} engine has and "
+            f"{audit.extra_paths:,} that only the {data.engine.engine if data.engine else ''} engine has, "
+            f"on {audit.links:,} links."
+        )
+    rejected = sum(f.rejected for f in data.inputs)
+    if rejected:
+        found.append(f"{rejected:,} log lines were rejected; see the account of the inputs.")
+    return found
+
+
+def _rss_warnings(panel: RssPanel) -> list[str]:
+    found = []
+    if panel.at_search_edge:
+        found.append(
+            f"{panel.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
+            "Widen the span, and check the transmit power and the unit of the log."
+        )
+    if 0 < panel.n < FEW_SAMPLES:
+        found.append(f"{panel.name}: only {panel.n} samples were scored, too few for a verdict.")
+    if panel.n_out_of_coverage and len(panel.time) and panel.n_out_of_coverage > 0.2 * len(panel.time):
+        share = 100 * panel.n_out_of_coverage / len(panel.time)
+        found.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
+    if panel.lag_verdict in ("ambiguous", "failed"):
+        found.append(f"{panel.name}: the check of the radio clock against the telemetry clock is {panel.lag_verdict}.")
+    elif panel.lag_verdict == "ok" and abs(panel.lag_s) > 0.5:
+        found.append(f"{panel.name}: the radio clock runs {panel.lag_s:+.1f} s against the telemetry clock.")
+    return found

@@ -1,0 +1,505 @@
+"""Buildings, forests and geofences from map files: classified, projected, repaired, with a list of what was done.
+
+Heights: the ``height`` tag, else ``building:levels`` times 3 m, else a default. Overlapping buildings of one height
+become one; of different heights the higher keeps the ground. Holes stay. Slivers and duplicates go.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import shapely
+import yaml
+from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
+
+from ..errors import InputError, UsageError
+from ..geodesy import SiteFrame
+from .mapfiles import MapFile, Outline, Position, read_map_file
+from .materials import MATERIALS
+from .site import Building, Forest, Geofence
+from .siteyaml import SiteModel, site_model
+
+LEVEL_M = 3.0
+DEFAULT_HEIGHT_M = 6.0
+FOOT_M = 0.3048
+TALLEST_M = 300.0
+FAR_M = 20_000.0
+"""Outlines farther from the origin are not of this site."""
+
+SLIVER_M = 0.3
+"""Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too."""
+
+MINIMUM_AREA_M2 = 2.0
+SAME_HEIGHT_M = 0.25
+
+Kind = Literal["building", "forest", "geofence"]
+
+_FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees"))
+_MATERIAL_WORDS = {
+    "steel": "metal",
+    "aluminium": "metal",
+    "sheet": "metal",
+    "stone": "marble",
+    "timber_framing": "wood",
+}
+
+
+@dataclass(slots=True)
+class Footprints:
+    """What was found in map files, in the site frame, and what was done to it.
+
+    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``.
+    """
+
+    buildings: list[Building] = field(default_factory=list)
+    forests: list[Forest] = field(default_factory=list)
+    geofences: list[Geofence] = field(default_factory=list)
+    trees_m: list[tuple[float, float]] = field(default_factory=list)
+    actions: list[str] = field(default_factory=list)
+
+
+@dataclass(slots=True)
+class _Shape:
+    """A projected outline on its way to a record."""
+
+    name: str
+    source: str
+    area: BaseGeometry
+    height_m: float = 0.0
+    stated: bool = False
+    material: str = "concrete"
+
+
+def import_footprints(
+    files: Sequence[str | Path],
+    frame: SiteFrame,
+    *,
+    untagged: Kind | None = None,
+    default_height_m: float = DEFAULT_HEIGHT_M,
+    trees_per_hectare: float = 100.0,
+    minimum_spacing_m: float = 4.0,
+) -> Footprints:
+    """Outlines of map files as records of the site.
+
+    Parameters
+    ----------
+    files : sequence of paths
+        GeoJSON, OSM XML, Overpass JSON or KML, told by content.
+    frame : SiteFrame
+        Of the site that they belong to.
+    untagged : {"building", "forest", "geofence"}, optional
+        What areas without a known tag are. By default a KML area is a geofence and others are left out.
+    default_height_m : float
+        Of buildings without height and levels.
+    trees_per_hectare, minimum_spacing_m : float
+        Of all forests found.
+
+    Returns
+    -------
+    Footprints
+
+    Raises
+    ------
+    InputError
+        Unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
+    """
+    result = Footprints()
+    shapes: dict[Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
+    for path in files:
+        content = read_map_file(path)
+        _check_place(content, frame, Path(path))
+        skipped: Counter[str] = Counter()
+        for outline in content.outlines:
+            kind = _kind(outline, content.kind, untagged)
+            if kind is None:
+                skipped[_main_tag(outline)] += 1
+                continue
+            result.actions += [f"{outline.source}: {problem}" for problem in outline.broken]
+            shape = _project(outline, frame, result.actions)
+            if shape is not None:
+                if kind == "building":
+                    _describe(shape, outline, default_height_m, Path(path), result.actions)
+                shapes[kind].append(shape)
+        if skipped:
+            listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
+            result.actions.append(f"{Path(path).name}: left out, neither building nor forest: {listed}")
+        if content.trees:
+            east, north = frame.to_local(*np.array(content.trees).T)
+            result.trees_m += list(zip(east.tolist(), north.tolist(), strict=True))
+    _warn_of_feet(shapes["building"], result.actions)
+    _fill(result, shapes, trees_per_hectare, minimum_spacing_m)
+    if not (result.buildings or result.forests or result.geofences or result.trees_m):
+        raise InputError(
+            "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
+            cause=result.actions[-1] if result.actions else "the areas carry no tags; say what they are",
+        )
+    return result
+
+
+def _fill(
+    result: Footprints, shapes: dict[Kind, list[_Shape]], trees_per_hectare: float, minimum_spacing_m: float
+) -> None:
+    actions = result.actions
+    for name, shape, area in _parts(
+        _without_overlaps(_without_duplicates(shapes["building"], actions), actions), actions
+    ):
+        result.buildings.append(Building(name, area, round(shape.height_m, 2), 0.0, shape.material, shape.source))
+    for name, shape, area in _parts(_first_keeps(_without_duplicates(shapes["forest"], actions), actions), actions):
+        result.forests.append(Forest(name, area, trees_per_hectare, minimum_spacing_m, shape.source))
+    for name, _, area in _parts(shapes["geofence"], actions):
+        result.geofences.append(Geofence(name, area))
+
+
+# ---------------------------------------------------------------- what an outline is, and where
+
+
+def _kind(outline: Outline, file_kind: str, untagged: Kind | None) -> Kind | None:
+    tags = {key.lower(): value.lower() for key, value in outline.tags.items()}
+    if tags.get("building", tags.get("building:part", "no")) not in ("no", "", "none"):
+        return "building"
+    if any(tags.get(key) == value for key, value in _FOREST_TAGS):
+        return "forest"
+    word = tags.get("kind", tags.get("type", ""))
+    for kind in ("building", "forest", "geofence"):
+        if word == kind or (kind == "geofence" and kind in tags):
+            return kind  # type: ignore[return-value]
+    return untagged or ("geofence" if file_kind == "KML" else None)
+
+
+def _main_tag(outline: Outline) -> str:
+    for key in ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier"):
+        if key in outline.tags:
+            return f"{key}={outline.tags[key]}"
+    return "untagged"
+
+
+def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
+    """Refuses a file whose outlines all lie elsewhere, and says so when swapping would bring them here."""
+    positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer] + content.trees
+    if not positions:
+        return
+    latitude, longitude = np.array(positions).T
+    if _distance_m(latitude, longitude, frame).min() <= FAR_M:
+        return
+    here = f"{frame.latitude_deg:.4f}, {frame.longitude_deg:.4f}"
+    first = f"latitude {latitude[0]:.5f}, longitude {longitude[0]:.5f}"
+    if _distance_m(longitude, latitude, frame).min() <= FAR_M:
+        raise InputError(
+            f"the positions are of another place ({first})",
+            expected=f"near the site's origin {here}",
+            cause="latitude and longitude are swapped",
+            path=path,
+        )
+    spans = [abs(np.diff([p[1] for p in outer])).max(initial=0) for o in content.outlines for outer, _ in o.parts]
+    away = float(_distance_m(latitude, longitude, frame).min())
+    raise InputError(
+        f"the nearest position is {away / 1000:.0f} km from the site ({first})"
+        if math.isfinite(away)
+        else f"the positions are no latitudes and longitudes ({first})",
+        expected=f"WGS84 degrees near the site's origin {here}",
+        cause="the area crosses the antimeridian (180 deg)"
+        if max(spans, default=0) > 180
+        else ("metres or feet in place of degrees" if not math.isfinite(away) else "a map of another place"),
+        path=path,
+    )
+
+
+def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
+    """Rough distance [m] from the origin; inf where it is no position on Earth."""
+    good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
+    mean = math.radians(frame.latitude_deg)
+    turn = (longitude - frame.longitude_deg + 180) % 360 - 180
+    return np.where(good, 111_200 * np.hypot(latitude - frame.latitude_deg, turn * math.cos(mean)), np.inf)
+
+
+def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:
+    """The outline in metres, valid; None (and a line in ``actions``) when nothing is left."""
+    areas, notes = [], []
+    for outer, holes in outline.parts:
+        if max(np.abs(np.diff([p[1] for p in outer])), default=0) > 180:
+            notes.append("crosses the antimeridian; its parts were joined")
+        ring = _ring(outer, frame)
+        if ring is None:
+            notes.append("an outer ring with fewer than 3 distinct points was left out")
+            continue
+        area = _repaired(ring, notes, "a self-crossing ring was repaired")
+        inner = [shape for shape in (_ring(hole, frame) for hole in holes) if shape is not None]
+        if len(inner) < len(holes):
+            notes.append("a hole with fewer than 3 distinct points was left out")
+        if inner:
+            area = area.difference(shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner]))
+        areas.append(area)
+    actions += [f"{outline.source}: {note}" for note in dict.fromkeys(notes)]
+    union = _areas_only(shapely.union_all(areas))
+    if union.is_empty:
+        actions.append(f"{outline.source}: left out, it has no area")
+        return None
+    if math.hypot(union.centroid.x, union.centroid.y) > FAR_M:
+        away = math.hypot(union.centroid.x, union.centroid.y) / 1000
+        actions.append(f"{outline.source}: left out, it lies {away:.0f} km from the site")
+        return None
+    return _Shape(outline.name, outline.source, union)
+
+
+def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
+    if len(set(positions)) < 3:
+        return None
+    latitude, longitude = np.array(positions).T
+    east, north = frame.to_local(latitude, longitude)
+    points = np.column_stack([east, north])
+    return Polygon(points[np.isfinite(points).all(axis=1)]) if np.isfinite(points).all(axis=1).sum() >= 3 else None
+
+
+def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
+    if ring.is_valid:
+        return ring
+    notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
+    return _areas_only(shapely.make_valid(ring, method="structure"))
+
+
+def _areas_only(shape: BaseGeometry) -> BaseGeometry:
+    return MultiPolygon([part for part in shapely.get_parts(shape, return_index=False) if isinstance(part, Polygon)])
+
+
+# ---------------------------------------------------------------- heights and materials
+
+
+def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, actions: list[str]) -> None:
+    tags = {key.lower(): value for key, value in outline.tags.items()}
+    written = tags.get("height") or tags.get("building:height") or tags.get("height_m")
+    height = _metres(written) if written else None
+    if written and height is None:
+        actions.append(f"{shape.source}: the height '{written}' is not a length; levels or the default hold")
+    levels = _number(tags.get("building:levels", tags.get("levels", "")))
+    shape.stated = height is not None
+    if height is None:
+        height = levels * LEVEL_M if levels else default_m
+    if not 0 < height <= TALLEST_M:
+        raise InputError(
+            f"{shape.source}: a building {height:g} m high",
+            expected=f"0 to {TALLEST_M:g} m",
+            cause="feet or centimetres in place of metres" if height > 0 else None,
+            path=path,
+        )
+    shape.height_m = height
+    word = tags.get("building:material", "").lower()
+    shape.material = _MATERIAL_WORDS.get(word, word if word in MATERIALS else "concrete")
+    if height > 2 * LEVEL_M and levels and 2.7 <= height / (levels * LEVEL_M) <= 4.5:
+        shape.stated = False  # counted by _warn_of_feet
+        actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
+
+
+def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
+    """A country site where most stated heights are tower blocks was probably drawn in feet."""
+    stated = [shape.height_m for shape in shapes if shape.stated]
+    if len(stated) >= 3 and float(np.median(stated)) > 20 and max(shape.area.area for shape in shapes) < 50_000:
+        actions.append(
+            f"warning: the median stated height of {len(stated)} buildings is {np.median(stated):.0f} m; "
+            "if the file is in feet, give the heights a unit ('20 ft')"
+        )
+
+
+def _number(text: str) -> float | None:
+    try:
+        value = float(text)
+    except ValueError:
+        return None
+    return value if math.isfinite(value) and value > 0 else None
+
+
+def _metres(text: str) -> float | None:
+    """Length of an OSM tag: ``12``, ``12 m``, ``40 ft``, ``40'``, ``39'4"``."""
+    text = text.strip().lower().replace(",", ".")
+    if match := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*(m|metres?|meters?|ft|feet|foot)?", text):
+        return float(match.group(1)) * (FOOT_M if (match.group(2) or "m").startswith("f") else 1.0)
+    if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*'\s*(?:(\d+(?:\.\d+)?)\s*(?:\"|''))?", text):
+        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * FOOT_M
+    return None
+
+
+# ---------------------------------------------------------------- cleaning
+
+
+def _without_duplicates(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Drops outlines that cover the same ground as an earlier one; a stated height is kept."""
+    tree = shapely.STRtree([shape.area for shape in shapes])
+    gone: set[int] = set()
+    for i, shape in enumerate(shapes):
+        if i in gone:
+            continue
+        for j in sorted(int(k) for k in tree.query(shape.area) if k > i and int(k) not in gone):
+            other = shapes[j]
+            ratio = shape.area.area / max(other.area.area, 1e-9)
+            if 0.98 < ratio < 1.02 and shape.area.intersection(other.area).area > 0.98 * shape.area.area:
+                gone.add(j)
+                actions.append(f"{other.source}: left out, it repeats {shape.source}")
+                if other.stated and not shape.stated:
+                    shape.height_m, shape.stated = other.height_m, True
+    return [shape for i, shape in enumerate(shapes) if i not in gone]
+
+
+def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
+    """Sets of shapes whose areas overlap, directly or by way of others."""
+    if not shapes:
+        return []
+    tree = shapely.STRtree([shape.area for shape in shapes])
+    one, two = tree.query([shape.area for shape in shapes], predicate="intersects")
+    home = list(range(len(shapes)))
+
+    def root(i: int) -> int:
+        while home[i] != i:
+            home[i] = home[home[i]]
+            i = home[i]
+        return i
+
+    for i, j in zip(one.tolist(), two.tolist(), strict=True):
+        if i < j and shapes[i].area.intersection(shapes[j].area).area > 0.01:
+            home[root(j)] = root(i)
+    groups: dict[int, list[_Shape]] = {}
+    for i, shape in enumerate(shapes):
+        groups.setdefault(root(i), []).append(shape)
+    return list(groups.values())
+
+
+def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    kept: list[_Shape] = []
+    for group in _groups(shapes):
+        if len(group) == 1:
+            kept += group
+            continue
+        group.sort(key=lambda shape: -shape.height_m)
+        covered: BaseGeometry = Polygon()
+        merged: list[_Shape] = []
+        for shape in group:
+            free = _areas_only(shape.area.difference(covered))
+            covered = covered.union(shape.area)
+            last = merged[-1] if merged else None
+            if free.is_empty:
+                actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
+            elif last and abs(last.height_m - shape.height_m) <= SAME_HEIGHT_M and last.material == shape.material:
+                last.area = _areas_only(last.area.union(shape.area if last is merged[0] else free))
+                actions.append(f"{shape.source}: overlaps {last.source} at the same height; they were merged")
+            else:
+                merged.append(_Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material))
+                if last:
+                    actions.append(f"{shape.source}: the part under a higher building was cut away")
+        kept += merged
+    return kept
+
+
+def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Forests do not overlap: trees would stand twice as dense."""
+    kept: list[_Shape] = []
+    for group in _groups(shapes):
+        covered: BaseGeometry = Polygon()
+        for shape in group:
+            free = _areas_only(shape.area.difference(covered))
+            if free.area < 0.999 * shape.area.area:
+                actions.append(f"{shape.source}: the part inside another forest was cut away")
+            covered = covered.union(shape.area)
+            if not free.is_empty:
+                kept.append(_Shape(shape.name, shape.source, free))
+    return kept
+
+
+def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, Polygon]]:
+    """Single polygons with unique names, without slivers and needless vertices."""
+    found: list[tuple[str, _Shape, Polygon]] = []
+    used: set[str] = set()
+    for shape in shapes:
+        for part in shapely.get_parts(_areas_only(shape.area)):
+            plain = part.simplify(SLIVER_M / 2)
+            plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
+            plain = Polygon(plain.exterior, [hole for hole in plain.interiors if Polygon(hole).area >= MINIMUM_AREA_M2])
+            if plain.area < MINIMUM_AREA_M2 or plain.buffer(-SLIVER_M / 2).is_empty:
+                actions.append(f"{shape.source}: a sliver of {part.area:.1f} m2 was left out")
+                continue
+            name, number = shape.name, 1
+            while name in used:
+                number += 1
+                name = f"{shape.name} ({number})"
+            used.add(name)
+            found.append((name, shape, shapely.normalize(plain)))
+    return found
+
+
+# ---------------------------------------------------------------- site.yaml
+
+
+def import_site(
+    files: Sequence[str | Path], *, base: str | Path = "lake_wheeler", **options: Any
+) -> tuple[SiteModel, list[str]]:
+    """A site with the towers and settings of ``base`` and everything else from map files.
+
+    Parameters
+    ----------
+    files : sequence of paths
+        Map files.
+    base : str or path
+        Packaged site or site.yaml.
+    **options
+        For :func:`import_footprints`.
+
+    Returns
+    -------
+    SiteModel, list of str
+        The settings (see :func:`write_site_yaml`), and what was done.
+    """
+    if not files:
+        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON or KML files")
+    model = site_model(base)
+    found = import_footprints(files, SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg), **options)
+    content = model.model_dump()
+    content |= {
+        "buildings": [
+            {**_outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}
+            for b in found.buildings
+        ],
+        "forests": [
+            {
+                **_outline_dict(f.name, f.area),
+                "trees_per_hectare": f.trees_per_hectare,
+                "minimum_spacing_m": f.minimum_spacing_m,
+                "source": f.source,
+            }
+            for f in found.forests
+        ],
+        "geofences": [_outline_dict(g.name, g.area) for g in found.geofences],
+        "illustrative": False,
+        "notes": [note for note in model.notes if "illustrative" not in note.lower()],
+    }
+    content["trees"]["points_m"] = [(round(east, 2), round(north, 2)) for east, north in found.trees_m]
+    return SiteModel.model_validate(content), found.actions
+
+
+def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
+    def ring(line: Any) -> list[tuple[float, float]]:
+        return [(round(float(x), 3), round(float(y), 3)) for x, y in list(line.coords)[:-1]]
+
+    return {"name": name, "polygon_m": ring(area.exterior), "holes_m": [ring(hole) for hole in area.interiors]}
+
+
+def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
+    """Settings as a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
+
+    ``header`` lines become comments at the top (what the import did).
+    """
+    content = model.model_dump(mode="json", exclude_defaults=True)
+    dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+    text = "".join(f"# {line}\n" for entry in header for line in str(entry).splitlines())
+    text += yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=118)
+    path = Path(path)
+    partial = path.with_name(path.name + ".partial")
+    try:
+        partial.write_text(text, encoding="utf-8")
+        partial.replace(path)
+    except OSError as error:
+        raise UsageError(f"cannot be written ({error.strerror})", path=path) from None

@@ -1,0 +1,169 @@
+"""Electrical properties of building materials and ground.
+
+Parametric model and constants of Recommendation ITU-R P.2040 (P.2040-4, table 3): with f in GHz,
+``eps' = a f^b`` and the conductivity ``sigma = c f^d`` [S/m]. The complex relative permittivity is
+``eps' - j sigma / (2 pi f eps0)`` for the time factor ``exp(+j omega t)``.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+from dataclasses import dataclass
+
+from ..errors import UsageError
+from ..units import VACUUM_PERMITTIVITY_F_PER_M
+
+Band = tuple[float, float, float, float, float, float]
+"""Lowest and highest frequency [GHz], a, b, c, d."""
+
+# P.2040-4 table 3. Where bands overlap the first that contains the frequency holds.
+_TABLE: dict[str, tuple[Band, ...]] = {
+    "vacuum": ((0.001, 100.0, 1.0, 0.0, 0.0, 0.0),),
+    "concrete": ((1.0, 100.0, 5.24, 0.0, 0.0462, 0.7822), (110.0, 330.0, 5.17, 0.0, 0.0145, 1.09)),
+    "brick": ((1.0, 40.0, 3.91, 0.0, 0.0238, 0.16), (110.0, 330.0, 4.15, 0.0, 0.0006, 1.5712)),
+    "plasterboard": (
+        (1.0, 100.0, 2.73, 0.0, 0.0085, 0.9395),
+        (110.0, 330.0, 2.56, 0.0, 0.0001, 1.7799),
+        (100.0, 400.0, 2.65, 0.0, 0.0002, 1.598),
+    ),
+    "wood": (
+        (0.001, 100.0, 1.99, 0.0, 0.0047, 1.0718),
+        (110.0, 330.0, 1.82, 0.0, 0.0040, 1.0761),
+        (100.0, 400.0, 2.1183, 0.0, 0.0055, 1.1113),
+    ),
+    "glass": (
+        (0.1, 100.0, 6.31, 0.0, 0.0036, 1.3394),
+        (220.0, 450.0, 5.79, 0.0, 0.0004, 1.658),
+        (100.0, 400.0, 6.5767, 0.0, 0.0012, 1.4697),
+    ),
+    "ceiling_board": (
+        (1.0, 100.0, 1.48, 0.0, 0.0011, 1.075),
+        (220.0, 450.0, 1.52, 0.0, 0.0029, 1.029),
+        (100.0, 400.0, 1.2567, 0.0, 0.00013, 1.454),
+    ),
+    "chipboard": ((1.0, 100.0, 2.58, 0.0, 0.0217, 0.78), (100.0, 200.0, 2.16, 0.0, 0.0023, 1.359)),
+    "plywood": (
+        (1.0, 40.0, 2.71, 0.0, 0.33, 0.0),
+        (110.0, 330.0, 1.94, 0.0, 0.0067, 0.9982),
+        (100.0, 400.0, 2.17, 0.0, 0.0063, 1.045),
+    ),
+    "marble": (
+        (1.0, 60.0, 7.074, 0.0, 0.0055, 0.9262),
+        (110.0, 330.0, 7.94, 0.0, 0.0001, 1.733),
+        (100.0, 400.0, 8.62, 0.0, 0.0027, 1.15),
+    ),
+    "floorboard": ((50.0, 100.0, 3.66, 0.0, 0.0044, 1.3515), (100.0, 400.0, 3.1575, 0.0, 0.001675, 1.32775)),
+    "asphalt_concrete": ((1.0, 40.0, 4.83, 0.0, 0.0108, 1.3969),),
+    "metal": ((1.0, 100.0, 1.0, 0.0, 1e7, 0.0),),
+    "very_dry_ground": ((1.0, 10.0, 3.0, 0.0, 0.00015, 2.52),),
+    "medium_dry_ground": ((1.0, 10.0, 15.0, -0.1, 0.035, 1.63),),
+    "wet_ground": ((1.0, 10.0, 30.0, -0.4, 0.15, 1.30),),
+}
+
+# Usual thickness of a wall or roof [m]; None is a half-space (no second face echoes).
+_THICKNESS_M: dict[str, float | None] = {
+    "vacuum": None,
+    "concrete": 0.3,
+    "brick": 0.2,
+    "plasterboard": 0.025,
+    "wood": 0.15,
+    "glass": 0.006,
+    "ceiling_board": 0.02,
+    "chipboard": 0.02,
+    "plywood": 0.02,
+    "marble": 0.03,
+    "floorboard": 0.02,
+    "asphalt_concrete": None,
+    "metal": 0.005,
+    "very_dry_ground": None,
+    "medium_dry_ground": None,
+    "wet_ground": None,
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Material:
+    """A homogeneous material.
+
+    Parameters
+    ----------
+    name : str
+        Without the ``itu_`` prefix.
+    bands : tuple of Band
+        Constants per frequency range.
+    thickness_m : float or None
+        Thickness of a wall of it; None is a half-space.
+    """
+
+    name: str
+    bands: tuple[Band, ...]
+    thickness_m: float | None = None
+
+    def _band(self, frequency_hz: float) -> Band:
+        frequency_ghz = frequency_hz / 1e9
+        for band in self.bands:
+            if band[0] <= frequency_ghz <= band[1]:
+                return band
+        ranges = ", ".join(f"{low:g}-{high:g} GHz" for low, high, *_ in self.bands)
+        raise UsageError(
+            f"ITU-R P.2040 gives no values for '{self.name}' at {frequency_ghz:g} GHz",
+            expected=ranges,
+            cause="the carrier was given in MHz or GHz where hertz are expected" if frequency_hz < 1e6 else None,
+        )
+
+    def conductivity_s_per_m(self, frequency_hz: float) -> float:
+        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's bands."""
+        *_, c, d = self._band(frequency_hz)
+        return float(c * (frequency_hz / 1e9) ** d)
+
+    def relative_permittivity(self, frequency_hz: float) -> complex:
+        """Complex relative permittivity at a frequency [Hz]; the imaginary part is negative (loss).
+
+        Raises
+        ------
+        UsageError
+            Outside the frequency ranges of the table.
+        """
+        _, _, a, b, _, _ = self._band(frequency_hz)
+        loss = self.conductivity_s_per_m(frequency_hz) / (2 * math.pi * frequency_hz * VACUUM_PERMITTIVITY_F_PER_M)
+        return complex(a * (frequency_hz / 1e9) ** b, -loss)
+
+
+MATERIALS: tuple[str, ...] = tuple(_TABLE)
+"""Names that :func:`material` knows."""
+
+
+def material(name: str) -> Material:
+    """A material of ITU-R P.2040 by name.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``"concrete"``, ``"itu_concrete"`` or ``"itu-concrete"``.
+
+    Returns
+    -------
+    Material
+
+    Raises
+    ------
+    UsageError
+        Unknown name; the nearest known one is named.
+
+    Examples
+    --------
+    >>> material("itu_concrete").relative_permittivity(3.4e9)
+    (5.24-0.636...j)
+    >>> material("medium_dry_ground").thickness_m is None
+    True
+    """
+    key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
+    if key not in _TABLE:
+        near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
+        raise UsageError(
+            f"unknown material '{name}'",
+            expected="one of " + ", ".join(MATERIALS),
+            cause=f"did you mean '{near[0]}'?" if near else None,
+        )
+    return Material(key, _TABLE[key], _THICKNESS_M[key])

@@ -1,0 +1,475 @@
+"""site.yaml to a :class:`~aerpaw_cmp.site.site.Site`, and the packaged sites.
+
+docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``polygon_deg`` (latitude, longitude).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from importlib import resources
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+import shapely
+from pydantic import Field, model_validator
+from shapely.geometry import Point, Polygon
+
+from ..errors import UsageError
+from ..geodesy import SiteFrame
+from ..yamlfile import StrictModel, load_yaml, nearest
+from .dem import Dem, read_dem
+from .heights import Height, HeightReference, VerticalDatum
+from .materials import material
+from .site import Building, Forest, Geofence, Site, Tower, Trees
+from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
+
+PACKAGED = ("lake_wheeler",)
+"""Sites that come with the package, by name."""
+
+FAR_TOWER_M = 10_000.0
+"""A tower farther from the origin and from the area is refused."""
+
+FAR_POLYGON_M = 100_000.0
+"""An outline that reaches farther from the origin is refused."""
+
+MAST_CLEARANCE_M = 8.0
+"""No tree is placed at random closer to a tower: masts stand clear."""
+
+Latitude = Annotated[float, Field(ge=-90, le=90)]
+Longitude = Annotated[float, Field(ge=-180, le=180)]
+Positive = Annotated[float, Field(gt=0)]
+NotNegative = Annotated[float, Field(ge=0)]
+Ground = Literal["flat", "offsets", "dem"]
+Area = tuple[float, float, float, float]
+Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
+
+
+class HeightModel(StrictModel):
+    """A height with its reference."""
+
+    height_m: float
+    reference: HeightReference
+
+    def height(self) -> Height:
+        """As a value that refuses to mix."""
+        return Height(self.height_m, self.reference)
+
+
+class OriginModel(StrictModel):
+    """Where east = north = up = 0."""
+
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    ground: HeightModel | None = None
+    takeoff_ground_m: float = 0.0
+
+
+class PositionModel(StrictModel):
+    """One published position of a tower."""
+
+    latitude_deg: Latitude
+    longitude_deg: Longitude
+    antenna_height_m: Positive | None = None
+    source: str = ""
+
+
+class TowerModel(StrictModel):
+    """A tower, with one position or several published ones."""
+
+    latitude_deg: Latitude | None = None
+    longitude_deg: Longitude | None = None
+    source: str = ""
+    positions: dict[str, PositionModel] = Field(default_factory=dict)
+    antenna_height_m: Positive | None = None
+    antenna: HeightModel | None = None
+    ground_offset_m: float | None = None
+    ground: HeightModel | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> TowerModel:
+        here = (self.latitude_deg is not None) + (self.longitude_deg is not None)
+        if here == 1 or (here == 2) == bool(self.positions):
+            raise ValueError("give latitude_deg and longitude_deg, or positions, not both")
+        if self.antenna is not None and self.antenna_height_m is not None:
+            raise ValueError("give antenna_height_m (above ground) or antenna, not both")
+        if self.ground is not None and self.ground_offset_m is not None:
+            raise ValueError("give ground_offset_m (above the ground at the origin) or ground, not both")
+        return self
+
+
+class PolygonModel(StrictModel):
+    """A named outline."""
+
+    name: str
+    polygon_m: Ring | None = None
+    polygon_deg: Ring | None = None
+    holes_m: list[Ring] = Field(default_factory=list)
+    holes_deg: list[Ring] = Field(default_factory=list)
+
+    @model_validator(mode="after")
+    def _one_way(self) -> PolygonModel:
+        if (self.polygon_m is None) == (self.polygon_deg is None):
+            raise ValueError("give polygon_m (east, north) or polygon_deg (latitude, longitude)")
+        if (self.holes_m and self.polygon_m is None) or (self.holes_deg and self.polygon_deg is None):
+            raise ValueError("holes and outline must both be in metres or both in degrees")
+        return self
+
+    def polygon(self, frame: SiteFrame) -> Polygon:
+        """In the site frame [m]; ValueError when it is not a simple polygon."""
+        if self.polygon_m is not None:
+            shape = Polygon(self.polygon_m, self.holes_m)
+        else:
+            rings = [self.polygon_deg or [], *self.holes_deg]
+            local = [_ring_from_degrees(ring, frame, self.name) for ring in rings]
+            shape = Polygon(local[0], local[1:])
+        if len(set(shape.exterior.coords)) < 3:
+            raise UsageError(f"the polygon of '{self.name}' has fewer than 3 distinct points")
+        if not shape.is_valid or shape.area < 1e-3:
+            raise UsageError(
+                f"the polygon of '{self.name}' is not a simple outline ({shapely.is_valid_reason(shape)})",
+                cause="it crosses itself or its points coincide; 'aerpaw-cmp site import' repairs outlines",
+            )
+        return shapely.normalize(shape)
+
+
+class BuildingModel(PolygonModel):
+    """A building with a flat roof."""
+
+    height_m: Positive
+    base_m: float = 0.0
+    material: str = "concrete"
+    source: str = ""
+
+
+class ForestModel(PolygonModel):
+    """A wooded area."""
+
+    trees_per_hectare: NotNegative = 100.0
+    minimum_spacing_m: NotNegative = 4.0
+    source: str = ""
+
+
+class DistributionModel(StrictModel):
+    """A size drawn from a normal distribution between limits."""
+
+    mean: Positive
+    deviation: NotNegative = 0.0
+    minimum: NotNegative = 0.0
+    maximum: Positive = math.inf
+
+
+Size = Positive | DistributionModel
+
+
+class TreesModel(StrictModel):
+    """Sizes of all trees, the seed of the placement, and single trees."""
+
+    seed: Annotated[int, Field(ge=0)] = 0
+    height_m: Size = 20.0
+    crown_diameter_m: Size = 10.0
+    trunk_diameter_m: Size = 0.4
+    crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
+    points_m: list[tuple[float, float]] = Field(default_factory=list)
+    points_deg: list[tuple[float, float]] = Field(default_factory=list)
+
+    def sizes(self) -> TreeSizes:
+        """For the placement."""
+        return TreeSizes(
+            _distribution(self.height_m),
+            _distribution(self.crown_diameter_m),
+            _distribution(self.trunk_diameter_m),
+            self.crown_base_fraction,
+        )
+
+
+class DemModel(StrictModel):
+    """An elevation model; relative paths start at the folder of site.yaml."""
+
+    path: str
+    crs: str | None = None
+    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
+
+
+class SiteModel(StrictModel):
+    """The whole of site.yaml."""
+
+    name: str
+    origin: OriginModel
+    towers: Annotated[dict[str, TowerModel], Field(min_length=1)]
+    coordinates: str | None = None
+    tower_ground: Ground | None = None
+    dem: DemModel | None = None
+    ground_material: str = "medium_dry_ground"
+    area_m: tuple[float, float, float, float] | None = None
+    buildings: list[BuildingModel] = Field(default_factory=list)
+    forests: list[ForestModel] = Field(default_factory=list)
+    trees: TreesModel = Field(default_factory=TreesModel)
+    geofences: list[PolygonModel] = Field(default_factory=list)
+    illustrative: bool = False
+    notes: list[str] = Field(default_factory=list)
+
+
+def load_site(
+    name_or_path: str | Path,
+    *,
+    coordinates: str | None = None,
+    tower_ground: Ground | None = None,
+) -> Site:
+    """A site by the name of a packaged one, or from a site.yaml.
+
+    Parameters
+    ----------
+    name_or_path : str or Path
+        ``"lake_wheeler"`` or a file.
+    coordinates : str, optional
+        Which published positions to use where a tower has several; overrides the file.
+    tower_ground : {"flat", "offsets", "dem"}, optional
+        ``flat`` puts the ground everywhere at up = 0 (the paper), ``offsets`` that of each tower at its stated
+        height, ``dem`` takes towers, buildings and trees from the elevation model. Overrides the file, where it is
+        ``dem`` when there is one, else ``flat``.
+
+    Returns
+    -------
+    Site
+
+    Raises
+    ------
+    UsageError
+        No such site, or the file is wrong (path and line are named).
+    """
+    path, model = _find(name_or_path)
+    changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
+    model = model.model_copy(update={key: value for key, value in changes.items() if value is not None})
+    try:
+        return build_site(model, Path(path).parent)
+    except UsageError as error:
+        if error.path is not None:
+            raise
+        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+
+
+def site_model(name_or_path: str | Path) -> SiteModel:
+    """The checked settings of a packaged site or a site.yaml, before trees are placed."""
+    return _find(name_or_path)[1]
+
+
+def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
+    path = Path(name_or_path)
+    if path.suffix in (".yaml", ".yml") or path.is_file():
+        return str(path), load_yaml(path, SiteModel)
+    name = str(name_or_path).lower().replace("-", "_").replace(" ", "_")
+    if name not in PACKAGED:
+        near = nearest(name, PACKAGED)
+        raise UsageError(
+            f"no site '{name_or_path}'",
+            expected=f"a site.yaml or one of {', '.join(PACKAGED)}",
+            cause=f"did you mean '{near}'?" if near else None,
+        )
+    with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
+        return name, load_yaml(file, SiteModel)
+
+
+def build_site(model: SiteModel, folder: Path | None = None) -> Site:
+    """The site of a checked model; places the trees. ``folder`` is where relative paths start."""
+    frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
+    dem = _dem(model, frame, folder or Path())
+    datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
+    material(model.ground_material)
+    notes = list(model.notes)
+    towers = {name: _tower(name, tower, model, frame, datum, dem, notes) for name, tower in model.towers.items()}
+    area = _area(model.area_m, towers)
+    _check_towers(towers, model.area_m)
+    buildings = tuple(_building(item, frame, dem) for item in model.buildings)
+    forests = tuple(
+        Forest(item.name, item.polygon(frame), item.trees_per_hectare, item.minimum_spacing_m, item.source)
+        for item in model.forests
+    )
+    return Site(
+        name=model.name,
+        frame=frame,
+        towers=towers,
+        buildings=buildings,
+        forests=forests,
+        trees=_on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem),
+        geofences=tuple(Geofence(item.name, item.polygon(frame)) for item in model.geofences),
+        ground_material=model.ground_material,
+        area_m=area,
+        illustrative=model.illustrative,
+        notes=tuple(notes),
+        datum=datum,
+        dem=dem,
+    )
+
+
+def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
+    if model.tower_ground == "dem" and model.dem is None:
+        raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
+    if model.dem is None or model.tower_ground not in (None, "dem"):
+        return None
+    return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
+
+
+def _origin_ground(model: SiteModel, dem: Dem | None) -> Height | None:
+    if model.origin.ground is not None:
+        return model.origin.ground.height()
+    if dem is not None and model.dem is not None:
+        return Height(float(dem.absolute_m(0.0, 0.0)), model.dem.reference)
+    return None
+
+
+def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
+    if dem is None or not len(trees):
+        return trees
+    return replace(trees, ground_m=np.nan_to_num(dem.ground_m(trees.east_m, trees.north_m)))
+
+
+def _check_towers(towers: Mapping[str, Tower], area: Area | None) -> None:
+    """A tower kilometres off is a slip of the pen, not a site."""
+    for tower in towers.values():
+        away = math.hypot(tower.east_m, tower.north_m)
+        if area is not None:
+            east, north = _outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])
+            away = min(away, math.hypot(east, north))
+        if away > FAR_TOWER_M:
+            raise UsageError(
+                f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
+                f"from its site",
+                expected=f"at most {FAR_TOWER_M / 1000:g} km",
+                cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
+            )
+
+
+def _outside(value: float, low: float, high: float) -> float:
+    return max(low - value, value - high, 0.0)
+
+
+def _tower(
+    name: str,
+    model: TowerModel,
+    site: SiteModel,
+    frame: SiteFrame,
+    datum: VerticalDatum,
+    dem: Dem | None,
+    notes: list[str],
+) -> Tower:
+    chosen = _chosen_position(name, model, site.coordinates, frame, notes)
+    what = f"tower '{name}'"
+    east, north = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
+    ground = 0.0
+    if dem is not None:
+        ground = float(dem.ground_m(east, north))
+        if math.isnan(ground):
+            raise UsageError(f"{what} is not on the elevation model", cause="the grid is too small for the site")
+    if site.tower_ground == "offsets":
+        ground = model.ground_offset_m or 0.0
+        if model.ground is not None:
+            ground = datum.up_m(model.ground.height(), f"{what}, ground")
+    height = model.antenna_height_m or chosen.antenna_height_m or 10.0
+    if model.antenna is not None:
+        height = datum.up_m(model.antenna.height(), f"{what}, antenna", ground_m=ground) - ground
+    if not height > 0:
+        raise UsageError(
+            f"{what}: the antenna lies {-height:g} m below the ground", cause="a height of another reference"
+        )
+    return Tower(
+        name, chosen.latitude_deg, chosen.longitude_deg, float(east), float(north), height, ground, chosen.source
+    )
+
+
+def _chosen_position(
+    name: str, model: TowerModel, wanted: str | None, frame: SiteFrame, notes: list[str]
+) -> PositionModel:
+    if model.latitude_deg is not None and model.longitude_deg is not None:
+        return PositionModel(latitude_deg=model.latitude_deg, longitude_deg=model.longitude_deg, source=model.source)
+    key = next(iter(model.positions)) if wanted is None else wanted
+    if key not in model.positions:
+        raise UsageError(f"tower '{name}' has no position '{key}'", expected="one of " + ", ".join(model.positions))
+    chosen = model.positions[key]
+    here = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
+    for other, position in model.positions.items():
+        if other != key:
+            there = frame.to_local(position.latitude_deg, position.longitude_deg)
+            apart = math.hypot(float(here[0] - there[0]), float(here[1] - there[1]))
+            notes.append(f"{name}: source {other} lies {apart:.1f} m from source {key}, which is used")
+    return chosen
+
+
+def _building(model: BuildingModel, frame: SiteFrame, dem: Dem | None) -> Building:
+    material(model.material)
+    footprint = model.polygon(frame)
+    base = model.base_m
+    if dem is not None:  # a floor is level: the ground under the middle
+        base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
+    return Building(model.name, footprint, model.height_m, base, model.material, model.source)
+
+
+def _trees(
+    model: TreesModel,
+    forests: tuple[Forest, ...],
+    buildings: tuple[Building, ...],
+    towers: Mapping[str, Tower],
+    frame: SiteFrame,
+    notes: list[str],
+) -> Trees:
+    clear = shapely.union_all(
+        [building.footprint for building in buildings]
+        + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
+    )
+    sizes, parts = model.sizes(), []
+    for forest in forests:
+        placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
+        wanted = wanted_trees(forest, clear)
+        if len(placed) < wanted:
+            notes.append(
+                f"{forest.name}: {len(placed)} of {wanted} trees fit at {forest.minimum_spacing_m:g} m spacing"
+            )
+        parts.append(placed)
+    points = list(model.points_m)
+    if model.points_deg:
+        points += _ring_from_degrees(model.points_deg, frame, "trees")
+    if points:
+        east, north = zip(*points, strict=True)
+        parts.append(trees_at(east, north, sizes))  # type: ignore[arg-type]
+    return join_trees(parts)
+
+
+def _area(area: tuple[float, float, float, float] | None, towers: Mapping[str, Tower]) -> Area:
+    east = [tower.east_m for tower in towers.values()]
+    north = [tower.north_m for tower in towers.values()]
+    if area is None:
+        return (min(east) - 500.0, max(east) + 500.0, min(north) - 500.0, max(north) + 500.0)
+    if not (area[0] < area[1] and area[2] < area[3]):
+        raise UsageError(f"area_m is {list(area)}", expected="[east_min, east_max, north_min, north_max]")
+    return area
+
+
+def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: str) -> list[tuple[float, float]]:
+    for latitude, longitude in ring:
+        if not (-90 <= latitude <= 90 and -180 <= longitude <= 180):
+            raise UsageError(
+                f"'{name}': latitude {latitude:g}, longitude {longitude:g}",
+                expected="latitude, longitude in degrees",
+                cause="the two are swapped" if abs(latitude) <= 180 and abs(longitude) <= 90 else None,
+            )
+    latitude, longitude = np.array(ring).T
+    east, north = frame.to_local(latitude, longitude)
+    away = float(np.hypot(east, north).max())
+    if away > FAR_POLYGON_M:
+        wraps = len(ring) > 1 and float(np.abs(np.diff(longitude)).max()) > 180
+        swapped = frame.to_local(longitude, latitude) if np.abs(longitude).max() <= 90 else (math.inf, math.inf)
+        cause = "a digit is wrong, or it belongs to another site"
+        if wraps:
+            cause = "it crosses the antimeridian (180 deg)"
+        elif float(np.hypot(*swapped).max()) < FAR_POLYGON_M:
+            cause = "latitude and longitude are swapped"
+        raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
+    return list(zip(east.tolist(), north.tolist(), strict=True))
+
+
+def _distribution(size: float | DistributionModel) -> Distribution:
+    if isinstance(size, DistributionModel):
+        return Distribution(size.mean, size.deviation, size.minimum, size.maximum)
+    return Distribution(size)

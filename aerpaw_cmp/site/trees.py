@@ -1,0 +1,208 @@
+"""Trees: seeded random placement in forests, sizes, single trees.
+
+A tree is the paper's (arXiv 2502.10324, section V): a trunk cylinder with a cone of vegetation on it, 20 m high and
+10 m across at its widest. The paper does not print the height of the crown's base; a quarter of the height is
+assumed here.
+"""
+
+from __future__ import annotations
+
+import math
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+
+import numpy as np
+import shapely
+from scipy.spatial import cKDTree
+from shapely.geometry.base import BaseGeometry
+
+from ..errors import UsageError
+from ..units import BoolArray, FloatArray
+from .site import Forest, Trees
+
+MAXIMUM_TREES = 2_000_000
+"""Of one forest."""
+
+_STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
+
+
+@dataclass(frozen=True, slots=True)
+class Distribution:
+    """A size: a constant, or a normal distribution cut off at ``minimum`` and ``maximum``.
+
+    Parameters
+    ----------
+    mean, deviation : float
+        Of the uncut normal distribution; deviation 0 is the constant ``mean``.
+    minimum, maximum : float
+        Values outside are drawn again.
+    """
+
+    mean: float
+    deviation: float = 0.0
+    minimum: float = 0.0
+    maximum: float = math.inf
+
+    def __post_init__(self) -> None:
+        if not (self.deviation >= 0 and 0 <= self.minimum <= self.mean <= self.maximum and math.isfinite(self.mean)):
+            raise UsageError(
+                f"a size distribution with mean {self.mean}, deviation {self.deviation}, limits {self.minimum} to "
+                f"{self.maximum}",
+                expected="0 <= minimum <= mean <= maximum and deviation >= 0",
+            )
+
+    def draw(self, count: int, random: np.random.Generator) -> FloatArray:
+        """``count`` values; rejected draws are repeated, so the limits do not pile up."""
+        values = np.full(count, float(self.mean))
+        wrong = np.ones(count, dtype=bool) if self.deviation > 0 else np.zeros(count, dtype=bool)
+        for _ in range(100):
+            if not wrong.any():
+                return values
+            values[wrong] = random.normal(self.mean, self.deviation, int(wrong.sum()))
+            wrong = (values < self.minimum) | (values > self.maximum)
+        return np.asarray(np.clip(values, self.minimum, self.maximum))
+
+
+@dataclass(frozen=True, slots=True)
+class TreeSizes:
+    """How large trees are.
+
+    Parameters
+    ----------
+    height_m, crown_diameter_m, trunk_diameter_m : Distribution
+        Drawn independently.
+    crown_base_fraction : float
+        Height of the crown's base as a share of the tree's height, 0 to below 1.
+    """
+
+    height_m: Distribution = field(default_factory=lambda: Distribution(20.0))
+    crown_diameter_m: Distribution = field(default_factory=lambda: Distribution(10.0))
+    trunk_diameter_m: Distribution = field(default_factory=lambda: Distribution(0.4))
+    crown_base_fraction: float = 0.25
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.crown_base_fraction < 1:
+            raise UsageError(f"crown_base_fraction is {self.crown_base_fraction}", expected="0 to below 1")
+
+
+def trees_at(
+    east_m: FloatArray,
+    north_m: FloatArray,
+    sizes: TreeSizes | None = None,
+    *,
+    random: np.random.Generator | None = None,
+    ground_m: FloatArray | float = 0.0,
+) -> Trees:
+    """Trees at given points (n,) [m], with drawn sizes."""
+    sizes = sizes or TreeSizes()
+    random = random or np.random.default_rng(0)
+    east = np.asarray(east_m, dtype=np.float64)
+    count = len(east)
+    height = sizes.height_m.draw(count, random)
+    return Trees(
+        east_m=east,
+        north_m=np.asarray(north_m, dtype=np.float64),
+        ground_m=np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (count,)).copy(),
+        height_m=height,
+        crown_diameter_m=sizes.crown_diameter_m.draw(count, random),
+        crown_base_m=height * sizes.crown_base_fraction,
+        trunk_diameter_m=sizes.trunk_diameter_m.draw(count, random),
+    )
+
+
+def join_trees(parts: Sequence[Trees]) -> Trees:
+    """All trees of several sets, in order."""
+    if not parts:
+        return Trees.none()
+    return Trees(**{f.name: np.concatenate([getattr(part, f.name) for part in parts]) for f in fields(Trees)})
+
+
+def place_trees(
+    forest: Forest,
+    sizes: TreeSizes | None = None,
+    *,
+    seed: int = 0,
+    keep_clear: BaseGeometry | None = None,
+) -> Trees:
+    """Trees at random places of a forest, no two closer than its minimum spacing.
+
+    Parameters
+    ----------
+    forest : Forest
+        ``trees_per_hectare`` times the free area is the wanted number.
+    sizes : TreeSizes, optional
+        The paper's tree by default.
+    seed : int
+        Same seed and forest, same trees; forests do not influence each other.
+    keep_clear : shapely geometry, optional
+        No trunk stands in it (buildings, masts).
+
+    Returns
+    -------
+    Trees
+        Fewer than wanted when they do not fit (see :func:`wanted_trees`).
+
+    Notes
+    -----
+    Darts are thrown in batches. Of two darts that are too close the earlier stays, as if they had been thrown one
+    by one (random sequential addition), but whole batches are decided at once.
+    """
+    area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
+    random = np.random.default_rng([seed, zlib.crc32(forest.name.encode())])
+    points = _scatter(area, wanted_trees(forest, keep_clear), forest.minimum_spacing_m, random)
+    return trees_at(points[:, 0], points[:, 1], sizes, random=random)
+
+
+def wanted_trees(forest: Forest, keep_clear: BaseGeometry | None = None) -> int:
+    """Number of trees that a forest's density asks for."""
+    area = forest.area if keep_clear is None else shapely.difference(forest.area, keep_clear)
+    return round(forest.trees_per_hectare * float(area.area) / 10_000.0)
+
+
+def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.random.Generator) -> FloatArray:
+    """Up to ``wanted`` random points (n, 2) in an area, at least ``spacing_m`` apart."""
+    placed = np.zeros((0, 2))
+    if wanted <= 0 or area.is_empty:
+        return placed
+    if wanted > MAXIMUM_TREES:
+        raise UsageError(
+            f"a forest of {area.area / 1e6:.0f} km2 asks for {wanted} trees", expected=f"at most {MAXIMUM_TREES}"
+        )
+    shapely.prepare(area)
+    east_min, north_min, east_max, north_max = area.bounds
+    low, span = np.array([east_min, north_min]), np.array([east_max - east_min, north_max - north_min])
+    share = area.area / max(float(span.prod()), 1e-300)
+    stalled = 0
+    while len(placed) < wanted and stalled < _STALLED_ROUNDS:
+        missing = wanted - len(placed)
+        darts = low + span * random.random((min(int(1.5 * missing / share) + 16, 2_000_000), 2))
+        darts = darts[shapely.contains_xy(area, darts[:, 0], darts[:, 1])]
+        if spacing_m > 0:
+            if len(placed):
+                darts = darts[cKDTree(placed).query(darts, distance_upper_bound=spacing_m)[0] >= spacing_m]
+            darts = darts[_first_come(darts, spacing_m)]
+        kept = darts[:missing]
+        stalled = stalled + 1 if len(kept) < 1e-3 * wanted else 0
+        placed = np.concatenate([placed, kept])
+    return placed
+
+
+def _first_come(points: FloatArray, spacing_m: float) -> BoolArray:
+    """Which points (n, 2) stay when each is refused by any earlier kept one closer than ``spacing_m``."""
+    keep = np.zeros(len(points), dtype=bool)
+    open_ = np.ones(len(points), dtype=bool)
+    pairs = cKDTree(points).query_pairs(np.nextafter(spacing_m, 0), output_type="ndarray") if len(points) else None
+    if pairs is None or not len(pairs):
+        return open_
+    early, late = pairs.min(axis=1), pairs.max(axis=1)
+    while open_.any():
+        waiting = np.zeros(len(points), dtype=bool)
+        live = open_[early] & open_[late]
+        early, late = early[live], late[live]
+        waiting[late] = True
+        chosen = open_ & ~waiting  # nothing earlier is still undecided nearby
+        keep |= chosen
+        open_ &= ~chosen
+        open_[late[chosen[early]]] = False
+    return keep

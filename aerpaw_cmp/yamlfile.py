@@ -1,0 +1,370 @@
+"""YAML files to checked settings: every mistake is one message with the line that mends it.
+
+``load_yaml(path, Model)`` is the only door. A model is a pydantic class, usually a :class:`StrictModel`.
+
+YAML is read by the core schema of YAML 1.2, because 1.1 (PyYAML's default) turns ``11:48:16`` into the number
+42496, ``no`` into False and leaves ``1e6`` a word. No tag builds an object. Duplicate keys, several documents,
+aliases that unfold to more than :data:`MAX_NODES` nodes and nesting deeper than :data:`MAX_DEPTH` are refused.
+"""
+
+from __future__ import annotations
+
+import difflib
+import math
+import re
+import types
+import typing
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import pydantic
+import yaml
+
+from .errors import UsageError
+
+MAX_BYTES = 32 * 1024 * 1024
+"""Larger files are refused unread; a site with 100 000 single trees has about 6 MB."""
+
+MAX_NODES = 4_000_000
+"""Scalars, lists and mappings, aliases counted unfolded: an alias bomb stops here."""
+
+MAX_DEPTH = 64
+"""Nesting of lists and mappings."""
+
+_TAG = "tag:yaml.org,2002:"
+_LOADER: Any = getattr(yaml, "CSafeLoader", yaml.SafeLoader)  # events only: nothing is constructed by PyYAML
+_INT = re.compile(r"[-+]?[0-9]+\Z")
+_HEX = re.compile(r"0x[0-9a-fA-F]+\Z")
+_FLOAT = re.compile(r"[-+]?(\.[0-9]+|[0-9]+(\.[0-9]*)?)([eE][-+]?[0-9]+)?\Z")
+_WORDS: dict[str, Any] = {
+    **dict.fromkeys(("", "~", "null", "Null", "NULL")),
+    **dict.fromkeys(("true", "True", "TRUE"), True),
+    **dict.fromkeys(("false", "False", "FALSE"), False),
+    **dict.fromkeys((".inf", ".Inf", "+.inf"), math.inf),
+    "-.inf": -math.inf,
+    **dict.fromkeys((".nan", ".NaN", ".NAN"), math.nan),
+}
+
+Location = tuple[Any, ...]
+ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
+
+
+class StrictModel(pydantic.BaseModel):
+    """A settings model that refuses unknown keys and cannot be changed after loading."""
+
+    model_config = pydantic.ConfigDict(extra="forbid", frozen=True)
+
+
+def nearest(name: object, choices: Iterable[str]) -> str | None:
+    """The choice most like ``name``, or None when none is near.
+
+    Examples
+    --------
+    >>> nearest("sight", ["flight", "site", "rank"])
+    'flight'
+    >>> nearest("zzz", ["flight"]) is None
+    True
+    """
+    by_lower = {choice.lower(): choice for choice in choices}
+    found = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
+    return by_lower[found[0]] if found else None
+
+
+def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
+    """A YAML file as a checked model.
+
+    Parameters
+    ----------
+    path : str or Path
+        UTF-8 file.
+    model : type of pydantic.BaseModel
+        With ``extra="forbid"`` (:class:`StrictModel`) unknown keys are errors.
+
+    Returns
+    -------
+    model instance
+
+    Raises
+    ------
+    UsageError
+        With path and line: no such file, not text, not YAML, duplicate or unknown key (the nearest valid key
+        is named), wrong or missing values (all of them at once).
+    """
+    return parse_yaml(_read_text(Path(path)), model, path)
+
+
+def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -> ModelT:
+    """YAML text as a checked model; ``path`` is for the messages only."""
+    document = _parse(text, path)
+    if document.value is None:
+        raise UsageError(
+            "the file holds no settings", expected=f"keys such as {_listed(_field_names(model)[:4])}", path=path
+        )
+    if not isinstance(document.value, dict):
+        raise UsageError("the file is not a list of 'key: value' settings", path=path, line=1)
+    try:
+        return model.model_validate(document.value)
+    except pydantic.ValidationError as error:
+        raise _explain(error, model, document, path) from None
+
+
+def _read_text(path: Path) -> str:
+    try:
+        size = path.stat().st_size
+        if path.is_dir():
+            raise UsageError("a folder was named", expected="a YAML file", path=path)
+        if size > MAX_BYTES:
+            raise UsageError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=path)
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise UsageError("no such file", path=path) from None
+    except OSError as error:
+        raise UsageError(f"cannot be read ({error.strerror})", path=path) from None
+    try:
+        return data.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise UsageError("not UTF-8 text", expected="a YAML file", path=path, line=line) from None
+
+
+# ---------------------------------------------------------------- YAML events to plain values, with their lines
+
+
+@dataclass(slots=True)
+class _Document:
+    value: Any = None
+    lines: dict[Location, int] = field(default_factory=dict)
+
+    def line(self, location: Location) -> int | None:
+        """Line of the longest known beginning of a location (pydantic mixes names of union members in)."""
+        known: Location = ()
+        for part in location:
+            if (*known, part) in self.lines:
+                known = (*known, part)
+        return self.lines.get(known)
+
+
+@dataclass(slots=True)
+class _Open:
+    """A list or mapping under construction."""
+
+    value: Any
+    location: Location
+    line: int
+    anchor: str | None
+    nodes_before: int
+    key: Any = None
+    has_key: bool = False
+    merges: list[tuple[Any, int]] = field(default_factory=list)
+
+
+def _parse(text: str, path: str | Path | None) -> _Document:
+    try:
+        return _Builder(path).build(yaml.parse(text, Loader=_LOADER))
+    except yaml.YAMLError as error:
+        mark = getattr(error, "problem_mark", None) or getattr(error, "context_mark", None)
+        problem = getattr(error, "problem", None) or str(error).splitlines()[0]
+        cause = "tabs cannot indent in YAML; use blanks" if _tab_indents(text, mark) else None
+        raise UsageError(
+            f"not YAML: {problem}", cause=cause, path=path, line=None if mark is None else mark.line + 1
+        ) from None
+
+
+def _tab_indents(text: str, mark: Any) -> bool:
+    line = [] if mark is None else text.splitlines()[mark.line : mark.line + 1]
+    return any("\t" in part[: len(part) - len(part.lstrip())] for part in line)
+
+
+class _Builder:
+    """Values from parser events, without recursion, so that no input can overflow the stack."""
+
+    def __init__(self, path: str | Path | None) -> None:
+        self.path = path
+        self.document = _Document()
+        self.stack: list[_Open] = []
+        self.anchors: dict[str, tuple[Any, int]] = {}
+        self.nodes = 0
+        self.documents = 0
+
+    def build(self, events: Iterator[Any]) -> _Document:
+        for event in events:
+            if isinstance(event, yaml.ScalarEvent):
+                self._count(1, event)
+                value = self._scalar(event)
+                if event.anchor:
+                    self.anchors[event.anchor] = (value, 1)
+                self._place(value, event)
+            elif isinstance(event, yaml.MappingStartEvent | yaml.SequenceStartEvent):
+                self._open(event)
+            elif isinstance(event, yaml.MappingEndEvent | yaml.SequenceEndEvent):
+                self._close(event)
+            elif isinstance(event, yaml.AliasEvent):
+                anchor = str(event.anchor)
+                if anchor not in self.anchors:
+                    self._fail(event, f"the alias '*{anchor}' names no anchor above it, or contains itself")
+                value, nodes = self.anchors[anchor]
+                self._count(nodes, event)
+                self._place(value, event)
+            elif isinstance(event, yaml.DocumentStartEvent):
+                self.documents += 1
+                if self.documents > 1:
+                    self._fail(event, "a second document begins here ('---'); expected one document")
+        return self.document
+
+    def _fail(self, event: Any, found: str) -> None:
+        raise UsageError(found, path=self.path, line=event.start_mark.line + 1)
+
+    def _count(self, nodes: int, event: Any) -> None:
+        self.nodes += nodes
+        if self.nodes > MAX_NODES:
+            self._fail(event, f"the file unfolds to more than {MAX_NODES} values (aliases of aliases?)")
+
+    def _location(self) -> Location:
+        if not self.stack:
+            return ()
+        top = self.stack[-1]
+        return (*top.location, top.key if isinstance(top.value, dict) else len(top.value))
+
+    def _open(self, event: Any) -> None:
+        self._count(1, event)
+        if len(self.stack) >= MAX_DEPTH:
+            self._fail(event, f"nested deeper than {MAX_DEPTH} levels")
+        is_map = isinstance(event, yaml.MappingStartEvent)
+        if event.tag not in (None, "!", _TAG + ("map" if is_map else "seq")):
+            self._fail(event, f"the tag '{event.tag}' is not allowed here")
+        top = self.stack[-1] if self.stack else None
+        if top is not None and isinstance(top.value, dict) and not top.has_key:
+            self._fail(event, "a list or mapping stands where a key should be")
+        line = event.start_mark.line + 1
+        self.stack.append(_Open({} if is_map else [], self._location(), line, event.anchor, self.nodes - 1))
+
+    def _close(self, event: Any) -> None:
+        done = self.stack.pop()
+        for merged, line in done.merges:
+            for part in merged if isinstance(merged, list) else [merged]:
+                if not isinstance(part, dict):
+                    raise UsageError("'<<' merges something that is not a mapping", path=self.path, line=line)
+                for key, value in part.items():
+                    done.value.setdefault(key, value)
+        if done.anchor:
+            self.anchors[done.anchor] = (done.value, self.nodes - done.nodes_before)
+        self._place(done.value, event, done.line)
+
+    def _place(self, value: Any, event: Any, line: int | None = None) -> None:
+        line = event.start_mark.line + 1 if line is None else line
+        if not self.stack:
+            self.document.value = value
+            self.document.lines.setdefault((), line)
+            return
+        top = self.stack[-1]
+        if isinstance(top.value, list):
+            self.document.lines[self._location()] = line
+            top.value.append(value)
+        elif top.has_key:
+            top.has_key = False
+            if top.key == "<<":
+                top.merges.append((value, line))
+            else:
+                top.value[top.key] = value
+        else:
+            self._key(top, value, event, line)
+
+    def _key(self, top: _Open, key: Any, event: Any, line: int) -> None:
+        if key is None or isinstance(key, list | dict):
+            self._fail(event, "a key is empty or not a word")
+        # keys are names: 'on', 1 or 1.5 as keys stay what was written (pydantic wants words)
+        key = event.value if isinstance(event, yaml.ScalarEvent) else str(key)
+        place = (*top.location, key)
+        if key in top.value:
+            first = self.document.lines.get(place)
+            self._fail(event, f"the key '{key}' stands twice (first on line {first})")
+        top.key, top.has_key = key, True
+        self.document.lines[place] = line
+
+    def _scalar(self, event: Any) -> Any:
+        text: str = event.value
+        if event.tag not in (None, "!", _TAG + "str"):
+            short = event.tag.replace(_TAG, "!!")
+            if short not in ("!!int", "!!float", "!!bool", "!!null"):
+                self._fail(event, f"the tag '{short}' is not allowed")
+        elif event.tag is not None or not event.implicit[0]:
+            return text  # quoted, block text, or !!str
+        if text in _WORDS:
+            return _WORDS[text]
+        if _INT.match(text) and len(text) < 40:
+            return int(text)
+        if _HEX.match(text) and len(text) < 40:
+            return int(text, 16)
+        if _FLOAT.match(text):
+            return float(text)
+        return text
+
+
+# ---------------------------------------------------------------- pydantic's findings in our words
+
+
+def _explain(
+    error: pydantic.ValidationError, model: type[pydantic.BaseModel], document: _Document, path: str | Path | None
+) -> UsageError:
+    findings: list[tuple[int | None, str, str | None]] = []
+    for item in error.errors(include_url=False):
+        found, cause = _finding(item, model)
+        findings.append((document.line(item["loc"]), found, cause))
+    findings.sort(key=lambda finding: finding[0] or 0)
+    if len(findings) == 1:
+        line, found, cause = findings[0]
+        return UsageError(found, cause=cause, path=path, line=line)
+    lines = [
+        f"line {line}: {found}" + (f" ({cause})" if cause else "") if line else found for line, found, cause in findings
+    ]
+    shown = lines[:20] + ([f"and {len(lines) - 20} more"] if len(lines) > 20 else [])
+    return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
+
+
+def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | None]:
+    location: Location = item["loc"]
+    where = ".".join(str(part) for part in location)
+    if item["type"] == "extra_forbidden":
+        names = _field_names(*_models_at(model, location[:-1]))
+        near = nearest(location[-1], names)
+        cause = f"did you mean '{near}'?" if near else f"valid keys are {_listed(names)}"
+        return f"unknown key '{where}'", cause
+    if item["type"] == "missing":
+        return f"the key '{where}' is missing", None
+    message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
+    if item["type"] in ("value_error", "assertion_error"):
+        return (f"{where}: {message}" if where else message), None
+    found = repr(item["input"])
+    found = found if len(found) <= 60 else found[:57] + "..."
+    return f"{where}: found {found}; expected {message}", None
+
+
+def _listed(names: Iterable[str]) -> str:
+    return ", ".join(f"'{name}'" for name in names)
+
+
+def _field_names(*models: type[pydantic.BaseModel]) -> list[str]:
+    names = [info.alias or name for model in models for name, info in model.model_fields.items()]
+    return list(dict.fromkeys(names))
+
+
+def _models_at(model: type[pydantic.BaseModel], location: Location) -> list[type[pydantic.BaseModel]]:
+    """Models that may stand at a location; parts that name no field are indices, keys or union members."""
+    here: list[type[pydantic.BaseModel]] = [model]
+    for part in location:
+        inside: list[type[pydantic.BaseModel]] = []
+        for candidate in here:
+            for name, info in candidate.model_fields.items():
+                if part in (name, info.alias):
+                    inside += _models_in(info.annotation)
+        named = [candidate for candidate in here if candidate.__name__ == part]
+        here = inside or named or here
+    return here
+
+
+def _models_in(annotation: Any) -> list[type[pydantic.BaseModel]]:
+    if isinstance(annotation, type) and not isinstance(annotation, types.GenericAlias):
+        return [annotation] if issubclass(annotation, pydantic.BaseModel) else []
+    return [model for part in typing.get_args(annotation) for model in _models_in(part)]

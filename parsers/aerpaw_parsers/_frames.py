@@ -1,0 +1,55 @@
+"""Frames of the record model from plain arrays."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.records import COLUMNS, Attribute, Kind
+from aerpaw_cmp.units import AnyArray
+
+_INTEGERS = ("fix", "satellites")
+
+
+def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray]) -> pd.DataFrame:
+    """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1)."""
+    count = len(time)
+    content: dict[str, Any] = {
+        "time": np.asarray(time, dtype="datetime64[ns]"),
+        "line": np.asarray(line, dtype=np.int64),
+        # object, not pandas' string type: no scan of the column, the same on every pandas
+        "flag": pd.Series(flag, dtype=object),
+    }
+    for name in COLUMNS[kind]:
+        if name in _INTEGERS:
+            content[name] = np.asarray(values.get(name, np.full(count, -1)), dtype=np.int64)
+        else:
+            content[name] = np.asarray(values.get(name, np.full(count, np.nan)), dtype=np.float64)
+    for name, column in values.items():
+        if name not in content:
+            content[name] = column
+    made: pd.DataFrame = pd.DataFrame(content)
+    return made
+
+
+def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Attribute]:
+    """Attributes from the options, then those of the reader; what is unknown is left out."""
+    found: dict[str, Attribute | None] = {
+        "node": options.node,
+        "channel": options.channel,
+        "frequency_hz": options.frequency_hz,
+        "timezone": options.timezone,
+        **extra,
+    }
+    return {name: value for name, value in found.items() if value is not None}
+
+
+def steps_back(records: pd.DataFrame) -> list[str]:
+    """Warning where the clock of a log runs backwards."""
+    time = records["time"].to_numpy().astype(np.int64)
+    back = int((np.diff(time) < 0).sum())
+    return [f"time steps back at {back} places"] if back else []

@@ -1,0 +1,209 @@
+"""Lines of a file as byte ranges, without making one Python object per line.
+
+The accounting law starts here: a line ends with LF (a CR before it belongs to the line end); a last text
+without LF is a line too; a file that ends with LF has no further, empty line.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from aerpaw_cmp.records import RejectedLine
+from aerpaw_cmp.units import AnyArray, BoolArray, IntArray
+
+TEXT_LIMIT = 500
+"""Characters of a rejected line that are kept."""
+
+UNTERMINATED = "unterminated_line"
+"""Flag of a record in a last line without line end: its last field may be cut short."""
+
+
+NUMBER = rb"[-+]?\d{1,20}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,3})?"
+"""A decimal number of bounded length (bytes pattern, no group)."""
+
+
+@dataclass(frozen=True)
+class Lines:
+    """The lines of ``data``: line ``i`` (0-based) is ``data[starts[i]:ends[i]]``, its line end left out."""
+
+    data: bytes
+    starts: IntArray
+    ends: IntArray
+
+    def __len__(self) -> int:
+        """Count the lines."""
+        return len(self.starts)
+
+    @cached_property
+    def buffer(self) -> AnyArray:
+        """The bytes as a uint8 array."""
+        return np.frombuffer(self.data, dtype=np.uint8)
+
+    @property
+    def unterminated(self) -> bool:
+        """Whether the last line lacks its line end."""
+        return bool(self.data) and not self.data.endswith(b"\n")
+
+    @cached_property
+    def blank(self) -> BoolArray:
+        """Mask of lines that hold white space only."""
+        empty = self.ends <= self.starts
+        # only short lines or those that begin with white space can be blank: few are looked at one by one
+        first = self.buffer[np.minimum(self.starts, max(len(self.data) - 1, 0))] if len(self) else np.empty(0, np.uint8)
+        for i in np.flatnonzero(
+            ~empty & ((first == 32) | (first == 9) | (first == 13) | (first == 11) | (first == 12))
+        ):
+            empty[i] = not self.data[self.starts[i] : self.ends[i]].strip()
+        return empty
+
+    def raw(self, i: int) -> bytes:
+        """Bytes of line ``i``."""
+        return self.data[self.starts[i] : self.ends[i]]
+
+    def text(self, i: int) -> str:
+        """Line ``i`` as text for people: at most ``TEXT_LIMIT`` characters, broken bytes replaced."""
+        piece = self.data[self.starts[i] : min(self.ends[i], self.starts[i] + 4 * TEXT_LIMIT)]
+        return piece.decode("utf-8", errors="replace")[:TEXT_LIMIT]
+
+    def reject(self, i: int, reason: str) -> RejectedLine:
+        """Line ``i`` as a rejected line."""
+        return RejectedLine(int(i) + 1, reason, self.text(i))
+
+    def reject_all(self, numbers: IntArray, reason: str) -> list[RejectedLine]:
+        """Several lines rejected for one reason."""
+        return [self.reject(int(i), reason) for i in numbers]
+
+    def fixed(self, numbers: IntArray, width: int) -> AnyArray:
+        """Bytes of equally long lines as a ``(len(numbers), width)`` uint8 array."""
+        if len(numbers) == 0:
+            return np.empty((0, width), dtype=np.uint8)
+        stride = np.unique(np.diff(self.starts[numbers])) if len(numbers) > 1 else np.array([width])
+        if len(stride) == 1:  # one block of equal lines: no gather, a view is enough
+            return np.lib.stride_tricks.as_strided(
+                self.buffer[self.starts[numbers[0]] :], (len(numbers), width), (int(stride[0]), 1), writeable=False
+            )
+        return np.asarray(self.buffer[self.starts[numbers][:, None] + np.arange(width)])
+
+
+def split(data: bytes) -> Lines:
+    r"""Cut a file into lines.
+
+    Examples
+    --------
+    >>> [bytes(split(b"a\r\n\nb").raw(i)) for i in range(3)]
+    [b'a', b'', b'b']
+    """
+    buffer = np.frombuffer(data, dtype=np.uint8)
+    ends = np.flatnonzero(buffer == 10).astype(np.int64)
+    starts = np.concatenate(([0], ends + 1)).astype(np.int64)
+    if len(data) and data[-1] != 10:
+        ends = np.append(ends, len(data))
+    else:
+        starts = starts[:-1]
+    if len(ends):
+        before = buffer[np.maximum(ends - 1, 0)]
+        ends = np.where((ends > starts) & (before == 13), ends - 1, ends)
+    return Lines(data, starts, ends)
+
+
+def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
+    r"""Lines that the pattern describes, and its groups.
+
+    Parameters
+    ----------
+    pattern : re.Pattern
+        MULTILINE, from ``^`` to ``\\r?$``, unable to cross a line end, every repetition bounded.
+
+    Returns
+    -------
+    numbers : int array, shape (n,)
+        0-based numbers of the matching lines.
+    groups : list of tuple of bytes, length n
+        One tuple per line.
+    """
+    positions: list[int] = []
+    groups: list[tuple[bytes, ...]] = []
+    for found in pattern.finditer(lines.data):
+        positions.append(found.start())
+        groups.append(found.groups(b""))
+    return np.searchsorted(lines.starts, np.array(positions, dtype=np.int64)), groups
+
+
+def remainder(
+    lines: Lines, accepted: IntArray, reason: Callable[[bytes], str | None], *, blank: IntArray | None = None
+) -> tuple[int, list[RejectedLine]]:
+    """Account for the lines that gave no record.
+
+    Parameters
+    ----------
+    accepted : int array
+        0-based numbers of the lines that gave records.
+    reason : callable
+        Reason why a line is rejected, or None for a header or comment.
+    blank : int array, optional
+        0-based numbers already known to be headers or comments.
+
+    Returns
+    -------
+    blank : int
+    rejected : list of RejectedLine
+    """
+    left = np.ones(len(lines), dtype=bool)
+    left[accepted] = False
+    known = lines.blank & left
+    if blank is not None:
+        known[blank] = True
+    count = int(known.sum())
+    rejected: list[RejectedLine] = []
+    for i in np.flatnonzero(left & ~known):
+        why = reason(lines.raw(int(i)))
+        if why is None:
+            count += 1
+        else:
+            rejected.append(lines.reject(int(i), why))
+    return count, rejected
+
+
+def columns(groups: list[tuple[bytes, ...]], count: int) -> list[AnyArray]:
+    """Groups by column, as fixed-width byte arrays."""
+    if not groups:
+        return [np.empty(0, dtype="S1") for _ in range(count)]
+    return [np.array(column, dtype=np.bytes_) for column in zip(*groups, strict=True)]
+
+
+def numbers(column: AnyArray) -> AnyArray:
+    """Text of numbers to float64; empty text is NaN."""
+    if column.dtype.itemsize == 0 or len(column) == 0:
+        return np.full(len(column), np.nan)
+    return np.asarray(np.where((column == b"") | (column == b"None"), b"nan", column).astype(np.float64))
+
+
+def flags(count: int) -> AnyArray:
+    """Empty flag column."""
+    return np.full(count, "", dtype=object)
+
+
+def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
+    """Add a reason where the mask holds, in place."""
+    if mask.any():
+        old = column[mask]
+        column[mask] = [f"{text};{reason}" if text else reason for text in old]
+
+
+def first_lines(head: bytes, count: int = 40) -> list[bytes]:
+    """Complete, non-blank lines at the start of a file: what sniffers judge by."""
+    pieces = head[:16_384].split(b"\n")
+    if len(head) > 16_384 or (len(pieces) > 1 and not head.endswith(b"\n")):
+        pieces = pieces[:-1]  # a cut line proves nothing
+    return [piece.rstrip(b"\r") for piece in pieces if piece.strip()][:count]
+
+
+def mostly(head: bytes, pattern: re.Pattern[bytes], *, skip: int = 0) -> bool:
+    """Whether the pattern describes more than half of the first lines."""
+    lines = first_lines(head)[skip:]
+    return bool(lines) and 2 * sum(pattern.match(line) is not None for line in lines) > len(lines)

@@ -1,0 +1,272 @@
+"""Wall clocks to UTC, once and with the zone named.
+
+AERPAW nodes write naive America/New_York time almost everywhere; some authors then stored that wall clock
+as if it were UTC. Every reader comes here, so the rule exists once.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass, field
+from datetime import datetime, timedelta, timezone, tzinfo
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import numpy as np
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.units import AnyArray, BoolArray, IntArray
+
+from ._lines import add_flag
+
+AMBIGUOUS = "ambiguous_local_time"
+NONEXISTENT = "nonexistent_local_time"
+TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
+"""Wall clock as AERPAW tools write it (bytes pattern, no group)."""
+ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
+"""Optional offset behind :data:`TIME`."""
+
+_BUCKET_S = 900  # no zone in use changes its offset within a quarter of an hour of wall clock
+_MONTH_DAYS = np.array([0, 31, 29, 31, 30, 31, 30, 31, 31, 30, 31, 30, 31])
+
+
+@dataclass(frozen=True)
+class Instants:
+    """UTC times and what is doubtful about them.
+
+    Parameters
+    ----------
+    time : datetime64[ns] array, shape (n,)
+        UTC, naive.
+    ambiguous, nonexistent : bool array, shape (n,)
+        Wall clock read twice, or never, because of a change of the clock.
+    warnings : tuple of str
+        What the user should know.
+    """
+
+    time: AnyArray
+    ambiguous: BoolArray
+    nonexistent: BoolArray
+    warnings: tuple[str, ...] = field(default=())
+
+    def take(self, rows: IntArray) -> Instants:
+        """Some of the times; the warnings stay with the whole."""
+        return Instants(self.time[rows], self.ambiguous[rows], self.nonexistent[rows])
+
+    def flag(self, column: AnyArray) -> None:
+        """Add the reasons to a flag column, in place."""
+        add_flag(column, self.ambiguous, AMBIGUOUS)
+        add_flag(column, self.nonexistent, NONEXISTENT)
+
+
+def zone(name: str | None, *, needed_by: str) -> tzinfo:
+    """The named zone; ``UsageError`` naming the key ``timezone:`` where there is none."""
+    if not name:
+        raise UsageError(
+            f"no time zone for the zone-less clock of {needed_by}",
+            expected="the key 'timezone:' (or --timezone), e.g. timezone: America/New_York",
+            cause="the log writes local wall time without an offset",
+        )
+    if name.upper() == "UTC":  # needs no zone database
+        return timezone.utc
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError, OSError) as error:
+        raise UsageError(
+            f"unknown time zone {name!r}",
+            expected="an IANA name under 'timezone:', e.g. America/New_York",
+            cause="a misspelt name, or no zone database on this machine",
+        ) from error
+
+
+def _offset_s(wall_s: int, where: tzinfo, fold: int) -> int:
+    try:
+        moment = datetime(1970, 1, 1) + timedelta(seconds=wall_s)
+        offset = moment.replace(tzinfo=where, fold=fold).utcoffset()
+    except (OverflowError, ValueError):
+        return 0
+    return 0 if offset is None else round(offset.total_seconds())
+
+
+def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Instants:
+    """Wall clock of a zone to UTC.
+
+    A wall clock that exists twice is read as the first pass (daylight time) until the log's clock steps back by
+    half an hour or more, afterwards as the second; both are flagged. One that never existed is read
+    with the offset before the change, and flagged.
+
+    Parameters
+    ----------
+    wall_ns : int array, shape (n,)
+        Wall clock as nanoseconds since 1970-01-01 00:00 of the same wall.
+    name : str or None
+        IANA zone.
+    needed_by : str
+        Whose clock, for the message.
+
+    Raises
+    ------
+    UsageError
+        If the zone is missing or unknown.
+    """
+    where = zone(name, needed_by=needed_by)
+    wall_s = wall_ns // 1_000_000_000
+    buckets, inverse = _unique_buckets(wall_s)
+    first = np.array([_offset_s(int(b) * _BUCKET_S, where, 0) for b in buckets], dtype=np.int64)
+    second = np.array([_offset_s(int(b) * _BUCKET_S, where, 1) for b in buckets], dtype=np.int64)
+    ambiguous = (first > second)[inverse]
+    nonexistent = (first < second)[inverse]
+    offset = first[inverse]
+    if ambiguous.any():
+        stepped = np.concatenate(([False], np.diff(wall_s) <= -1800))
+        offset = np.where(ambiguous & (np.cumsum(stepped) > 0), second[inverse], offset)
+    warnings = []
+    if ambiguous.any():
+        warnings.append(
+            f"{int(ambiguous.sum())} times lie in the hour that {name} had twice: read as daylight time "
+            f"until the log's clock steps back; flagged {AMBIGUOUS}"
+        )
+    if nonexistent.any():
+        warnings.append(
+            f"{int(nonexistent.sum())} times lie in the hour that {name} skipped: wrong zone? flagged {NONEXISTENT}"
+        )
+    utc = (wall_ns - offset * 1_000_000_000).astype("datetime64[ns]")
+    return Instants(utc, ambiguous, nonexistent, tuple(warnings))
+
+
+def _unique_buckets(wall_s: IntArray) -> tuple[IntArray, AnyArray]:
+    """Distinct quarter hours and the index of each time; logs run forward, so runs come before sorting."""
+    bucket = wall_s // _BUCKET_S
+    if len(bucket) == 0:
+        return bucket, np.zeros(0, dtype=np.int64)
+    change = np.concatenate(([True], bucket[1:] != bucket[:-1]))
+    unique, index = np.unique(bucket[change], return_inverse=True)
+    return unique, index[np.cumsum(change) - 1]
+
+
+def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
+    """Zone-less clock to UTC under the options: local unless ``clock: utc`` says otherwise."""
+    if options.clock == "utc":
+        none = np.zeros(len(wall_ns), dtype=bool)
+        return Instants(wall_ns.astype("datetime64[ns]"), none, none)
+    return local_to_utc(wall_ns, options.timezone, needed_by=needed_by)
+
+
+def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
+    """Fixed-layout ``YYYY-mm-dd HH:MM:SS[.f...]`` to wall nanoseconds.
+
+    Parameters
+    ----------
+    cells : uint8 array, shape (n, 19) or (n, 20 + fraction)
+        One time per row; ``fraction`` digits behind the dot.
+
+    Returns
+    -------
+    wall_ns : int array, shape (n,)
+        Zero where invalid.
+    valid : bool array, shape (n,)
+        Is it a date of the calendar and a time of the day?
+    """
+    places = [0, 1, 2, 3, 5, 6, 8, 9, 11, 12, 14, 15, 17, 18, *range(20, 20 + fraction)]
+    digit = cells[:, places].T.astype(np.int32) - 48
+    valid = np.all((digit >= 0) & (digit <= 9), axis=0)
+    for place, allowed in ((4, b"-/"), (7, b"-/"), (10, b" T"), (13, b":"), (16, b":"), (19, b".")):
+        if place < cells.shape[1]:
+            valid &= (cells[:, place] == allowed[0]) | (cells[:, place] == allowed[-1])
+    year = digit[0] * 1000 + digit[1] * 100 + digit[2] * 10 + digit[3]
+    month, day, hour, minute, second = (digit[i] * 10 + digit[i + 1] for i in (4, 6, 8, 10, 12))
+    inside = np.clip(month, 1, 12)
+    leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
+    days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
+    # datetime64[ns] spans 1678-2262; a log outside 1970-2261 is a clock that was never set
+    valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
+    valid &= (hour < 24) & (minute < 60) & (second < 60)
+    months = (year.astype(np.int64) - 1970) * 12 + inside - 1
+    date = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
+    seconds = date * 86_400 + hour * 3600 + minute * 60 + second
+    nanos = np.zeros(len(cells), dtype=np.int64)
+    for i in range(fraction):
+        nanos += digit[14 + i].astype(np.int64) * 10 ** (8 - i)
+    return np.where(valid, seconds * 1_000_000_000 + nanos, 0), valid
+
+
+def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
+    """Times as byte strings of mixed length (the form of :data:`TIME` + :data:`ZONE`).
+
+    Returns
+    -------
+    wall_ns, valid : arrays, shape (n,)
+        As :func:`parse_digits`.
+    offset_s : int array, shape (n,)
+        Offset written in the text, else 0.
+    zoned : bool array, shape (n,)
+        Does the text carry an offset?
+    """
+    count = len(column)
+    wall, offset = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    valid, zoned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
+    if count == 0:
+        return wall, valid, offset, zoned
+    width = max(column.dtype.itemsize, 30)
+    cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
+    digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)
+    dotted = cells[:, 19] == 46
+    fraction = np.where(dotted, np.cumprod(digits, axis=1).sum(axis=1), 0)
+    for length in np.unique(fraction):
+        rows = np.flatnonzero(fraction == length)
+        end = 20 + int(length) if length else 19
+        wall[rows], valid[rows] = parse_digits(cells[rows, :end], int(length))
+        tail = column[rows].astype(f"S{width}").view(f"S{1}").reshape(len(rows), width)[:, end:]
+        tails = np.ascontiguousarray(tail).view(f"S{width - end}").ravel()
+        for text in np.unique(tails):  # one entry per distinct offset
+            seconds = _zone_s(bytes(text))
+            here = rows[tails == text]
+            if seconds is None:
+                valid[here] = False
+            elif text:
+                offset[here], zoned[here] = seconds, True
+    return wall, valid, offset, zoned
+
+
+def _zone_s(text: bytes) -> int | None:
+    if text in (b"", b"Z"):
+        return 0
+    found = re.fullmatch(rb"([+-])(\d\d):?(\d\d)", text)
+    if not found:
+        return None
+    seconds = int(found[2]) * 3600 + int(found[3]) * 60
+    return -seconds if found[1] == b"-" else seconds
+
+
+def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> tuple[Instants, BoolArray]:
+    """Times as text to UTC: an offset in the text wins, the rest is wall clock of the zone.
+
+    Returns
+    -------
+    instants : Instants
+    valid : bool array, shape (n,)
+        Times that are none are False, and 1970-01-01 in ``instants``.
+    """
+    wall, valid, offset, zoned = parse_texts(column)
+    naive = valid & ~zoned
+    utc = (wall - offset * 1_000_000_000).astype("datetime64[ns]")
+    ambiguous, nonexistent = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
+    if not naive.any():
+        return Instants(utc, ambiguous, nonexistent), valid
+    local = wall_to_utc(wall[naive], options, needed_by=needed_by)
+    utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
+    return Instants(utc, ambiguous, nonexistent, local.warnings), valid
+
+
+def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:
+    """``time_origin`` as UTC nanoseconds; None where the option is absent."""
+    if options.time_origin is None:
+        return None
+    text = str(options.time_origin).strip().encode()
+    instants, valid = texts_to_utc(np.array([text or b"-"]), options, needed_by=f"time_origin of {needed_by}")
+    if not valid[0]:
+        raise UsageError(
+            f"time_origin {options.time_origin!r} is no time",
+            expected="an ISO time such as 2024-07-02T15:37:10.5Z, or local time with 'timezone:'",
+        )
+    return int(instants.time.astype(np.int64)[0])

@@ -1,0 +1,202 @@
+"""Any CSV with a header, its columns mapped by the user: ``columns: {time: Time, rss_db: Power}``, ``kind: rss``.
+
+It is never guessed: flight.yaml names it. Times are texts (``YYYY-mm-dd HH:MM:SS[.f][offset]``) or numbers: seconds
+since ``time_origin`` where that is given, else since 1970 in UTC (``clock: local_as_utc`` for wall time stored so).
+"""
+
+from __future__ import annotations
+
+import csv
+import re
+from difflib import get_close_matches
+
+import numpy as np
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.readers import Reader, ReadOptions
+from aerpaw_cmp.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.units import AnyArray, FloatArray
+
+from . import _frames, _lines, _time
+
+EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
+_TEXT = re.compile(_time.TIME + _time.ZONE)
+_PLAIN = re.compile(_lines.NUMBER)
+
+
+def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
+    """Never: a CSV says nothing about its units; name this reader in flight.yaml."""
+    return False
+
+
+def _fields(line: bytes) -> list[str]:
+    text = line.decode("utf-8", errors="replace")
+    if '"' not in text:
+        return text.split(",")
+    # a stray CR or NUL would end the csv module's patience with the whole line
+    return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")]), [])
+
+
+def _header(lines: _lines.Lines, first: int) -> list[str]:
+    try:
+        return [name.strip() for name in _fields(lines.raw(first))]
+    except csv.Error as error:
+        raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
+
+
+def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, int]]:
+    """Kind, and the position of the file column for each record column."""
+    if options.kind is None:
+        raise UsageError("generic_csv does not know what the file holds", expected="'kind:' telemetry, rss or rank")
+    allowed = ["time", *COLUMNS[options.kind], *(EXTRA if options.kind == "rank" else ())]
+    unknown = sorted(set(options.columns) - set(allowed))
+    if unknown:
+        near = get_close_matches(unknown[0], allowed, 1)
+        raise UsageError(
+            f"'columns:' names {unknown[0]!r}, which a {options.kind} record does not have",
+            expected=", ".join(allowed),
+            cause=f"did you mean {near[0]!r}?" if near else None,
+        )
+    needed = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
+    lacking = [name for name in ("time", *needed[options.kind]) if name not in options.columns]
+    if lacking:
+        raise UsageError(
+            f"'columns:' lacks {', '.join(lacking)}", expected=f"e.g. columns: {{{lacking[0]}: {header[0]!r}}}"
+        )
+    absent = sorted({name for name in options.columns.values() if name not in header})
+    if absent:
+        near = get_close_matches(absent[0], header, 1)
+        raise UsageError(
+            f"the file has no column {absent[0]!r}",
+            expected="one of " + ", ".join(repr(name) for name in header[:40]),
+            cause=f"did you mean {near[0]!r}?" if near else None,
+        )
+    if options.kind == "rank" and options.ri_base is None:
+        raise UsageError(
+            "generic_csv cannot know whether rank 1 is written as 0 or 1", expected="'ri_base:' zero or one"
+        )
+    return options.kind, {column: header.index(name) for column, name in options.columns.items()}
+
+
+def _numbers(cells: list[str]) -> FloatArray:
+    """Numbers of a column; what is none becomes NaN."""
+    stripped = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
+    return np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in stripped], dtype=np.float64)
+
+
+def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
+    texts = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
+    plain = np.array([_PLAIN.fullmatch(cell) is not None for cell in texts], dtype=bool)
+    if not plain.any():
+        written = np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts] or [b"-"], dtype=np.bytes_)
+        return _time.texts_to_utc(written[: len(texts)], options, needed_by="generic_csv")
+    seconds = np.array([float(cell) if mark else np.nan for cell, mark in zip(texts, plain, strict=True)])
+    origin = _time.origin_ns(options, needed_by="generic_csv")
+    valid = np.isfinite(seconds) & (np.abs(seconds) < (9e8 if origin is not None else 9.2e9))
+    whole = np.floor(np.where(valid, seconds, 0))
+    ns = whole.astype(np.int64) * 10**9 + np.round((np.where(valid, seconds, 0) - whole) * 1e9).astype(np.int64)
+    ns += origin or 0
+    if origin is None and options.clock in ("local", "local_as_utc"):
+        return _time.local_to_utc(ns, options.timezone, needed_by="generic_csv"), valid
+    none = np.zeros(len(ns), dtype=bool)
+    return _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """One stream of the kind that the options name.
+
+    Raises
+    ------
+    UsageError
+        If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
+    """
+    lines = _lines.split(data.removeprefix(b"\xef\xbb\xbf"))
+    blank = lines.blank
+    first = int(np.argmin(blank)) if len(lines) and not blank.all() else -1
+    if first < 0:
+        return ReadResult("generic_csv", (), len(lines), 0, len(lines))
+    header = _header(lines, first)
+    kind, where = _checked(options, header)
+    rows, cells, rejected = _table(lines, first, len(header))
+    column = {name: [line[i] for line in cells] for name, i in where.items()}
+    instants, valid = _times(column.pop("time"), options)
+    rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
+    flag = _lines.flags(len(rows))
+    instants.flag(flag)
+    values, extra = _values(kind, {name: _numbers(texts) for name, texts in column.items()}, flag, options)
+    if lines.unterminated:
+        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
+    frame = _frames.frame(kind, instants.time, rows + 1, flag, values)[valid].reset_index(drop=True)
+    stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
+    warnings = [*instants.warnings, *_frames.steps_back(frame)]
+    if kind == "rss" and options.unit is None:
+        warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
+    return ReadResult(
+        "generic_csv",
+        (stream,) if len(frame) else (),
+        len(lines),
+        len(frame),
+        int(blank.sum()) + 1,
+        tuple(sorted(rejected, key=lambda line: line.number)),
+        tuple(warnings),
+    )
+
+
+def _table(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
+    """Rows with as many fields as the header, and the rest as rejected lines."""
+    numbers: list[int] = []
+    cells: list[list[str]] = []
+    rejected: list[RejectedLine] = []
+    for i in np.flatnonzero(~lines.blank).tolist():
+        if i == first:
+            continue
+        try:
+            fields = _fields(lines.raw(i))
+        except csv.Error as error:
+            rejected.append(lines.reject(i, f"no CSV: {error}"))
+            continue
+        if len(fields) == width:
+            numbers.append(i)
+            cells.append(fields)
+        else:
+            rejected.append(lines.reject(i, f"{len(fields)} fields where the header has {width} (torn line?)"))
+    return np.array(numbers, dtype=np.int64), cells, rejected
+
+
+def _values(
+    kind: Kind, values: dict[str, AnyArray], flag: AnyArray, options: ReadOptions
+) -> tuple[dict[str, AnyArray], dict[str, str | None]]:
+    """Columns by the rules of the kind, and the attributes that go with them."""
+    if kind == "rss":
+        silent = ~(values["rss_db"] > options.floor_db)
+        _lines.add_flag(flag, silent, "out_of_coverage")
+        values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
+        return values, {"unit": options.unit or "dB re full scale"}
+    if kind == "rank":
+        ri = values["ri_raw"]
+        rank = ri + 1 if options.ri_base == "zero" else ri
+        good = (rank >= 1) & (rank <= 8)
+        none = np.isnan(ri) | ((ri == 0) & (options.ri_base == "one"))
+        _lines.add_flag(flag, none, "no_csi")
+        _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
+        values["rank"] = np.where(good, rank, np.nan)
+        return values, {"ri_base": options.ri_base}
+    latitude, longitude, altitude = (values[name] for name in ("latitude_deg", "longitude_deg", "altitude_m"))
+    lost = ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (altitude > -998.5))
+    _lines.add_flag(flag, lost, "no_fix")
+    for name in ("latitude_deg", "longitude_deg", "altitude_m"):
+        values[name] = np.where(lost, np.nan, values[name])
+    for name in ("fix", "satellites"):
+        if name in values:
+            values[name] = np.where(np.isnan(values[name]), -1, values[name]).clip(-1, 255).astype(np.int64)
+    return values, {}
+
+
+READER = Reader(
+    name="generic_csv",
+    title="any CSV with a header, columns mapped in flight.yaml",
+    kinds=("telemetry", "rss", "rank"),
+    sample="Time,Power,...",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,75 @@
+"""Rank of a Keysight Nemo phone as CSV: ``index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi``.
+
+Times are milliseconds relative to an origin that the file does not hold. The rank is that of the scheduled PDSCH,
+one-based; rows of other measurements leave it empty.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.readers import Reader, ReadOptions
+from aerpaw_cmp.records import ReadResult
+
+from . import _lines, _nemo
+
+_HEADER = b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
+_N = rb"(" + _lines.NUMBER + rb")"
+_CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
+_ROW = re.compile(rb"^(\d{1,12})," + _N + (rb"," + _CELL) * 7 + rb"\r?$", re.MULTILINE)
+_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether the first line is the header."""
+    first = head.lstrip(b"\xef\xbb\xbf")[: len(_HEADER) + 2]
+    return first.startswith(_HEADER) and first[len(_HEADER) :].strip() == b""
+
+
+def _reason(line: bytes) -> str | None:
+    if line.lstrip(b"\xef\xbb\xbf").strip() == _HEADER:
+        return None
+    fields = line.count(b",") + 1
+    if fields != 9:
+        return f"{fields} fields where 9 were expected (torn line?)"
+    return "a field is no number"
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Rank stream with RSRP, SINR, CQI and the phone's own position.
+
+    Raises
+    ------
+    UsageError
+        If ``time_origin`` is no time, or is local and no time zone is given.
+    """
+    lines = _lines.split(data)
+    rows, groups = _lines.match(lines, _ROW)
+    column = [_lines.numbers(cells) for cells in _lines.columns(groups, 9)]
+    fits = np.abs(column[1]) <= _nemo.MOST_MS
+    blank, rejected = _lines.remainder(lines, rows, _reason)
+    rejected += lines.reject_all(rows[~fits], "the relative time is beyond any flight")
+    values = {name: column[2 + i][fits] for i, name in enumerate(_COLUMNS)}
+    stream, warnings = _nemo.stream(lines, rows[fits], column[1][fits], values, options, "nemo_csv")
+    count = int(fits.sum())
+    return ReadResult(
+        "nemo_csv",
+        (stream,) if count else (),
+        len(lines),
+        count,
+        blank,
+        tuple(sorted(rejected, key=lambda line: line.number)),
+        tuple(warnings) if count else (),
+    )
+
+
+READER = Reader(
+    name="nemo_csv",
+    title="Keysight Nemo NR rank, CSV with relative times",
+    kinds=("rank",),
+    sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,302 @@
+"""GNU Radio channel sounder logs (``power_log``, ``quality_log``, ``snr_log``): ``od -f -w4`` through ``ts``.
+
+``[2025-01-01 12:00:00.000000] 0000014      -35.401386``: arrival time, **octal** byte offset of the sample
+(four bytes each), value in dB re full scale. ``*`` stands for samples equal to the one before; a last line may
+hold an offset only. With no signal the power is 20 log10(FLT_MIN) minus the gain, about -790 dB.
+Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+
+import numpy as np
+
+from aerpaw_cmp.readers import Reader, ReadOptions
+from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray, IntArray
+
+from . import _frames, _lines, _time
+
+_STAMP = 28  # "[" + 26 characters of time + "]"
+_VALUE = 16  # od -f: right-aligned in sixteen columns
+_WIDTHS = (7, 8, 9)  # octal digits of the offset; seven until 8 MiB, then it grows
+_MOST_REPEATS = 5_000_000
+_HEAD = rb"^\[(" + _time.TIME + rb")\] "
+_ODD = re.compile(_HEAD + rb"+([0-7]{7,12}) +(" + _lines.NUMBER + rb"|-?nan|-?inf)[ \t]*$")
+_STAR = re.compile(_HEAD + rb"+\*[ \t]*$")
+_FOOT = re.compile(_HEAD + rb"+([0-7]{7,12})[ \t]*$")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether most of the first lines are od lines, with at least one sample."""
+    lines = _lines.first_lines(head)
+    samples = sum(_ODD.match(line) is not None for line in lines)
+    stars = sum(_STAR.match(line) is not None for line in lines)
+    return samples > 0 and 2 * (samples + stars) > len(lines)
+
+
+@dataclass
+class _Samples:
+    """Samples in file order: 0-based line, wall clock, byte offset, value."""
+
+    line: IntArray
+    wall: IntArray
+    offset: IntArray
+    value: FloatArray
+
+    @classmethod
+    def none(cls) -> _Samples:
+        """No samples."""
+        empty = np.zeros(0, dtype=np.int64)
+        return cls(empty, empty, empty, np.zeros(0))
+
+    def take(self, order: AnyArray) -> _Samples:
+        return _Samples(self.line[order], self.wall[order], self.offset[order], self.value[order])
+
+    def join(self, other: _Samples) -> _Samples:
+        return _Samples(
+            np.concatenate((self.line, other.line)),
+            np.concatenate((self.wall, other.wall)),
+            np.concatenate((self.offset, other.offset)),
+            np.concatenate((self.value, other.value)),
+        )
+
+
+def _decimal(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
+    """Right-aligned plain decimals, ``(n, 16)`` uint8, to float64 exactly as ``float`` reads them.
+
+    At most 15 digits over a power of ten up to 1e15: both are exact in float64, so one division rounds once.
+    """
+    count, width = cells.shape
+    mantissa = np.zeros(count, dtype=np.int64)
+    places = np.zeros(count, dtype=np.int64)
+    begun, dotted, negative = (np.zeros(count, dtype=bool) for _ in range(3))
+    valid = np.ones(count, dtype=bool)
+    for column in np.ascontiguousarray(cells.T)[:width]:
+        digit = column - np.uint8(48)
+        is_digit = digit <= 9
+        minus, dot, space = column == 45, column == 46, column == 32
+        valid &= is_digit | ((space | minus) & ~begun) | (dot & ~dotted)
+        negative |= minus
+        begun |= ~space
+        mantissa = np.where(is_digit, mantissa * 10 + digit, mantissa)
+        places += is_digit & dotted
+        dotted |= dot
+    valid &= cells[:, -1] != 45
+    valid &= (cells[:, -1] - np.uint8(48)) <= 9
+    value = mantissa / 10.0**places
+    return np.where(negative, -value, value), valid
+
+
+def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
+    """Octal digits, ``(n, w)`` uint8, to integers."""
+    digit = cells - np.uint8(48)
+    weight = 8 ** np.arange(cells.shape[1] - 1, -1, -1)
+    return digit.astype(np.int64) @ weight, np.all(digit <= 7, axis=1)
+
+
+def _fixed_layout(lines: _lines.Lines) -> _Samples:
+    """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines."""
+    length = lines.ends - lines.starts
+    found = _Samples.none()
+    for width in _WIDTHS:
+        rows = np.flatnonzero(length == _STAMP + 1 + width + _VALUE)
+        if not len(rows):
+            continue
+        cells = lines.fixed(rows, _STAMP + 1 + width + _VALUE)
+        wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
+        offset, octal = _octal(cells[:, _STAMP + 1 : _STAMP + 1 + width])
+        value, decimal = _decimal(cells[:, _STAMP + 1 + width :])
+        valid &= octal & decimal & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
+        valid &= cells[:, _STAMP + 1 + width] == 32
+        found = found.join(_Samples(rows, wall, offset, value).take(valid))
+    return found
+
+
+def _odd_lines(lines: _lines.Lines, done: IntArray) -> tuple[_Samples, _Samples, list[int], list[RejectedLine]]:
+    """The few other lines, one by one: samples, ``*`` and foot lines (value NaN), blank lines, rejected lines."""
+    left = np.ones(len(lines), dtype=bool)
+    left[done] = False
+    samples: list[tuple[int, bytes, bytes, float]] = []
+    marks: list[tuple[int, bytes, bytes, float]] = []
+    blank: list[int] = []
+    rejected: list[RejectedLine] = []
+    for i in np.flatnonzero(left).tolist():
+        line = lines.raw(i)
+        if found := _ODD.match(line):
+            short = len(line) < _STAMP + 1 + len(found[2]) + _VALUE
+            if short and i == len(lines) - 1 and lines.unterminated:
+                rejected.append(lines.reject(i, "torn last line: the value is cut short"))
+            else:
+                samples.append((i, found[1], found[2], float(found[3])))
+        elif found := _STAR.match(line):
+            marks.append((i, found[1], b"-1", np.nan))
+        elif found := _FOOT.match(line):
+            marks.append((i, found[1], found[2], np.nan))
+        elif not line.strip():
+            blank.append(i)
+        else:
+            rejected.append(lines.reject(i, _reason(line)))
+    kept, wrong = _collect(samples)
+    marked, wrong_marks = _collect(marks)
+    rejected += [lines.reject(i, "the time stamp is no date of the calendar") for i in wrong + wrong_marks]
+    return kept, marked, blank, rejected
+
+
+def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, list[int]]:
+    """Rows with parsed times; second, the lines whose time is none."""
+    if not rows:
+        return _Samples.none(), []
+    line = np.array([row[0] for row in rows], dtype=np.int64)
+    wall, valid, _, _ = _time.parse_texts(np.array([row[1] for row in rows]))
+    offset = np.array([-1 if row[2] == b"-1" else int(row[2], 8) for row in rows], dtype=np.int64)
+    value = np.array([row[3] for row in rows])
+    return _Samples(line, wall, offset, value).take(valid), line[~valid].tolist()
+
+
+def _reason(line: bytes) -> str:
+    if b"\0" in line:
+        return "NUL bytes in the line (the file system was not synced when power went)"
+    if not line.startswith(b"["):
+        return "no '[time]' in front: not written through 'ts'"
+    if not re.match(_HEAD, line):
+        return "the time stamp is incomplete or of another form (torn line?)"
+    return "neither 'offset value', nor '*': not an od line"
+
+
+def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, list[tuple[int, str]]]:
+    """Samples that ``*`` lines stand for.
+
+    Returns
+    -------
+    repeats : _Samples
+        The suppressed samples, times interpolated between the neighbours, ``line`` that of the ``*``.
+    used : int array
+        0-based ``*`` lines that were expanded.
+    bad : list of (line, reason)
+    """
+    stars = marks.take(marks.offset < 0)
+    feet = marks.take(marks.offset >= 0)
+    # a foot line bounds a last run: it is an end without a value
+    ends = samples.join(feet)
+    ends = ends.take(np.argsort(ends.line, kind="stable"))
+    after = np.searchsorted(ends.line, stars.line)
+    before = np.searchsorted(samples.line, stars.line) - 1
+    bad: list[tuple[int, str]] = []
+    ok = (before >= 0) & (after < len(ends.line))
+    same = np.concatenate(([False], np.diff(before) == 0)) & (before >= 0)
+    bad += [(int(i), "'*' without a sample before it or an offset after it: the run has no length")
+            for i in stars.line[~ok]]  # fmt: skip
+    bad += [(int(i), "a second '*' in one run") for i in stars.line[ok & same]]
+    chosen = np.flatnonzero(ok & ~same)
+    left, right = before[chosen], after[chosen]
+    count = (ends.offset[right] - samples.offset[left]) // 4 - 1
+    fits = (count >= 0) & (np.cumsum(np.maximum(count, 0)) <= _MOST_REPEATS)
+    bad += [(int(i), "'*' between offsets that do not bound a run of believable length")
+            for i in stars.line[chosen[~fits]]]  # fmt: skip
+    chosen, left, right, count = chosen[fits], left[fits], right[fits], count[fits]
+    step = np.concatenate([np.arange(1, n + 1) for n in count.tolist()]) if len(count) else np.zeros(0, dtype=np.int64)
+    part = step / np.repeat(count + 1, count)
+    span = (ends.wall[right] - samples.wall[left]).astype(np.float64)
+    repeats = _Samples(
+        np.repeat(stars.line[chosen], count),
+        np.repeat(samples.wall[left], count) + np.round(part * np.repeat(span, count)).astype(np.int64),
+        np.repeat(samples.offset[left], count) + 4 * step,
+        np.repeat(samples.value[left], count),
+    )
+    return repeats, stars.line[chosen], bad
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """One stream of levels; power and quality logs look alike, so ``options.channel`` names the stream.
+
+    Raises
+    ------
+    UsageError
+        If no time zone is given.
+    """
+    lines = _lines.split(data)
+    fixed = _fixed_layout(lines)
+    odd, marks, blank, rejected = _odd_lines(lines, fixed.line)
+    samples = fixed.join(odd)
+    if len(odd.line) or not np.all(np.diff(samples.line) > 0):
+        samples = samples.take(np.argsort(samples.line, kind="stable"))
+    repeats, used, bad = _expand(samples, marks)
+    rejected += [lines.reject(i, reason) for i, reason in bad]
+    foot_reason = "no value behind the offset (torn last line, or the end of od's input)"
+    rejected += [lines.reject(int(i), foot_reason) for i in marks.line[marks.offset >= 0]]
+    accepted = len(samples.line) + len(used)
+    warnings: list[str] = []
+    stream = _stream(samples, repeats, lines, options, warnings)
+    return ReadResult(
+        "sounder_log",
+        (stream,) if stream is not None else (),
+        len(lines),
+        accepted,
+        len(blank),
+        tuple(sorted(rejected, key=lambda line: line.number)),
+        tuple(warnings),
+    )
+
+
+def _stream(
+    samples: _Samples, repeats: _Samples, lines: _lines.Lines, options: ReadOptions, warnings: list[str]
+) -> Stream | None:
+    """The stream with its flags; ``None`` without samples."""
+    if not len(samples.line):
+        return None
+    jump = np.concatenate(([0], np.diff(samples.offset)))
+    repeated = np.zeros(len(samples.line), dtype=bool)
+    if len(repeats.line):
+        samples = samples.join(repeats)
+        order = np.argsort(samples.line, kind="stable")
+        repeated = np.concatenate((repeated, np.ones(len(repeats.line), dtype=bool)))[order]
+        samples = samples.take(order)
+        jump = np.concatenate(([0], np.diff(samples.offset)))
+        warnings.append(f"{len(repeats.line)} samples that od had suppressed as '*' were put back; flagged repeated")
+    instants = _time.wall_to_utc(samples.wall, options, needed_by="sounder_log")
+    flag = _lines.flags(len(samples.line))
+    instants.flag(flag)
+    _lines.add_flag(flag, repeated, "repeated")
+    value = samples.value
+    silent = ~(value > options.floor_db)
+    if silent.any():
+        value = np.where(silent, np.nan, value)
+        _lines.add_flag(flag, silent, "out_of_coverage")
+    lost = jump > 4
+    if lost.any():
+        _lines.add_flag(flag, lost, "samples_lost_before")
+        warnings.append(
+            f"offsets jump at {int(lost.sum())} places: {int((jump[lost] // 4 - 1).sum())} samples are missing"
+        )
+    if (jump < 0).any():
+        warnings.append(f"offsets step back at {int((jump < 0).sum())} places: several runs in one file?")
+    if lines.unterminated:
+        _lines.add_flag(flag, samples.line == len(lines) - 1, _lines.UNTERMINATED)
+    frame = _frames.frame("rss", instants.time, samples.line + 1, flag, {"rss_db": value})
+    warnings += [*instants.warnings, *_frames.steps_back(frame)]
+    name = options.channel or "power"
+    ratio = name.lower() in ("quality", "snr")
+    if options.channel is None:
+        warnings.append(
+            "power, quality and SNR logs have one layout: read as power; name another with the channel option"
+        )
+    attributes = _frames.attributes(
+        options,
+        channel=name,
+        unit=options.unit or ("dB" if ratio else "dB re full scale"),
+        repeated_samples=len(repeats.line),
+    )
+    return Stream("rss", name, frame, attributes)
+
+
+READER = Reader(
+    name="sounder_log",
+    title="GNU Radio channel sounder power, quality or SNR log (od text)",
+    kinds=("rss",),
+    sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
+    sniff=sniff,
+    read=read,
+)

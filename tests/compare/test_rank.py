@@ -1,0 +1,331 @@
+"""Ranks, their distances, and the rules that might explain a modem."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from scipy.stats import wasserstein_distance
+
+from aerpaw_cmp.compare.rank import (
+    agreement,
+    capacity_rank,
+    channel_rank,
+    cohen_kappa,
+    compare_rank,
+    compare_ranks,
+    condition_number_rank,
+    confusion_matrix,
+    histogram,
+    histogram_test,
+    k_curve,
+    k_grid,
+    profile_by_rank,
+    shift_test,
+    singular_values,
+    stale_reports,
+    total_variation,
+    wasserstein,
+)
+
+NAN = float("nan")
+
+
+def unitary(rng, n, count=None):
+    shape = (n, n) if count is None else (count, n, n)
+    return np.linalg.qr(rng.normal(size=shape) + 1j * rng.normal(size=shape))[0]
+
+
+def with_profile(profile, seed=0):
+    """Channels (n, 4, 4) with given singular values (n, 4) and random directions."""
+    rng = np.random.default_rng(seed)
+    profile = np.atleast_2d(np.asarray(profile, dtype=float))
+    return unitary(rng, 4, len(profile)) * profile[:, None, :] @ unitary(rng, 4, len(profile))
+
+
+@pytest.mark.parametrize("scale", [1e-300, 1e-150, 1e-9, 1.0, 1e150, 1e300])
+def test_rank_does_not_depend_on_scale(scale):
+    h = with_profile([[1, 0.5, 0.05, 0.005], [1, 0.09, 0.009, 0.0009]])
+    for k, expected in ((10, [2, 1]), (100, [3, 2]), (1000, [4, 3]), (10_000, [4, 4])):
+        assert channel_rank(h * scale, k).tolist() == expected
+
+
+def test_the_count_is_strict_where_a_singular_value_ties():
+    assert channel_rank(np.diag([1.0, 0.1]), 10) == 1
+    assert channel_rank(np.diag([3.0, 0.3]), 10) == 1
+    assert channel_rank(np.diag([1.0, 0.1 * (1 + 1e-9)]), 10) == 2
+    # a tie that rounding of the decomposition must not decide
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        u, v = unitary(rng, 2), unitary(rng, 2)
+        assert channel_rank(u @ np.diag([1.0, 0.01]) @ v, 100) == 1
+    assert channel_rank(np.eye(4), 1.0) == 0  # nothing exceeds sigma_1
+
+
+def test_no_channel_is_rank_zero():
+    h = with_profile(np.ones((4, 4)))
+    h[1] = 0.0
+    h[2, 0, 0] = NAN
+    h[3, 1, 1] = np.inf
+    assert channel_rank(h, 10).tolist() == [4, 0, 0, 0]
+    assert np.isnan(singular_values(h)[2]).all()
+
+
+def test_shapes():
+    assert channel_rank(np.ones((3, 5, 2, 4)), 10).shape == (3, 5)
+    assert channel_rank(np.ones((2, 3)), 10).shape == ()
+    assert channel_rank(np.zeros((0, 2, 2)), 10).shape == (0,)
+    assert channel_rank(np.ones((7, 1, 4)), 10).tolist() == [1] * 7
+    with pytest.raises(ValueError, match="n_rx, n_tx"):
+        channel_rank(np.ones(4), 10)
+    with pytest.raises(ValueError, match="K is a ratio"):
+        channel_rank(np.eye(2), 0.5)
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.integers(0, 2**32 - 1), st.floats(1.01, 1e5), st.floats(1.01, 1e5))
+def test_rank_grows_with_k(seed, k1, k2):
+    rng = np.random.default_rng(seed)
+    h = rng.normal(size=(20, 4, 4)) * np.logspace(0, -3, 4) + 0j
+    low, high = channel_rank(h, min(k1, k2)), channel_rank(h, max(k1, k2))
+    assert (low <= high).all()
+    assert (low >= 1).all()
+
+
+def test_histogram_leaves_out_what_does_not_exist():
+    assert histogram([1, 1, 2, 4, 0, NAN]).tolist() == [0.5, 0.25, 0.0, 0.25]
+    assert histogram([1, 2], weights=[3.0, 1.0]).tolist() == [0.75, 0.25, 0, 0]
+    assert np.isnan(histogram([0, NAN])).all()
+    with pytest.raises(ValueError, match="whole numbers"):
+        histogram([5])
+    with pytest.raises(ValueError, match="whole numbers"):
+        histogram([1.5])
+
+
+bars = st.lists(st.integers(0, 20), min_size=4, max_size=4).filter(any).map(lambda v: np.array(v) / sum(v))
+
+
+@settings(max_examples=100, deadline=None)
+@given(bars, bars, bars)
+def test_distances_are_metrics_and_agree_with_scipy(p, q, r):
+    ranks = np.arange(1, 5)
+    assert wasserstein(p, q) == pytest.approx(wasserstein_distance(ranks, ranks, p, q), abs=1e-9)
+    for distance in (total_variation, wasserstein):
+        assert distance(p, p) == 0
+        assert distance(p, q) == pytest.approx(distance(q, p))
+        assert distance(p, r) <= distance(p, q) + distance(q, r) + 1e-12
+    assert total_variation(p, q) <= wasserstein(p, q) + 1e-12 <= 3 * total_variation(p, q) + 1e-9
+    # total variation is the largest difference in the probability of any event
+    events = [sum(p[i] - q[i] for i in range(4) if e >> i & 1) for e in range(16)]
+    assert total_variation(p, q) == pytest.approx(max(events), abs=1e-12)
+
+
+def test_confusion_agreement_and_kappa():
+    measured, simulated = [1, 2, 2, 3, NAN, 2], [1, 2, 3, 3, 1, 0]
+    table = confusion_matrix(measured, simulated)
+    assert table.sum() == 6
+    assert table[2, 3] == 1
+    assert table[0, 1] == 1
+    assert table[2, 0] == 1
+    assert agreement(measured, simulated) == 0.75
+    # kappa by hand: observed 3/4; chance = (1*1 + 2*1 + 1*2) / 16
+    assert cohen_kappa(measured, simulated) == pytest.approx((0.75 - 5 / 16) / (1 - 5 / 16))
+    assert np.isnan(agreement([NAN], [1]))
+    assert np.isnan(cohen_kappa([NAN], [1]))
+
+
+def test_ri_only_ever_two():
+    n = 200
+    h = with_profile(np.tile([1, 0.5, 0.01, 0.001], (n, 1)))
+    result = compare_rank(np.full(n, 2.0), h, replicates=100)
+    assert result.histogram.tolist() == [0, 1, 0, 0]
+    fit = result.simulated[10.0]
+    assert fit.agreement == 1.0
+    assert fit.total_variation == 0.0
+    assert np.isnan(fit.kappa)  # two constants agree, but that says nothing
+    assert np.isnan(fit.p_agreement)
+    assert result.staleness.verdict == "constant"
+    as_dict = result.as_dict()
+    assert as_dict["simulated"]["10"]["kappa"] is None
+    # the wall of the interval is not at 1: 200 samples do not prove certainty
+    low, high = result.histogram_ci95[1]
+    assert 0.95 < low < 1.0
+    assert high == pytest.approx(1.0)
+
+
+def test_everything_out_of_coverage():
+    result = compare_rank([2.0, 1.0, 3.0], np.zeros((3, 4, 4)), replicates=50)
+    fit = result.simulated[10.0]
+    assert fit.out_of_coverage == 3
+    assert np.isnan(fit.histogram).all()
+    assert np.isnan(fit.agreement)
+    assert np.isnan(result.best_k)
+    assert result.as_dict()["simulated"]["1000"]["total_variation"] is None
+
+
+def test_one_sample():
+    result = compare_rank([2.0], with_profile([[1, 0.5, 0.01, 0.001]]), replicates=20)
+    assert result.simulated[10.0].agreement == 1.0
+    assert result.as_dict()["simulated"]["10"]["agreement_ci95"] == [None, None]
+    assert result.n == 1
+
+
+def test_measured_rank_zero_is_refused():
+    with pytest.raises(ValueError, match="no CSI"):
+        compare_rank([0.0, 1.0], np.ones((2, 4, 4)))
+    with pytest.raises(ValueError, match="shape"):
+        compare_rank([1.0, 1.0], np.ones((3, 4, 4)))
+
+
+def slow_ranks(rng, n, memory):
+    """Ranks 1 to 4 that change slowly."""
+    from scipy.ndimage import gaussian_filter1d
+
+    x = gaussian_filter1d(rng.normal(size=n), memory, mode="wrap")
+    return np.searchsorted(np.quantile(x, [0.2, 0.7, 0.95]), x) + 1.0
+
+
+def test_shift_test_is_honest_about_memory():
+    rng = np.random.default_rng(11)
+    unrelated = [shift_test(slow_ranks(rng, 600, 15), slow_ranks(rng, 600, 15)) for _ in range(200)]
+    # an honest p-value is below 0.1 in about 10 % of unrelated pairs (a naive one would be in 40 % or more)
+    assert 0.03 < np.mean(np.array(unrelated) < 0.1) < 0.2
+    ranks = slow_ranks(rng, 600, 15)
+    noisy = np.where(rng.random(600) < 0.3, 1.0 + rng.integers(0, 4, 600), ranks)
+    assert shift_test(ranks, noisy) < 0.01
+
+
+def test_shift_test_equals_explicit_shifts():
+    rng = np.random.default_rng(4)
+    a, b = slow_ranks(rng, 100, 2), slow_ranks(rng, 100, 2)
+    counts = [np.sum(a == np.roll(b, s)) for s in range(100)]
+    apart = counts[7:94]
+    expected = (1 + sum(c >= counts[0] for c in apart)) / (1 + len(apart))
+    assert shift_test(a, b, minimum_shift=7) == pytest.approx(expected)
+
+
+def test_histogram_test_sees_a_different_distribution():
+    rng = np.random.default_rng(12)
+    a = slow_ranks(rng, 2000, 5)
+    b = np.minimum(slow_ranks(rng, 2000, 5) + (rng.random(2000) < 0.3), 4)
+    assert histogram_test(a, b) < 0.02
+    assert histogram_test(a, np.roll(a, 700)) == 1.0
+
+
+def test_best_k_is_found_within_its_interval():
+    rng = np.random.default_rng(13)
+    n, truth = 1500, 30.0
+    profile = np.sort(10 ** rng.uniform(-3.0, 0, (n, 4)), axis=1)[:, ::-1]
+    profile /= profile[:, :1]
+    h = with_profile(profile)
+    measured = channel_rank(h, truth).astype(float)
+    lost = rng.random(n) < 0.2  # the modem is not perfect
+    measured[lost] = rng.integers(1, 5, lost.sum())
+    curve = k_curve(measured, singular_values(h), replicates=200)
+    assert curve.best_k_agreement == pytest.approx(truth, rel=0.15)
+    assert curve.best_k_interval[0] <= truth <= curve.best_k_interval[1]
+    assert not curve.at_edge
+    at = np.flatnonzero(curve.k == 100.0)[0]
+    assert curve.agreement[at] == pytest.approx(agreement(measured, channel_rank(h, 100)))
+    assert curve.total_variation[at] == pytest.approx(
+        total_variation(histogram(measured), histogram(channel_rank(h, 100)))
+    )
+
+
+def test_the_grid_of_k_holds_the_papers_values():
+    assert {10.0, 100.0, 1000.0} <= set(k_grid().tolist())
+
+
+def test_condition_number_rule():
+    limit = 10 ** (-17 / 20)
+    h = np.stack([np.diag([1, limit * 1.01]), np.diag([1, limit * 0.99])])
+    assert condition_number_rank(h).tolist() == [2, 1]
+
+
+def test_capacity_rank_limits():
+    h = with_profile([[1, 0.9, 0.8, 0.7]])[0]
+    assert capacity_rank(h, [-30.0, 60.0]).tolist() == [1, 4]
+    ranks = capacity_rank(h, np.linspace(-20, 50, 100))
+    assert (np.diff(ranks) >= 0).all()
+    assert set(ranks) == {1, 2, 3, 4}
+    assert capacity_rank(h, NAN) == 0
+    assert capacity_rank(np.zeros((4, 4)), 20.0) == 0
+    assert capacity_rank(np.outer(np.ones(4), np.ones(4)), 40.0) == 1  # one path carries one layer at any SINR
+
+
+def test_capacity_rank_is_the_best_of_all_rates():
+    # two equal directions: layer 2 pays from the SINR at which 2 log2(1 + s) exceeds log2(1 + 2 s)
+    h = np.diag([1.0, 0.5])
+    for sinr_db in np.linspace(-10, 20, 50):
+        snr = 10 ** (sinr_db / 10) * 4 / 1.25
+        one = np.log2(1 + snr)
+        two = np.log2(1 + snr / 2) + np.log2(1 + snr * 0.25 / 2)
+        assert capacity_rank(h, sinr_db) == (2 if two > one else 1)
+
+
+def test_stale_ri_is_recognised():
+    rng = np.random.default_rng(21)
+    reports = rng.integers(1, 4, 60).astype(float)
+    held = np.repeat(reports, 5)
+    sinr = np.repeat(rng.normal(15, 3, 60), 5)
+    time = np.arange(300) * 0.2
+    seen = stale_reports(time, held, {"sinr_db": sinr})
+    assert seen.verdict == "held"
+    assert seen.n_reports == 60
+    assert seen.hold_s == pytest.approx(1.0)
+    alone = stale_reports(time, held)  # from the changes of RI only
+    assert alone.verdict == "held"
+    assert alone.hold_s == pytest.approx(1.0)
+    fresh = stale_reports(time, rng.integers(1, 4, 300).astype(float))
+    assert fresh.verdict == "fresh"
+    assert stale_reports(time, np.full(300, 2.0)).verdict == "constant"
+    assert stale_reports(time, np.full(300, NAN)).verdict == "no rank"
+
+
+def test_profile_tells_why_a_rank_was_two():
+    profile = np.tile([1, 0.5, 0.01, 0.0], (40, 1))
+    profile[::2, 1] = 0.02
+    ranks = np.where(np.arange(40) % 2, 2.0, 1.0)
+    found = profile_by_rank(ranks, profile)
+    assert found[2][1].tolist() == pytest.approx([0, 20 * np.log10(0.5), -40, -np.inf])
+    assert found[1][1][1] == pytest.approx(20 * np.log10(0.02))
+
+
+def test_rank_intervals_hold_the_truth_of_a_known_process():
+    rng = np.random.default_rng(31)
+    hits = np.zeros(3)
+    runs = 60
+    for _ in range(runs):
+        from scipy.ndimage import gaussian_filter1d
+
+        x = gaussian_filter1d(rng.normal(size=1500), 5, mode="wrap")
+        x /= np.sqrt(1 / (2 * np.sqrt(np.pi) * 5))  # unit variance of the process, not of the sample
+        measured = np.searchsorted([-1.0, 0.5, 2.0], x) + 1.0
+        simulated = np.searchsorted([-0.5, 0.5, 2.0], x) + 1.0
+        fit = compare_ranks(measured, simulated, replicates=200)
+        from scipy.stats import norm
+
+        moved = norm.cdf(-0.5) - norm.cdf(-1.0)  # the share whose rank drops from 2 to 1
+        hits += [
+            fit.agreement_ci95[0] <= 1 - moved <= fit.agreement_ci95[1],
+            fit.total_variation_ci95[0] <= moved <= fit.total_variation_ci95[1],
+            fit.histogram_ci95[0][0] <= norm.cdf(-0.5) <= fit.histogram_ci95[0][1],
+        ]
+    assert (hits >= 0.85 * runs).all()
+
+
+def test_as_dict_has_the_stable_names():
+    rng = np.random.default_rng(2)
+    h = with_profile(np.sort(rng.random((50, 4)))[:, ::-1])
+    found = compare_rank(channel_rank(h, 5).astype(float), h, replicates=50, sinr_db=rng.normal(10, 3, 50)).as_dict()
+    assert set(found["measured"]["histogram"]) == {"1", "2", "3", "4"}
+    assert set(found["simulated"]) == {"10", "100", "1000"}
+    for fit in found["simulated"].values():
+        assert {"histogram", "out_of_coverage", "agreement", "total_variation", "wasserstein"} <= set(fit)
+        assert set(fit["histogram"]) == {"1", "2", "3", "4"}
+    assert "best_k" in found
+    assert set(found["rules"]) == {"condition_number", "capacity"}
+    import json
+
+    json.dumps(found, allow_nan=False)

@@ -1,0 +1,328 @@
+"""Comparison of levels: hard cases, the same footing, residuals and spans."""
+
+from __future__ import annotations
+
+import json
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.rss import (
+    bin_residual,
+    channel_difference,
+    compare_rss,
+    error_spans,
+    link_geometry,
+    local_mean_db,
+    residual_tables,
+    same_footing,
+    seconds,
+)
+
+NAN = float("nan")
+
+
+def flight(n=600, seed=0, sigma=3.0):
+    rng = np.random.default_rng(seed)
+    time = np.arange(n) * 0.1
+    simulated = -80 + 10 * np.sin(time / 5)
+    return time, simulated + 30.0 + rng.normal(0, sigma, n), simulated
+
+
+def test_a_planted_offset_comes_back():
+    time, measured, simulated = flight(sigma=0.0)
+    found = compare_rss(time, measured, simulated)
+    assert found.offset_db == -30.0
+    assert found.rmse_db == pytest.approx(0.0, abs=1e-9)
+    assert found.correlation == pytest.approx(1.0)
+    np.testing.assert_allclose(found.residual_db, 0.0, atol=1e-9)
+    time, measured, simulated = flight()
+    found = compare_rss(time, measured, simulated)
+    assert found.intervals.offset_db[0] < -30.0 < found.intervals.offset_db[1]
+    assert found.rmse_ci95_db[0] < 3.0 < found.rmse_ci95_db[1]
+
+
+def test_stable_names_and_strict_json():
+    time, measured, simulated = flight()
+    found = compare_rss(time, measured, simulated, baselines={"free_space": simulated + 1, "two_ray": 0 * simulated})
+    entry = found.as_dict()
+    assert {
+        "offset_db", "rmse_db", "n", "n_out_of_coverage", "at_search_edge", "correlation", "rmse_ci95_db", "lag_s", "baselines",
+    } <= set(entry)  # fmt: skip
+    assert set(entry["baselines"]) == {"free_space", "two_ray"}
+    assert entry["baselines"]["free_space"]["offset_db"] == pytest.approx(entry["offset_db"] + 1)
+    assert entry["baselines"]["two_ray"]["rmse_db"] > entry["rmse_db"]
+    assert len(entry["rmse_ci95_db"]) == 2
+    assert entry["lag_s"] is None
+    assert entry["fitted_on_scored"] == ["offset_db"]
+    json.dumps(entry, allow_nan=False)
+
+
+def test_everything_out_of_coverage():
+    time, measured, _ = flight(50)
+    found = compare_rss(time, measured, np.full(50, NAN), baselines={"free_space": np.full(50, NAN)})
+    assert (found.n, found.n_out_of_coverage, found.n_simulated_out, found.n_measured_out) == (0, 50, 50, 0)
+    assert np.isnan(found.offset_db)
+    assert found.as_dict()["rmse_ci95_db"] == [None, None]
+    assert found.as_dict()["baselines"]["free_space"]["rmse_db"] is None
+    json.dumps(found.as_dict(), allow_nan=False)
+
+
+def test_no_sample_at_all():
+    assert compare_rss([], [], []).n == 0
+
+
+def test_one_sample():
+    found = compare_rss([0.0], [-60.0], [-80.0])
+    assert (found.offset_db, found.rmse_db, found.n) == (-20.0, 0.0, 1)
+    assert found.as_dict()["rmse_ci95_db"] == [None, None]
+    assert np.isnan(found.correlation)
+
+
+def test_a_constant_series():
+    found = compare_rss(np.arange(20.0), np.full(20, -60.0), np.linspace(-90, -70, 20))
+    assert found.offset_db == -20.0
+    assert np.isnan(found.correlation)
+    assert found.rmse_db == pytest.approx(np.std(np.linspace(-90, -70, 20)))
+    both = compare_rss(np.arange(20.0), np.full(20, -60.0), np.full(20, -75.0))
+    assert both.rmse_db == 0.0
+    assert both.rmse_ci95_db == (0.0, 0.0)
+
+
+def test_the_edge_of_the_search_is_flagged():
+    time, measured, simulated = flight()
+    found = compare_rss(time, measured + 40, simulated)
+    assert found.at_edge
+    assert found.as_dict()["at_search_edge"] is True
+    assert found.offset_db == -50.0
+
+
+def test_a_sample_without_a_pose_is_not_out_of_coverage():
+    time, measured, simulated = flight(10)
+    simulated[:3] = NAN
+    measured[5] = NAN
+    posed = np.arange(10) >= 2
+    found = compare_rss(time, measured, simulated, posed=posed)
+    assert (found.n, found.n_no_pose, found.n_out_of_coverage) == (6, 2, 2)
+    assert (found.n_simulated_out, found.n_measured_out) == (1, 1)
+
+
+def test_order_of_samples_does_not_matter():
+    time, measured, simulated = flight()
+    mixed = np.random.default_rng(1).permutation(len(time))
+    one = compare_rss(time, measured, simulated)
+    two = compare_rss(time[mixed], measured[mixed], simulated[mixed])
+    assert one.as_dict() == two.as_dict()
+    np.testing.assert_array_equal(one.residual_db[mixed], two.residual_db)
+    stamps = np.datetime64("2024-07-15T12:00") + (time * 1e9).astype("timedelta64[ns]")
+    assert compare_rss(stamps, measured, simulated).as_dict() == one.as_dict()
+
+
+def test_a_fixed_offset_is_not_searched():
+    time, measured, simulated = flight(sigma=0.0)
+    found = compare_rss(time, measured, simulated, offset_db=-28.0)
+    assert found.rmse_db == pytest.approx(2.0)
+    assert found.fitted_on_scored == ()
+    assert compare_rss(time, measured, simulated, fitted_on_scored=["lag_s"]).fitted_on_scored == ("offset_db", "lag_s")
+
+
+def test_lengths_must_agree():
+    with pytest.raises(ValueError, match="must be"):
+        compare_rss([0.0, 1.0], [1.0], [1.0])
+
+
+def test_seconds():
+    assert seconds(np.array(["2024-01-01T00:00:01", "2024-01-01T00:00:00"], dtype="datetime64[ms]")).tolist() == [1, 0]
+    assert np.isnan(seconds(np.array(["NaT"], dtype="datetime64[ns]"))).all()
+
+
+# --- the same footing ---
+
+
+def test_local_mean_averages_power():
+    level = 10 * np.log10(np.array([1.0, 3.0, 5.0, 7.0]))
+    np.testing.assert_allclose(10 ** (local_mean_db([0, 1, 2, 3], level, 2.2) / 10), [2, 3, 5, 6])
+    np.testing.assert_allclose(local_mean_db([0, 1, 2, 3], level, 0.0), level)
+    assert np.isnan(local_mean_db([0, 1], [NAN, NAN], 1.0)).all()
+    gap = local_mean_db([0, 1, 2], [0.0, NAN, 0.0], 4.0)
+    assert np.isnan(gap[1])
+    np.testing.assert_allclose(gap[[0, 2]], 0.0, atol=1e-12)
+
+
+def test_local_mean_keeps_weak_stretches_beside_strong_ones():
+    rng = np.random.default_rng(2)
+    time = np.sort(rng.uniform(0, 100, 3000))
+    level = np.where(time < 50, 0.0, -180.0) + rng.normal(0, 3, 3000)
+    got = local_mean_db(time, level, 1.0)
+    for i in rng.integers(0, 3000, 50):
+        near = np.abs(time - time[i]) <= 0.5
+        assert got[i] == pytest.approx(10 * np.log10(np.mean(10 ** (level[near] / 10))), abs=1e-6)
+
+
+def test_fading_averages_out_on_the_same_footing():
+    rng = np.random.default_rng(3)
+    time = np.arange(0, 200, 0.1)
+    mean = -70 + 8 * np.sin(time / 20)
+    rayleigh = 10 * np.log10(rng.exponential(size=len(time)))
+    found = same_footing(time, mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, windows_s=(0.0, 4.0))
+    assert found["local_mean"][0.0].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
+    assert found["local_mean"][4.0].rmse_db < 1.0
+    assert found["other"][4.0].rmse_db > 4.0
+
+
+# --- residuals ---
+
+
+def test_link_geometry_in_the_antenna_frames():
+    from aerpaw_cmp.replay.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+
+    tower = np.array([10.0, -5.0, 10.0])
+    rng = np.random.default_rng(9)
+    position = tower + rng.normal(0, 100, (50, 3))
+    rotation = rotation_from_aircraft(*rng.uniform(-30, 30, (3, 50)))
+    mount = rotation_from_yaw_pitch_roll(np.radians(45.0), 0.0, 0.0)
+    uav_mount = rotation_from_yaw_pitch_roll(np.radians(315.0), 0.0, np.radians(90.0))
+    found = link_geometry(tower, position, rotation, tower_mount=mount, uav_mount=uav_mount)
+    # boresight 45 deg counter-clockwise from east is the bearing 45 deg: an azimuth of 0 in the antenna frame
+    bearing = (45.0 - found["azimuth_deg"] + 180) % 360 - 180
+    np.testing.assert_allclose(found["tower_azimuth_deg"], bearing, atol=1e-9)
+    np.testing.assert_allclose(found["tower_elevation_deg"], found["elevation_deg"], atol=1e-9)
+    for i in range(50):  # one by one, from the definition v_site = R_body R_mount v_device
+        device = (rotation[i] @ uav_mount).T @ (tower - position[i])
+        assert found["uav_azimuth_deg"][i] == pytest.approx(np.degrees(np.arctan2(device[1], device[0])))
+        assert found["uav_elevation_deg"][i] == pytest.approx(np.degrees(np.arcsin(device[2] / np.linalg.norm(device))))
+    level = link_geometry(tower, position, rotation_from_aircraft(np.zeros(50), np.zeros(50), np.full(50, 30.0)))
+    np.testing.assert_allclose(level["heading_deg"], 30.0)
+
+
+def test_bins_hold_every_pair_once():
+    rng = np.random.default_rng(4)
+    quantity, residual = rng.uniform(0, 100, 1000), rng.normal(size=1000)
+    residual[::7] = NAN
+    bins = bin_residual(residual, quantity, 8)
+    assert bins.n.sum() == np.isfinite(residual).sum()
+    pooled = np.sqrt(np.sum(bins.n * bins.rmse_db**2) / bins.n.sum())
+    assert pooled == pytest.approx(np.sqrt(np.nanmean(residual**2)))
+    assert np.nansum(bins.n * bins.mean_db) == pytest.approx(np.nansum(residual))
+    assert bins.explained < 0.05
+    json.dumps(bins.as_dict(), allow_nan=False)
+
+
+def test_bins_show_what_explains_the_residual():
+    rng = np.random.default_rng(5)
+    heading = rng.uniform(0, 360, 2000)
+    los = rng.random(2000) < 0.5
+    residual = 6 * np.cos(np.radians(heading)) + np.where(los, 0.0, -3.0) + rng.normal(0, 1, 2000)
+    tables = residual_tables(residual, {"heading_deg": heading, "los": los, "time_s": np.arange(2000)})
+    assert tables["heading_deg"].explained > 0.75
+    assert tables["time_s"].explained < 0.05
+    assert tables["los"].n.tolist() == [(~los).sum(), los.sum()]
+    assert tables["los"].mean_db[0] - tables["los"].mean_db[1] == pytest.approx(-3.0, abs=0.5)
+    assert (tables["heading_deg"].low_db < tables["heading_deg"].mean_db).all()
+
+
+def test_empty_and_constant_quantities():
+    empty = bin_residual([NAN], [1.0])
+    assert empty.n.sum() == 0
+    assert np.isnan(empty.explained)
+    one = bin_residual([1.0, 2.0], [5.0, 5.0], 3)
+    assert one.n.sum() == 2
+
+
+def test_largest_error_spans_are_found_with_their_cause():
+    time = np.arange(0, 300, 0.2)
+    residual = np.random.default_rng(6).normal(0, 1.5, len(time))
+    residual[(time > 50) & (time < 60)] -= 12.0
+    residual[(time > 200) & (time < 204)] += 9.0
+    position = np.column_stack([time, 0 * time, 0 * time + 40])
+    context = {
+        "foliage_m": np.where((time > 49) & (time < 61), 25.0, 0.0),
+        "height_m": np.full(len(time), 40.0),
+        "coherent_minus_power_sum_db": np.where((time > 199) & (time < 205), -15.0, 0.0),
+    }
+    spans = error_spans(time, residual, position_m=position, context=context)
+    assert len(spans) == 2
+    first, second = spans
+    assert first.start_s == pytest.approx(50, abs=1.0)
+    assert first.end_s == pytest.approx(60, abs=1.0)
+    assert first.position_m == pytest.approx((55, 0, 40), abs=1.0)
+    assert first.geometry["foliage_m"] == 25.0
+    json.dumps([span.as_dict() for span in spans], allow_nan=False)
+    assert "foliage" in first.cause
+    assert "more loss" in first.cause
+    assert "fade" in second.cause
+    assert second.mean_db > 5
+    assert error_spans(time, np.full(len(time), NAN)) == []
+    assert error_spans(time, residual, largest=1) == spans[:1] or len(error_spans(time, residual, largest=1)) == 1
+
+
+@pytest.mark.parametrize(
+    ("context", "words"),
+    [
+        ({"height_m": 1.0}, "take-off"),
+        ({"los": 0.0}, "obstruction"),
+        ({"elevation_deg": 80.0}, "elevation"),
+        ({}, "unmodelled"),
+    ],
+)
+def test_causes(context, words):
+    time = np.arange(100.0)
+    residual = np.where((time > 40) & (time < 50), 20.0, 0.0)
+    spans = error_spans(time, residual, context={k: np.full(100, v) for k, v in context.items()})
+    assert words in spans[0].cause
+
+
+def test_a_turn_is_named():
+    time = np.arange(100.0)
+    residual = np.where((time > 40) & (time < 50), -20.0, 0.0)
+    heading = np.where(time < 45, 350.0, 80.0)
+    spans = error_spans(time, residual, context={"heading_deg": heading})
+    assert "turn by 90 deg" in spans[0].cause
+
+
+def test_two_channels_part_where_the_geometry_says():
+    rng = np.random.default_rng(7)
+    time = np.arange(0, 200, 0.2)
+    one = -60 + rng.normal(0, 1, len(time))
+    two = one - 2.0 + rng.normal(0, 1, len(time))
+    two[(time > 100) & (time < 110)] -= 15.0
+    found = channel_difference(time, one, two, position_m=np.column_stack([time] * 3))
+    assert len(found.spans) == 1
+    assert found.spans[0].start_s == pytest.approx(100, abs=1)
+    assert found.share_parted == pytest.approx(0.05, abs=0.005)
+    assert found.interval_std_db[0] < found.std_db < found.interval_std_db[1]
+    json.dumps(found.as_dict(), allow_nan=False)
+    assert channel_difference(time, one, np.full(len(time), NAN)).n == 0
+
+
+@pytest.mark.field
+@pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
+def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
+    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
+    if not folder:
+        pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
+    from scipy.io import loadmat
+
+    from aerpaw_cmp.geodesy import SiteFrame
+
+    data = {
+        k: np.ravel(v)
+        for k, v in loadmat(Path(folder) / "dataset12" / f"{name}.mat").items()
+        if k[0] == "m" or "power" in k
+    }
+    longitude, latitude = data["mX"].astype(float), data["mY"].astype(float)
+    if np.abs(longitude).mean() < np.abs(latitude).mean():
+        longitude, latitude = latitude, longitude
+    east, north = SiteFrame(35.72750947, -78.69595819).to_local(latitude, longitude)
+    up = np.maximum(data["mZ"].astype(float), 0.5)
+    flown = up > 20.0
+    free_space = np.where(flown, -20 * np.log10(np.sqrt(east**2 + north**2 + (up - 10) ** 2)), NAN)
+    for channel in ("mpower1", "mpower2"):
+        found = compare_rss(
+            data["timestamp_power"].astype(float), data[channel].astype(float), free_space, span_db=(-100, 100)
+        )
+        assert 4.5 < found.rmse_db < 7.2
+        assert found.intervals.memory.n_effective < 0.05 * found.n  # 0.26 s apart: neighbours repeat each other
+        assert found.correlation > 0.5

@@ -1,0 +1,178 @@
+"""Memory, resampling and intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.signal import lfilter
+
+from aerpaw_cmp.compare.statistics import (
+    _correlation_of_residual,
+    autocovariance,
+    bootstrap_means,
+    correlation,
+    error_intervals,
+    interval,
+    memory,
+    plain,
+    repeatability,
+    same_places,
+    share_interval,
+)
+
+
+def shadowing(rng, n, samples, sigma):
+    """AR(1) sequence that forgets in so many samples."""
+    keep = np.exp(-1.0 / samples)
+    noise = rng.normal(size=n)
+    noise[0] /= np.sqrt(1 - keep**2)
+    return sigma * np.sqrt(1 - keep**2) * lfilter([1], [1, -keep], noise)
+
+
+def test_autocovariance_by_hand():
+    x = np.random.default_rng(0).normal(size=50)
+    c = x - x.mean()
+    expected = [np.sum(c[lag:] * c[: 50 - lag]) / 50 for lag in range(6)]
+    np.testing.assert_allclose(autocovariance(x, 5), expected, atol=1e-14)
+
+
+def test_effective_sample_size_of_a_known_process():
+    rng = np.random.default_rng(1)
+    for samples in (2, 10, 40):
+        keep = np.exp(-1.0 / samples)
+        expected = 20_000 * (1 - keep) / (1 + keep)
+        found = np.median([memory(shadowing(rng, 20_000, samples, 3.0)).n_effective for _ in range(7)])
+        assert found == pytest.approx(expected, rel=0.15)
+    white = memory(rng.normal(size=5000))
+    assert white.n_effective > 4000
+    assert white.block_length < 20
+
+
+def test_blocks_grow_with_memory_and_stay_a_fifth_of_the_flight():
+    rng = np.random.default_rng(2)
+    lengths = [memory(shadowing(rng, 5000, s, 1.0)).block_length for s in (1, 5, 25, 100)]
+    assert lengths == sorted(lengths)
+    assert memory(np.linspace(0, 1, 100)).block_length <= 20
+
+
+def test_degenerate_sequences():
+    assert memory([]).n_effective != memory([]).n_effective  # NaN
+    assert memory([1.0]).block_length == 1
+    assert memory(np.zeros(100)).block_length == 1
+    assert np.isnan(error_intervals(np.zeros(0), np.zeros(0)).rmse_db).all()
+    one = error_intervals(np.array([1.0]), np.array([2.0]))
+    assert np.isnan(one.offset_db).all()
+    constant = error_intervals(np.full(50, -60.0), np.full(50, -70.0))
+    assert constant.offset_db == pytest.approx((-10.0, -10.0))
+    assert np.isnan(constant.correlation).all()
+    assert constant.rmse_db == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("n", "length", "columns"), [(97, 10, 2), (97, 1, 3), (97, 10, 400), (12, 12, 1), (1, 1, 2)])
+def test_resamples_have_the_moments_of_the_circular_block_bootstrap(n, length, columns):
+    rng = np.random.default_rng(3)
+    data = rng.normal(size=(n, columns)) + 5.0
+    drawn = bootstrap_means(data, length, replicates=4000)
+    np.testing.assert_allclose(drawn.mean(axis=0), data.mean(axis=0), atol=0.05)
+    # exact variance: independent whole blocks and one shorter one
+    whole, last = -(-n // length) - 1, n - (-(-n // length) - 1) * length
+    ring = np.concatenate([data, data])
+
+    def sums(size):
+        return np.array([ring[s : s + size].sum(axis=0) for s in range(n)])
+
+    expected = (whole * sums(length).var(axis=0) + sums(last).var(axis=0)) / n**2
+    np.testing.assert_allclose(drawn.var(axis=0).mean(), expected.mean(), rtol=0.08, atol=1e-12)
+
+
+def test_the_same_seed_gives_the_same_interval():
+    rng = np.random.default_rng(4)
+    m, s = rng.normal(size=(2, 300))
+    assert error_intervals(m, s) == error_intervals(m, s)
+    assert error_intervals(m, s, seed=1) != error_intervals(m, s, seed=2)
+
+
+@pytest.mark.parametrize("samples", [1, 12])
+def test_intervals_cover_the_truth(samples):
+    """95 % nominal; the script in benchmarks/ does this on 500 flights."""
+    rng = np.random.default_rng(5)
+    n, runs = 1500, 120
+    t = np.linspace(0, 2 * np.pi, n)
+    simulated = -80 + 8 * np.sin(3 * t) + 4 * np.cos(11 * t)
+    truth = np.array([7.3, np.sqrt(4.0**2 + 2.0**2), np.sqrt(simulated.var() / (simulated.var() + 20.0))])
+    hits = np.zeros(3)
+    for _ in range(runs):
+        noise = shadowing(rng, n, samples, 4.0) + rng.normal(0, 2, n)
+        found = error_intervals(simulated - 7.3 + noise, simulated, replicates=200)
+        bounds = np.array([found.offset_db, found.rmse_db, found.correlation])
+        hits += (bounds[:, 0] <= truth) & (truth <= bounds[:, 1])
+    assert (hits >= 0.87 * runs).all()
+    if samples > 1:  # an interval from independent samples would be far too narrow
+        naive = 2 * 1.96 * np.sqrt(20.0 / n)
+        assert np.ptp(found.offset_db) > 2 * naive
+
+
+def test_interval_contains_the_estimate_and_respects_bounds():
+    known = memory(np.random.default_rng(0).normal(size=100))
+    low, high = interval(0.02, np.array([0.05, 0.10, 0.02, 0.04]), known, bounds=(0.0, 1.0))
+    assert 0.0 <= low <= 0.02 <= high <= 1.0
+
+
+def test_share_interval_is_wilsons():
+    known = memory(np.random.default_rng(0).normal(size=5))  # below 8 samples: taken as independent
+    low, high = share_interval(0.0, 0.0, known)
+    assert low == 0.0
+    assert high == pytest.approx(1.959964**2 / (5 + 1.959964**2), rel=1e-6)
+
+
+def test_correlation():
+    rng = np.random.default_rng(7)
+    a, b = rng.normal(size=(2, 40))
+    assert correlation(a, b) == pytest.approx(np.corrcoef(a, b)[0, 1])
+    assert correlation([1, 2, np.nan, 3], [2, 4, 5, 6]) == pytest.approx(1.0)
+    assert np.isnan(correlation([1, 1, 1], [1, 2, 3]))
+    assert np.isnan(correlation([1], [1]))
+    assert correlation([1e8, 1e8 + 1, 1e8 + 2], [1, 2, 3]) == pytest.approx(1.0)
+
+
+def test_correlation_from_moments_of_the_residual_is_the_correlation():
+    rng = np.random.default_rng(10)
+    s = rng.normal(-80, 6, 300)
+    m = 0.4 * s + rng.normal(0, 2, 300)  # a residual that goes with the simulation
+    d, centred = (s - m) - (s - m).mean(), s - s.mean()
+    found = _correlation_of_residual(s.var(), np.array([np.mean(d * centred)]), np.array([d.var()]))
+    assert found[0] == pytest.approx(np.corrcoef(m, s)[0, 1])
+    low, high = error_intervals(m, s).correlation
+    assert 0.5 < low < found[0] < high < 0.95
+
+
+def test_repeatability_floor_of_two_passes():
+    rng = np.random.default_rng(9)
+    here = np.column_stack([np.linspace(0, 500, 2000), np.zeros(2000), np.full(2000, 40.0)])
+    there = here[::-1] + rng.normal(0, 0.1, (2000, 3))
+    field = 5 * np.sin(here[:, 0] / 20)
+    first = -60 + field + rng.normal(0, 2, 2000)
+    second = -57 + field[::-1] + rng.normal(0, 2, 2000)
+    first[:50] = np.nan
+    found = repeatability(here, first, there, second)
+    assert found.rmse_db == pytest.approx(np.sqrt(8.0), rel=0.1)
+    assert found.offset_db == pytest.approx(3.0, abs=0.2)
+    assert found.interval_db[0] < np.sqrt(8.0) < found.interval_db[1]
+    north, south = np.zeros(2000), np.full(2000, 180.0)
+    assert repeatability(here, first, there, second, heading_deg=north, other_heading_deg=south).n == 0
+    assert repeatability(here, first, there + 100.0, second).n == 0
+    assert np.isnan(repeatability(here, first, there + 100.0, second).rmse_db)
+
+
+def test_same_places_pairs_the_nearest_and_wraps_headings():
+    a = np.array([[0.0, 0, 0], [10, 0, 0], [np.nan, 0, 0]])
+    b = np.array([[10.5, 0, 0], [0.2, 0, 0], [0.1, 0, 0]])
+    here, there = same_places(a, b)
+    assert (here.tolist(), there.tolist()) == ([0, 1], [2, 0])
+    here, _ = same_places(a, b, heading_deg=np.array([359.0, 0, 0]), other_heading_deg=np.array([90.0, 0, 1]))
+    assert here.tolist() == [0]
+
+
+def test_plain_makes_json():
+    found = plain({"a": np.float64("nan"), 1: np.array([1, 2]), "b": (np.True_, np.int32(3), float("inf"), "x", None)})
+    assert found == {"a": None, "1": [1, 2], "b": [True, 3, None, "x", None]}

@@ -1,0 +1,160 @@
+"""Scores: closed forms, no leak from what is held out, honest intervals on simulated fields."""
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.maps import evaluate
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
+from aerpaw_cmp.maps.kriging import OrdinaryKriging
+
+
+def exponential(d):
+    return np.exp(-d / 120.0)
+
+
+def simulated_field(points, seed, fields=1, noise=0.0):
+    """Gaussian field with unit variance and the exponential correlation, by Cholesky."""
+    far = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    root = np.linalg.cholesky((1 - noise) * exponential(far) + noise * np.eye(len(points)))
+    return root @ np.random.default_rng(seed).normal(size=(len(points), fields))
+
+
+GRID = Grid.over_area((0.0, 600.0, 0.0, 450.0))
+
+
+class Spy:
+    """Predicts the mean of what it was given, and remembers it."""
+
+    def __init__(self):
+        self.seen = []
+
+    def fit(self, points_m, values):
+        self.points, self.values = np.asarray(points_m), np.asarray(values)
+        self.seen.append(self.points)
+        return self
+
+    def predict(self, targets_m):
+        mean = np.broadcast_to(self.values.mean(axis=0), (len(targets_m), self.values.shape[1])).copy()
+        return mean, np.ones_like(mean)
+
+    def leave_one_out(self):
+        n = len(self.values)
+        return (self.values.sum(axis=0) - self.values) / (n - 1), np.ones_like(self.values)
+
+
+def test_score_closed_form():
+    result = evaluate.score([[1.0, 2.0], [np.nan, 4.0], [3.0, np.nan]], [[2.0, np.nan], [9.0, 2.0], [0.0, 1.0]])
+    assert result.mae.tolist() == [2.0, 2.0]
+    assert result.rmse.tolist() == [np.sqrt(5.0), 2.0]
+    assert result.bias.tolist() == [-1.0, -2.0]
+    assert result.n.tolist() == [2, 1]
+    assert result.unpredicted.tolist() == [0, 1]
+    nothing = evaluate.score([np.nan], [1.0])
+    assert np.isnan(nothing.mae)
+    with pytest.raises(UsageError, match="shape"):
+        evaluate.score([1.0], [1.0, 2.0])
+
+
+def test_leave_one_out_keeps_altitude_and_k():
+    values = np.random.default_rng(1).normal(size=(len(GRID), 3, 2))
+    table = evaluate.leave_one_out_table({"mean": Spy(), "nearest": Nearest()}, GRID.points_m, values)
+    assert table["nearest"].mae.shape == (3, 2)
+    n = len(GRID)
+    expected = np.abs((values.sum(axis=0) - values) / (n - 1) - values).mean(axis=0)
+    np.testing.assert_allclose(table["mean"].mae, expected, rtol=1e-12)
+
+
+def test_blocks_never_train_on_themselves():
+    spy = Spy()
+    result = evaluate.blocked(spy, GRID.points_m, np.zeros((len(GRID), 1)), 150.0)
+    assert len(spy.seen) == 4 * 3
+    assert result.n.tolist() == [len(GRID)]
+    corner = GRID.points_m.min(axis=0)
+    blocks = {tuple(b) for b in np.floor((GRID.points_m - corner) / 150.0 + 1e-9).astype(int).tolist()}
+    missing = [
+        blocks - {tuple(b) for b in np.floor((seen - corner) / 150.0 + 1e-9).astype(int).tolist()} for seen in spy.seen
+    ]
+    assert all(len(m) == 1 for m in missing)
+    assert set.union(*missing) == blocks
+
+
+def test_held_out_altitude_is_not_seen_and_a_linear_profile_is_found():
+    spy = Spy()
+    heights = [30.0, 40.0, 50.0]
+    evaluate.altitude_held_out(spy, GRID.points_m, heights, np.zeros((len(GRID), 3, 2)))
+    assert [sorted(set(seen[:, 2])) for seen in spy.seen] == [[40.0, 50.0], [30.0, 50.0], [30.0, 40.0]]
+    values = np.broadcast_to(np.array(heights)[None, :, None], (len(GRID), 3, 2))
+    # all within 40 m, so that as many are taken above as below
+    model = OrdinaryKriging(exponential, 100, 40.0, vertical_scale=2.0)
+    result = evaluate.altitude_held_out(model, GRID.points_m, heights, values)
+    assert result.mae.shape == (3, 2)
+    assert result.mae[1].max() < 1e-9, "half-way by symmetry"
+    assert result.mae[0].min() > 5.0, "below all samples nothing can be known"
+
+
+def test_trajectory_trains_on_its_cells_only():
+    spy = Spy()
+    flight = np.column_stack([np.linspace(-100, 700, 500), np.full(500, 200.0)])
+    result = evaluate.along_trajectory(spy, GRID, np.zeros((len(GRID), 1)), flight)
+    assert len(spy.seen[0]) == 20, "one row of cells"
+    assert set(spy.seen[0][:, 1]) == {195.0}
+    assert result.n.tolist() == [len(GRID) - 20]
+    with pytest.raises(UsageError, match="does not cross"):
+        evaluate.along_trajectory(spy, GRID, np.zeros(len(GRID)), [[5e3, 0.0]])
+
+
+def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
+    """A Gaussian field with the model's correlation: best linear predictor, calibrated intervals."""
+    values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
+    model = OrdinaryKriging(lambda d: 0.9 * exponential(d), sill=1.0)
+    table = evaluate.leave_one_out_table(
+        {
+            "kriging": model,
+            "idw": InverseDistance(),
+            "nearest": Nearest(),
+            "spline": IndexInterpolation("spline", GRID),
+            "makima": IndexInterpolation("makima", GRID),
+            "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
+        },
+        GRID.points_m,
+        values,
+    )
+    rmse = {name: float(s.rmse.mean()) for name, s in table.items()}
+    assert min(rmse, key=lambda name: rmse[name]) == "kriging", rmse
+    estimate, variance = evaluate.leave_one_out_estimate(model, GRID.points_m, values)
+    intervals = evaluate.interval_coverage(values, estimate, variance)
+    np.testing.assert_allclose(intervals.observed, intervals.level, atol=0.02)
+    assert intervals.standardised_variance == pytest.approx(1.0, abs=0.05)
+    assert intervals.n == values.size
+
+
+def test_intervals_notice_a_variance_that_is_too_small():
+    rng = np.random.default_rng(4)
+    truth = rng.normal(size=20_000)
+    assert evaluate.interval_coverage(
+        truth, np.zeros(20_000), np.full(20_000, 0.25)
+    ).standardised_variance == pytest.approx(4.0, rel=0.05)
+    nothing = evaluate.interval_coverage([1.0], [np.nan], [1.0])
+    assert nothing.n == 0
+    assert np.isnan(nothing.observed).all()
+
+
+def test_blocked_is_harder_than_leave_one_out():
+    values = simulated_field(GRID.points_m, 5, fields=10)
+    model = OrdinaryKriging(exponential, outside="nearest")
+    near = evaluate.leave_one_out(model, GRID.points_m, values).mae.mean()
+    blocked = evaluate.blocked(model, GRID.points_m, values, 200.0).mae.mean()
+    assert blocked > 1.3 * near
+
+
+def test_learning_curve_falls_and_is_repeatable():
+    values = simulated_field(GRID.points_m, 6, fields=10)
+    model = OrdinaryKriging(exponential, outside="nearest")
+    curve = evaluate.learning_curve(model, GRID.points_m, values, (10, 40, 160), seed=1).mean(axis=1)
+    assert curve[0] > curve[1] > curve[2]
+    again = evaluate.learning_curve(model, GRID.points_m, values, (10, 40, 160), seed=1).mean(axis=1)
+    np.testing.assert_array_equal(curve, again)
+    with pytest.raises(UsageError, match="sample sizes"):
+        evaluate.learning_curve(model, GRID.points_m, values, (len(GRID),))

@@ -1,0 +1,178 @@
+"""Files are read back with the programs that others use."""
+
+import io
+import json
+import sys
+import zipfile
+from xml.etree import ElementTree
+
+import numpy as np
+import pandas as pd
+import pytest
+from shapely.geometry import shape
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.maps import export
+from aerpaw_cmp.maps.grid import Grid, Layer, class_names, voronoi_borders
+
+FRAME = SiteFrame(35.7275, -78.6960)
+GRID = Grid.over_area((-90.0, 90.0, -60.0, 60.0))
+RSS = np.linspace(-120.0, -40.0, len(GRID))
+RSS[3] = np.nan
+RANK = np.arange(len(GRID)) % 5
+LAYERS = [
+    Layer("rank_k10_h030m_joint", RANK, "1", "Rank, K = 10, 30 m", class_names()),
+    Layer("rss_h030m_joint", RSS, "dBm", "RSS < 30 m & more"),
+]
+TOWERS = {"LW1": [-50.0, 0.0, 10.0], "LW<2>": [50.0, 10.0, 10.0]}
+BORDERS = voronoi_borders(list(TOWERS.values()), (-90.0, 90.0, -60.0, 60.0))
+
+
+def test_csv_keeps_order_and_gaps(tmp_path):
+    table = pd.read_csv(export.write_csv(tmp_path / "m.csv", GRID, FRAME, LAYERS))
+    assert table["index"].tolist() == list(range(1, len(GRID) + 1))
+    np.testing.assert_array_equal(table[["east_m", "north_m"]], GRID.points_m)
+    np.testing.assert_array_equal(table["rss_h030m_joint"], RSS)
+    np.testing.assert_array_equal(table["rank_k10_h030m_joint"], RANK)
+    east, north = FRAME.to_local(table["latitude_deg"], table["longitude_deg"])
+    np.testing.assert_allclose(np.column_stack([east, north]), GRID.points_m, atol=2e-4)
+
+
+def test_json_is_strict(tmp_path):
+    path = export.write_json(
+        tmp_path / "m.json", GRID, FRAME, LAYERS, {"mae": np.array([1.0, np.nan]), "n": np.int64(3), "r": float("inf")}
+    )
+
+    def refuse(name):
+        raise AssertionError(name)
+
+    content = json.loads(path.read_text(), parse_constant=refuse)
+    assert content["summary"] == {"mae": [1.0, None], "n": 3, "r": None}
+    values = content["layers"]["rss_h030m_joint"]["values"]
+    assert values[3] is None
+    assert values[4] == RSS[4]
+    assert content["layers"]["rank_k10_h030m_joint"]["classes"][0] == "Z"
+
+
+def test_geojson_cells_are_where_the_positions_are(tmp_path):
+    path = export.write_geojson(tmp_path / "m.geojson", GRID, FRAME, LAYERS, TOWERS, BORDERS)
+    features = json.loads(path.read_text())["features"]
+    cells = [f for f in features if f["properties"]["kind"] == "cell"]
+    assert len(cells) == len(GRID)
+    for i in (0, 5, 6, len(GRID) - 1):
+        polygon = shape(cells[i]["geometry"])
+        assert polygon.exterior.is_ccw
+        east, north = FRAME.to_local(polygon.centroid.y, polygon.centroid.x)
+        assert [float(east), float(north)] == pytest.approx(GRID.points_m[i].tolist(), abs=0.02)
+        assert polygon.area * 111_320**2 * np.cos(np.radians(35.7275)) == pytest.approx(900.0, rel=0.01)
+    assert cells[3]["properties"]["rss_h030m_joint"] is None
+    assert cells[4]["properties"]["rank_k10_h030m_joint"] == 4
+    towers = [f["properties"]["name"] for f in features if f["properties"]["kind"] == "tower"]
+    assert towers == list(TOWERS)
+    border = next(f for f in features if f["properties"]["kind"] == "border")
+    assert border["properties"]["towers"] == ["LW1", "LW<2>"]
+
+
+def test_kmz_has_a_map_and_a_legend_per_layer(tmp_path):
+    from matplotlib.image import imread
+
+    path = export.write_kmz(tmp_path / "m.kmz", GRID, FRAME, LAYERS, TOWERS, BORDERS)
+    with zipfile.ZipFile(path) as archive:
+        names = archive.namelist()
+        tree = ElementTree.fromstring(archive.read("doc.kml"))
+        picture = imread(io.BytesIO(archive.read("maps/rank_k10_h030m_joint.png")))
+        legend = imread(io.BytesIO(archive.read("legends/rss_h030m_joint.png")))
+    assert names[0] == "doc.kml", "Google Earth opens the first KML"
+    kml = "{http://www.opengis.net/kml/2.2}"
+    hrefs = [node.text for node in tree.iter(f"{kml}href")]
+    assert sorted(hrefs) == sorted(names[1:])
+    assert [node.find(f"{kml}visibility").text for node in tree.iter(f"{kml}GroundOverlay")] == ["1", "0"]
+    assert {node.text for node in tree.iter(f"{kml}name")} >= {"LW1", "LW<2>", "RSS < 30 m & more"}
+    # the picture begins in the north-west: position of the last row, first column
+    size = export.PIXELS_PER_CELL
+    assert picture.shape[:2] == (GRID.shape[0] * size, GRID.shape[1] * size)
+    classes = export._colours(LAYERS[0], 0, 1)
+    np.testing.assert_allclose(
+        picture[size // 2, size // 2], classes[(GRID.shape[0] - 1) * GRID.shape[1]], atol=1 / 250
+    )
+    np.testing.assert_allclose(picture[-size // 2, size // 2], classes[0], atol=1 / 250)
+    assert legend[..., :3].std() > 0.05, "an empty legend"
+
+
+def test_kml_box_fits_the_site_at_full_size():
+    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    north, south, east, west = export._bounding_box(grid, FRAME)
+    corner_east, corner_north = FRAME.to_local([north, north, south, south], [west, east, west, east])
+    assert np.abs(np.abs(corner_east) - 540.0).max() < 0.3
+    assert np.abs(np.abs(corner_north) - 1065.0).max() < 0.3
+
+
+def test_same_map_same_bytes(tmp_path):
+    first = export.write_kmz(tmp_path / "a.kmz", GRID, FRAME, LAYERS).read_bytes()
+    assert first == export.write_kmz(tmp_path / "b.kmz", GRID, FRAME, LAYERS).read_bytes()
+
+
+def test_out_of_coverage_is_its_own_colour():
+    colours = export._colours(LAYERS[1], -120.0, -40.0)
+    assert colours[3].tolist() == export._colours(LAYERS[0], 0, 1)[0].tolist(), "Z of both kinds is the same grey"
+    assert (colours[[2, 4]] != colours[3]).any(axis=1).all()
+    servers = Layer("serving_tower", np.zeros(len(GRID), dtype=int), "1", "Serving", ("LW1", "LW2"))
+    assert export._colours(servers, 0, 1)[0].tolist() != colours[3].tolist(), "the first tower is no gap"
+
+
+def test_constant_and_empty_layers_can_be_drawn(tmp_path):
+    flat = Layer("flat", np.full(len(GRID), 3.0), "dB", "flat")
+    empty = Layer("empty", np.full(len(GRID), np.nan), "dB", "empty")
+    endless = Layer("endless", np.full(len(GRID), np.inf), "dB", "endless")
+    assert export.write_kmz(tmp_path / "m.kmz", GRID, FRAME, [flat, empty, endless]).stat().st_size > 0
+
+
+def test_netcdf_follows_cf(tmp_path):
+    xr = pytest.importorskip("xarray")
+    pytest.importorskip("netCDF4")
+    path = export.write_netcdf(tmp_path / "m.nc", GRID, FRAME, LAYERS)
+    with xr.open_dataset(path, decode_coords="all") as data:
+        assert data.attrs["Conventions"] == "CF-1.10"
+        np.testing.assert_array_equal(data["rss_h030m_joint"].values.ravel(), RSS)
+        np.testing.assert_array_equal(data["rank_k10_h030m_joint"].values.ravel(), RANK)
+        assert data["rss_h030m_joint"].attrs["units"] == "dBm"
+        rank = data["rank_k10_h030m_joint"].attrs
+        assert rank["flag_meanings"].split()[0] == "out_of_coverage"
+        assert len(rank["flag_values"]) == len(rank["flag_meanings"].split())
+        assert data["rss_h030m_joint"].dims == ("north", "east")
+        import pyproj
+
+        there = pyproj.Proj(pyproj.CRS.from_cf(data["crs"].attrs))(
+            float(data["longitude"][0, 0]), float(data["latitude"][0, 0])
+        )
+        assert there == pytest.approx(tuple(GRID.points_m[0]), abs=1e-3)
+
+
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rasterio's own, of affine
+def test_geotiff_is_north_up(tmp_path):
+    rasterio = pytest.importorskip("rasterio")
+    path = export.write_geotiff(tmp_path / "m.tif", GRID, FRAME, LAYERS)
+    with rasterio.open(path) as file:
+        assert file.count == 2
+        assert file.descriptions == tuple(layer.name for layer in LAYERS)
+        row, column = file.index(*GRID.points_m[6])
+        assert file.read(2)[row, column] == pytest.approx(RSS[6], rel=1e-6)
+        assert np.isnan(file.read(2)[file.index(*GRID.points_m[3])])
+        assert file.tags(1)["classes"].startswith("Z 1")
+
+
+@pytest.mark.parametrize(("writer", "module"), [(export.write_netcdf, "netCDF4"), (export.write_geotiff, "rasterio")])
+def test_missing_extra_is_named(tmp_path, monkeypatch, writer, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=r"aerpaw-cmp\[geo\]"):
+        writer(tmp_path / "m", GRID, FRAME, LAYERS)
+
+
+def test_wrong_layers_are_a_bug(tmp_path):
+    with pytest.raises(ValueError, match="same name"):
+        export.write_csv(tmp_path / "m.csv", GRID, FRAME, [LAYERS[0], LAYERS[0]])
+    with pytest.raises(ValueError, match="shape"):
+        export.write_csv(tmp_path / "m.csv", GRID, FRAME, [Layer("a", np.zeros(3), "1", "a")])
+    with pytest.raises(ValueError, match="layer name"):
+        Layer("a b", np.zeros(3), "1", "a")

@@ -1,0 +1,229 @@
+"""The map job with a small engine of closed forms handed in."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.job import (
+    PAPER_RANK_ALTITUDES_M,
+    Evaluation,
+    altitude_variance,
+    empirical_cdf,
+    foliage_difference,
+    honest_study,
+    interpolation_study,
+    layers_of,
+    map_job,
+    rank_fields,
+    rank_of_singular_values,
+    rank_study,
+)
+
+GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
+TOWERS = {"A": np.array([-200.0, 0.0, 10.0]), "B": np.array([200.0, 50.0, 10.0])}
+
+
+class Engine:
+    """Free space; the second singular value falls with distance; no path beyond a range."""
+
+    def __init__(self, range_m=350.0, extra_loss_db=0.0):
+        self.range_m, self.extra_loss_db = range_m, extra_loss_db
+        self.calls = []
+
+    def __call__(self, position_m, names):
+        self.calls.append((len(position_m), float(position_m[0, 2])))
+        towers = np.array([TOWERS[name] for name in names])
+        d = np.linalg.norm(position_m[:, None] - towers[None], axis=-1)
+        seen = d < self.range_m
+        siso = np.where(seen, -40.0 - 20 * np.log10(d) - self.extra_loss_db, np.nan)
+        one = np.where(seen, 1.0 / d, np.nan)
+        ratio = (20.0 / d) * (1 + 0.5 * np.sin(position_m[:, :1] / 40 + position_m[:, 2:] / 9))
+        sigma = np.stack([one, one * ratio, one * 1e-4, np.where(seen, 0.0, np.nan)], axis=-1)
+        return Evaluation(siso, siso + 12.0, sigma)
+
+
+@pytest.fixture(scope="module")
+def result():
+    return map_job(
+        GRID, TOWERS, Engine(), rss_altitudes_m=(30, 70), rank_altitudes_m=(3, 30, 40, 50), ks=(10, 100), chunk=150
+    )
+
+
+def test_each_altitude_is_evaluated_once_in_chunks():
+    engine = Engine()
+    done = []
+    map_job(GRID, TOWERS, engine, rss_altitudes_m=(30, 70), rank_altitudes_m=(3, 30), chunk=150, progress=done.append)
+    assert sorted({h for _, h in engine.calls}) == [3.0, 30.0, 70.0]
+    assert sum(n for n, _ in engine.calls) == 3 * len(GRID)
+    assert max(n for n, _ in engine.calls) == 150
+    assert done[-1] == 1.0
+    assert done == sorted(done)
+
+
+def test_values_land_where_they_belong(result):
+    direct = Engine()(GRID.positions_m(70.0), ("A", "B"))
+    np.testing.assert_array_equal(result.rss("siso", "B")[1], direct.rss_siso_dbm[:, 1])
+    np.testing.assert_array_equal(result.rss("mimo", "A")[1], direct.rss_mimo_dbm[:, 0])
+    direct = Engine()(GRID.positions_m(40.0), ("A", "B"))
+    np.testing.assert_array_equal(
+        result.ranks("B")[2], rank_of_singular_values(direct.singular_values, (10, 100))[:, 1].T
+    )
+    near = np.where(
+        np.abs(GRID.points_m - TOWERS["A"][:2]).sum(axis=1) < np.abs(GRID.points_m - TOWERS["B"][:2]).sum(axis=1), 0, 1
+    )
+    assert (result.serving == near).mean() > 0.9
+    joint = result.ranks()[2]
+    np.testing.assert_array_equal(joint[:, result.serving == 1], result.ranks("B")[2][:, result.serving == 1])
+    spread = 20 * np.log10(direct.singular_values[:, 0, 0] / direct.singular_values[:, 0, 1])
+    np.testing.assert_allclose(result.spread_db[2, 0], spread, rtol=1e-12)
+    seen = np.isfinite(spread)
+    assert np.isposinf(result.condition_db[2, 0][seen]).all(), "a zero singular value"
+    assert np.isnan(result.condition_db[2, 0][~seen]).all()
+
+
+def test_chunks_do_not_change_the_result(result):
+    other = map_job(
+        GRID, TOWERS, Engine(), rss_altitudes_m=(30, 70), rank_altitudes_m=(3, 30, 40, 50), ks=(10, 100), chunk=400
+    )
+    for name in ("rss_siso_dbm", "rss_mimo_dbm", "rank", "spread_db", "condition_db"):
+        np.testing.assert_array_equal(getattr(result, name), getattr(other, name))
+
+
+def test_rank_rule_is_strict_and_knows_no_channel():
+    sigma = np.array([[1.0, 0.1, 0.01, 0.001], [0.0, 0.0, 0.0, 0.0], [np.nan] * 4, [2.0, 2.0, 2.0, 2.0]])
+    assert rank_of_singular_values(sigma, (10.0, 100.0, 1000.0)).tolist() == [
+        [1, 2, 3],
+        [0, 0, 0],
+        [0, 0, 0],
+        [4, 4, 4],
+    ]
+
+
+def test_out_of_coverage_is_counted_and_never_averaged(result):
+    shares = result.rank_shares("A")
+    np.testing.assert_allclose(shares.sum(axis=-1), 1.0)
+    far = np.linalg.norm(GRID.positions_m(30.0) - TOWERS["A"], axis=1) >= 350.0
+    assert shares[1, 0, 0] == pytest.approx(far.mean())
+    assert result.coverage("siso", "A")[0] == pytest.approx(1 - far.mean())
+    assert result.coverage("siso", "A", threshold_dbm=-60.0)[0] < result.coverage("siso", "A")[0]
+    value, share = empirical_cdf(result.rss("siso", "A")[0])
+    assert share[0] == pytest.approx(far.mean() + 1 / len(GRID))
+    assert share[-1] == 1.0
+    assert (np.diff(value) >= 0).all()
+
+
+def test_memory_grows_with_results_only():
+    """Twice the altitudes cost twice the result and no more."""
+
+    def peak(altitudes):
+        tracemalloc.start()
+        found = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=altitudes, rank_altitudes_m=altitudes, chunk=100)
+        size = sum(
+            getattr(found, n).nbytes for n in ("rss_siso_dbm", "rss_mimo_dbm", "rank", "spread_db", "condition_db")
+        )
+        top = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        return top - size
+
+    few, many = peak(range(10, 60, 10)), peak(range(10, 410, 10))
+    assert many < few + 200_000
+
+
+def test_foliage_difference():
+    clear = map_job(GRID, TOWERS, Engine(), rss_altitudes_m=(30,), rank_altitudes_m=(30,))
+    shaded = map_job(
+        GRID, TOWERS, Engine(range_m=200.0, extra_loss_db=3.0), rss_altitudes_m=(30,), rank_altitudes_m=(30,)
+    )
+    found = foliage_difference(clear, shaded)
+    assert np.nanmax(np.abs(found.rss_loss_db - 3.0)) < 1e-9
+    assert found.lost.sum() == np.isfinite(clear.rss()).sum() - np.isfinite(shaded.rss()).sum() > 0
+    assert (found.rank_change == 0).all()
+    with pytest.raises(UsageError, match="ks"):
+        foliage_difference(
+            clear, map_job(GRID, TOWERS, Engine(), rss_altitudes_m=(30,), rank_altitudes_m=(30,), ks=(7,))
+        )
+
+
+def test_layers_are_named_once(result):
+    layers = layers_of(result, towers_too=True)
+    names = [layer.name for layer in layers]
+    assert len(set(names)) == len(names) == 1 + 3 * (2 * 2 + 4 * (2 + 2))
+    assert "rank_k10_h003m_joint" in names
+    assert "rss_mimo_h070m_B" in names
+    assert all(layer.values.shape == (len(GRID),) for layer in layers)
+
+
+def test_rank_study_runs_the_papers_comparison(result):
+    study = rank_study(result)
+    heights, rank = rank_fields(result)
+    assert heights == (30.0, 40.0, 50.0)
+    assert rank.shape == (len(GRID), 3, 2)
+    assert set(study.scores) == {"Kriging", "makima", "spline", "nearest", "inverse distance", "serving-tower mean"}
+    for found in study.scores.values():
+        assert found.mae.shape == (3, 2)
+    assert (
+        study.correlation.positions + study.correlation.excluded_constant + study.correlation.excluded_missing
+        == len(GRID)
+    )
+    out = (result.ranks()[1:] == 0).sum(axis=-1)
+    np.testing.assert_array_equal(study.scores["Kriging"].n + study.scores["Kriging"].unpredicted, len(GRID) - out)
+    assert study.scores["Kriging"].mae.mean() < study.scores["serving-tower mean"].mae.mean()
+    zeros = rank_study(result, out_of_coverage="zero")
+    assert (zeros.scores["Kriging"].n == len(GRID)).all()
+
+
+def test_rank_study_of_a_flat_map_says_so():
+    def flat(position_m, names):
+        one = np.ones((len(position_m), len(names)))
+        return Evaluation(-one, -one, np.stack([one, 0 * one, 0 * one, 0 * one], axis=-1))
+
+    study = rank_study(map_job(GRID, TOWERS, flat, rss_altitudes_m=(), rank_altitudes_m=(30, 40)))
+    assert study.fit.degenerate
+    assert "stands in" in study.fit.message
+    assert (study.scores["Kriging"].mae == 0).all()
+    assert study.correlation.excluded_constant == len(GRID)
+
+
+def test_papers_altitudes():
+    assert PAPER_RANK_ALTITUDES_M == (3, 30, 40, 50, 60, 70, 80, 90, 100, 110)
+
+
+def test_wrong_engine_and_no_tower_are_named():
+    with pytest.raises(UsageError, match="no tower"):
+        map_job(GRID, {}, Engine())
+    with pytest.raises(ValueError, match="shapes"):
+        map_job(GRID, TOWERS, lambda *_: Evaluation(np.zeros((1, 1)), np.zeros((1, 1)), np.zeros((1, 1, 4))))
+
+
+def test_papers_variance_over_altitudes():
+    values = np.array([[[1.0], [2.0], [3.0]], [[2.0], [2.0], [np.nan]], [[1.0], [np.nan], [np.nan]]])
+    found = altitude_variance(values)[:, 0]
+    assert found[:2].tolist() == [1.0, 0.0]
+    assert np.isnan(found[2])
+
+
+def test_rss_is_studied_like_rank(result):
+    study = interpolation_study(GRID, np.moveaxis(result.rss_siso_dbm, -1, 0), result.towers_m)
+    assert study.scores["Kriging"].mae.shape == (2, 2)
+    assert study.scores["Kriging"].mae.max() < 1.0, "free space is smooth"
+    assert study.scores["Kriging"].mae.mean() < study.scores["nearest"].mae.mean()
+
+
+def test_honest_study_is_harder_than_leave_one_out(result):
+    heights, rank = rank_fields(result)
+    study = rank_study(result)
+    flight = np.column_stack([np.linspace(-300, 300, 400), 50 * np.sin(np.linspace(0, 9, 400))])
+    found = honest_study(
+        GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0, learning_sizes=(20, 100, 9999)
+    )
+    assert found.learning_sizes == (20, 100)
+    assert found.learning_mae.shape == (2, 3, 2)
+    assert found.learning_mae[0].mean() > found.learning_mae[1].mean()
+    assert found.blocked.mae.mean() > study.scores["Kriging"].mae.mean()
+    assert found.altitude_held_out.mae.shape == (3, 2)
+    assert found.altitude_held_out.unpredicted.sum() == 0
+    assert found.trajectory.n.max() < len(GRID)
+    assert found.vertical_scale > 1.0, "the engine's rank changes faster with height than along the ground"

@@ -1,0 +1,418 @@
+"""Kriging: against a plain textbook solve, PyKrige, closed forms, and where textbooks break."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.kriging import OrdinaryKriging
+from aerpaw_cmp.maps.variogram import PAPER_BIEXPONENTIAL as PAPER
+
+
+def exponential(d):
+    return np.exp(-d / 120.0)
+
+
+def scattered(n, seed, extent=600.0, dims=2):
+    return np.random.default_rng(seed).uniform(0, extent, (n, dims))
+
+
+def textbook(points, values, target, correlation, v2=1.0):
+    """The paper's system (section VI-B) for one target, as written."""
+    n = len(points)
+    gamma = v2 * (1 - correlation(np.linalg.norm(points[:, None] - points[None], axis=-1)))
+    np.fill_diagonal(gamma, 0.0)
+    system = np.block([[gamma, np.ones((n, 1))], [np.ones((1, n)), np.zeros((1, 1))]])
+    right = np.append(v2 * (1 - correlation(np.linalg.norm(points - target, axis=-1))), 1.0)
+    solution = np.linalg.solve(system, right)
+    return solution[:n] @ values, solution @ right
+
+
+# --- right where the textbook is right ------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("correlation", [PAPER, exponential], ids=["paper", "exponential"])
+def test_predict_equals_the_textbook_system(correlation):
+    points, targets = scattered(80, 1), scattered(40, 2)
+    values = np.random.default_rng(3).normal(size=80)
+    estimate, variance = (
+        OrdinaryKriging(correlation, neighbours=12, radius_m=300.0, sill=2.5).fit(points, values).predict(targets)
+    )
+    for t, target in enumerate(targets):
+        far = np.linalg.norm(points - target, axis=1)
+        near = [i for i in np.argsort(far) if far[i] <= 300.0][:12]
+        expected, expected_variance = textbook(points[near], values[near], target, correlation, 2.5)
+        assert estimate[t] == pytest.approx(expected, abs=1e-10)
+        assert variance[t] == pytest.approx(expected_variance, abs=1e-10)
+
+
+def test_equals_pykrige_on_untied_data():
+    """Moving neighbourhood of 20, an external implementation, 1e-9."""
+    ok = pytest.importorskip("pykrige.ok")
+    points, targets = scattered(300, 4, 1000.0), scattered(100, 5, 1000.0)
+    values = np.random.default_rng(6).normal(size=300)
+    peer = ok.OrdinaryKriging(
+        *points.T,
+        values,
+        variogram_model="custom",
+        variogram_parameters=[0.0],
+        variogram_function=lambda _, d: 1 - PAPER(d),
+    )
+    expected, expected_variance = peer.execute("points", *targets.T, backend="loop", n_closest_points=20)
+    estimate, variance = OrdinaryKriging(PAPER, 20, np.inf, sill=1.0).fit(points, values).predict(targets)
+    np.testing.assert_allclose(estimate, np.asarray(expected), atol=1e-9, rtol=0)
+    np.testing.assert_allclose(variance, np.asarray(expected_variance), atol=1e-9, rtol=0)
+
+
+def test_equals_pykrige_in_space():
+    ok3d = pytest.importorskip("pykrige.ok3d")
+    points, targets = scattered(120, 7, 300.0, 3), scattered(30, 8, 300.0, 3)
+    values = np.random.default_rng(9).normal(size=120)
+    peer = ok3d.OrdinaryKriging3D(
+        *points.T, values, variogram_model="custom", variogram_parameters=[0.0],
+        variogram_function=lambda _, d: 1 - exponential(d), anisotropy_scaling_z=4.0,
+    )  # fmt: skip
+    expected, expected_variance = peer.execute("points", *targets.T, backend="loop", n_closest_points=15)
+    model = OrdinaryKriging(exponential, 15, np.inf, sill=1.0, vertical_scale=4.0).fit(points, values)
+    estimate, variance = model.predict(targets)
+    np.testing.assert_allclose(estimate, np.asarray(expected), atol=1e-9, rtol=0)
+    np.testing.assert_allclose(variance, np.asarray(expected_variance), atol=1e-9, rtol=0)
+
+
+def test_separable_correlation_uses_height_and_plan_apart():
+    def vertical(d):
+        return np.exp(-d / 15.0)
+
+    points = scattered(10, 10, 100.0, 3)
+    target = np.array([50.0, 50.0, 40.0])
+    values = np.arange(10.0)
+
+    def gamma(a, b):
+        return 1 - exponential(np.hypot(*(a - b)[:2])) * vertical(abs((a - b)[2]))
+
+    system = np.ones((11, 11))
+    system[:10, :10] = [[0.0 if i == j else gamma(points[i], points[j]) for j in range(10)] for i in range(10)]
+    system[10, 10] = 0
+    right = np.array([gamma(p, target) for p in points] + [1.0])
+    solution = np.linalg.solve(system, right)
+    model = OrdinaryKriging(exponential, 10, np.inf, sill=1.0, vertical_correlation=vertical).fit(points, values)
+    estimate, variance = model.predict([target])
+    assert estimate[0] == pytest.approx(solution[:10] @ values, abs=1e-11)
+    assert variance[0] == pytest.approx(solution @ right, abs=1e-11)
+
+
+def test_many_fields_equal_one_by_one():
+    points, targets = scattered(60, 11), scattered(25, 12)
+    values = np.random.default_rng(13).normal(size=(60, 4))
+    values[::7, 1] = np.nan
+    together = OrdinaryKriging(PAPER).fit(points, values).predict(targets)
+    for field in range(4):
+        alone = OrdinaryKriging(PAPER).fit(points, values[:, field]).predict(targets)
+        np.testing.assert_allclose(together[0][:, field], alone[0], rtol=1e-12)
+        np.testing.assert_allclose(together[1][:, field], alone[1], rtol=1e-12)
+
+
+def test_leave_one_out_equals_refitting_without_each():
+    points = scattered(50, 14)
+    values = np.random.default_rng(15).normal(size=(50, 2))
+    values[3, 0] = np.nan
+    model = OrdinaryKriging(PAPER, 8, 250.0, sill=1.3).fit(points, values)
+    estimate, variance = model.leave_one_out()
+    for i in range(50):
+        others = np.arange(50) != i
+        expected = OrdinaryKriging(PAPER, 8, 250.0, sill=1.3).fit(points[others], values[others]).predict(points[[i]])
+        np.testing.assert_allclose(estimate[i], expected[0][0], atol=1e-11)
+        np.testing.assert_allclose(variance[i], expected[1][0], atol=1e-11)
+
+
+def test_shared_weights_on_a_grid_equal_the_textbook():
+    grid = Grid.over_area((0.0, 300.0, 0.0, 360.0))
+    points = grid.points_m
+    values = np.random.default_rng(16).integers(1, 4, len(grid)).astype(float)
+    estimate, variance = OrdinaryKriging(PAPER, 12, 100.0, sill=1.0).fit(points, values).leave_one_out()
+    for i in range(len(grid)):
+        offset = points - points[i]
+        far = np.hypot(*offset.T)
+        near = [
+            j for j in np.lexsort((offset[:, 0], offset[:, 1], np.round(far, 6))) if far[j] <= 100.0 + 1e-6 and j != i
+        ][:12]
+        expected, expected_variance = textbook(points[near], values[near], points[i], PAPER)
+        assert estimate[i] == pytest.approx(expected, abs=1e-11)
+        assert variance[i] == pytest.approx(expected_variance, abs=1e-11)
+
+
+@settings(max_examples=30, deadline=None)
+@given(st.integers(0, 10_000), st.integers(1, 25), st.floats(-1e3, 1e3), st.floats(0.1, 50.0))
+def test_properties(seed, m, shift, factor):
+    """Weights sum to 1; affine in the values; moving the site changes nothing; nor does the order of samples."""
+    rng = np.random.default_rng(seed)
+    points, targets, values = rng.uniform(0, 400, (40, 2)), rng.uniform(0, 400, (6, 2)), rng.normal(size=40)
+    model = OrdinaryKriging(PAPER, m, 500.0).fit(points, values)
+    rule = model.weights(targets)
+    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-12)
+    assert (rule.variance >= 0).all()
+    estimate, variance = model.predict(targets)
+    other, other_variance = OrdinaryKriging(PAPER, m, 500.0).fit(points, shift + factor * values).predict(targets)
+    np.testing.assert_allclose(other, shift + factor * estimate, atol=1e-9 * (abs(shift) + factor))
+    np.testing.assert_allclose(other_variance, factor**2 * variance, rtol=1e-8)
+    order = rng.permutation(40)
+    moved = OrdinaryKriging(PAPER, m, 500.0).fit(points[order] + shift, values[order]).predict(targets + shift)
+    np.testing.assert_allclose(moved[0], estimate, atol=1e-8)
+
+
+# --- hard cases of issue 6 ------------------------------------------------------------------------------------------
+
+
+def test_tied_neighbours_follow_the_rule_whatever_the_order():
+    """Four samples at 30 m, two allowed: the southern, then the western one."""
+    points = np.array([[0.0, 30.0], [30.0, 0.0], [-30.0, 0.0], [0.0, -30.0]])
+    values = np.array([1.0, 2.0, 4.0, 8.0])
+    for order in (np.arange(4), np.arange(4)[::-1], np.array([2, 0, 3, 1])):
+        estimate, _ = OrdinaryKriging(exponential, 2).fit(points[order], values[order]).predict([[0.0, 0.0]])
+        assert estimate[0] == pytest.approx(6.0, abs=1e-12)
+
+
+def test_ties_survive_coordinates_that_are_not_exact():
+    """0.1 m steps are no binary numbers: the pattern of inner targets must still be one."""
+    grid = Grid.over_area((0.1, 3.1, 0.7, 3.7), 0.1)
+    model = OrdinaryKriging(lambda d: np.exp(-d), 20, 1.0).fit(grid.points_m, np.arange(len(grid)))
+    chosen = model._neighbours(grid.points_m, grid.points_m, np.arange(len(grid)))
+    offset = np.round((grid.points_m[chosen.index] - grid.points_m[:, None]) * 10).astype(int)
+    inner = grid.raster(np.arange(len(grid)))[6:-6, 6:-6].ravel()
+    assert len(np.unique(offset[inner].reshape(len(inner), -1), axis=0)) == 1
+
+
+def test_rings_larger_than_the_first_query_are_complete():
+    """200 samples on one circle: the 3 taken are the 3 southernmost."""
+    angle = np.linspace(0, 2 * np.pi, 200, endpoint=False) + 0.01
+    points = 50.0 * np.column_stack([np.cos(angle), np.sin(angle)])
+    rule = OrdinaryKriging(exponential, 3).fit(points, np.zeros(200)).weights([[0.0, 0.0]])
+    assert set(rule.index[0]) == set(np.argsort(points[:, 1])[:3])
+
+
+@pytest.mark.parametrize("correlation", [PAPER, exponential], ids=["nugget", "no nugget"])
+def test_coincident_samples_are_one_place_with_their_mean(correlation):
+    points = scattered(12, 17, 200.0)
+    values = np.arange(12.0)
+    doubled = np.vstack([points, points[:3]])
+    more = np.append(values, values[:3] + 2.0)
+    merged = values.copy()
+    merged[:3] += 1.0
+    targets = scattered(9, 18, 200.0)
+    model = OrdinaryKriging(correlation, 6, 400.0, sill=1.0)
+    expected = model.fit(points, merged).predict(targets)
+    found = model.fit(doubled, more).predict(targets)
+    np.testing.assert_array_equal(found[0], expected[0])
+    np.testing.assert_array_equal(found[1], expected[1])
+    left_out, _ = model.leave_one_out()
+    assert len(left_out) == 15
+    assert left_out[0] == left_out[12], "leaving one out leaves out the place"
+    assert left_out[0] != more[0]
+
+
+def test_nearly_coincident_samples_do_not_blow_up():
+    points = np.array([[0.0, 0.0], [0.0, 2e-6], [100.0, 0.0], [0.0, 90.0]])
+    model = OrdinaryKriging(exponential, 4, 400.0).fit(points, [1.0, 1.5, 0.0, 0.0])
+    estimate, variance = model.predict([[20.0, 20.0]])
+    assert 0.0 < estimate[0] < 1.5
+    assert np.isfinite(variance[0])
+    assert np.abs(model.weights([[20.0, 20.0]]).weight).max() < 2.0
+
+
+def test_zero_sill_is_harmless():
+    points, targets = scattered(30, 19), scattered(10, 20)
+    values = np.random.default_rng(21).normal(size=30)
+    with_zero = OrdinaryKriging(PAPER, sill=0.0).fit(points, values).predict(targets)
+    with_one = OrdinaryKriging(PAPER, sill=1.0).fit(points, values).predict(targets)
+    np.testing.assert_array_equal(with_zero[0], with_one[0])
+    assert (with_zero[1][np.isfinite(with_zero[0])] == 0).all()
+
+
+def test_constant_field_is_exact_with_variance_zero():
+    points, targets = scattered(100, 22), scattered(50, 23)
+    for constant in (0.1, 1 / 3, -97.7, 3.0):
+        values = np.full((100, 2), constant)
+        values[::5, 1] = np.nan
+        model = OrdinaryKriging(PAPER).fit(points, values)
+        for estimate, variance in (model.predict(targets), model.leave_one_out()):
+            assert (estimate[np.isfinite(estimate)] == constant).all()
+            assert np.isfinite(estimate).any()
+            assert (variance[np.isfinite(variance)] == 0).all()
+
+
+def test_fewer_than_m_one_and_none_within_the_radius():
+    points = np.array([[0.0, 0.0], [100.0, 0.0], [120.0, 0.0]])
+    model = OrdinaryKriging(exponential, 20, 50.0, sill=1.0).fit(points, [1.0, 2.0, 4.0])
+    estimate, variance = model.predict([[20.0, 0.0], [110.0, 10.0], [0.0, 500.0]])
+    assert estimate[0] == 1.0  # one sample: its value
+    assert variance[0] == pytest.approx(2 * (1 - exponential(20.0)), rel=1e-12)
+    assert estimate[1] == pytest.approx(3.0, abs=1e-12)  # two samples, by symmetry their mean
+    assert np.isnan(estimate[2])
+    assert np.isnan(variance[2])
+    anyway = (
+        OrdinaryKriging(exponential, 2, 50.0, outside="nearest").fit(points, [1.0, 2.0, 4.0]).predict([[-400.0, 0.0]])
+    )
+    expected = OrdinaryKriging(exponential, 2, np.inf).fit(points, [1.0, 2.0, 4.0]).predict([[-400.0, 0.0]])
+    assert anyway == expected
+
+
+def test_radius_is_inclusive():
+    """150 m / 30 m: the fifth cell counts, although 5 * 30.000000000000001 might not."""
+    model = OrdinaryKriging(exponential, 1, 0.3).fit([[0.1 * 3, 0.0]], [5.0])
+    assert model.predict([[0.0, 0.0]])[0][0] == 5.0
+
+
+def test_one_sample_in_all():
+    model = OrdinaryKriging(PAPER).fit([[0.0, 0.0]], [2.0])
+    assert model.predict([[10.0, 0.0]])[0][0] == 2.0
+    assert np.isnan(model.leave_one_out()[0]).all()
+
+
+def test_collinear_samples():
+    points = np.column_stack([np.arange(0, 300, 10.0), np.zeros(30)])
+    values = np.sin(points[:, 0] / 50)
+    estimate, variance = (
+        OrdinaryKriging(exponential, 10, 100.0, sill=1.0).fit(points, values).predict([[145.0, 0.0], [145.0, 40.0]])
+    )
+    # an exponential correlation on a line is Markov: between two samples only these two count
+    expected, expected_variance = textbook(points[14:16], values[14:16], np.array([145.0, 0.0]), exponential)
+    assert estimate[0] == pytest.approx(expected, abs=1e-3)
+    assert variance[0] <= expected_variance + 1e-12
+    assert np.isfinite(estimate[1])
+    assert variance[1] > variance[0]
+
+
+@pytest.mark.parametrize("range_m", [300.0, 3000.0])
+def test_gaussian_correlation_without_nugget_is_regularised(range_m):
+    """Condition number beyond 1e16: estimates must follow a smooth field, weights stay bounded."""
+    grid = Grid.over_area((0.0, 300.0, 0.0, 300.0))
+    field = np.sin(grid.points_m[:, 0] / 200) + np.cos(grid.points_m[:, 1] / 300)
+    model = OrdinaryKriging(lambda d: np.exp(-((d / range_m) ** 2)), 20, 200.0).fit(grid.points_m, field)
+    targets = np.random.default_rng(24).uniform(60, 240, (40, 2))
+    rule = model.weights(targets)
+    assert rule.regularised.all()
+    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-9)
+    assert np.abs(rule.weight).max() < 30
+    assert (rule.variance >= 0).all()
+    estimate, _ = model.predict(targets)
+    truth = np.sin(targets[:, 0] / 200) + np.cos(targets[:, 1] / 300)
+    assert np.abs(estimate - truth).max() < 5e-3
+
+
+def test_well_conditioned_systems_are_left_alone():
+    model = OrdinaryKriging(PAPER).fit(scattered(200, 25), np.zeros(200))
+    assert not model.weights(scattered(100, 26)).regularised.any()
+
+
+def test_correlation_that_turns_negative():
+    def damped(d):
+        return np.exp(-d / 150.0) * np.cos(d / 70.0)
+
+    points, targets = scattered(80, 27), scattered(30, 28)
+    values = np.random.default_rng(29).normal(size=80)
+    estimate, variance = OrdinaryKriging(damped, 15, 400.0, sill=1.0).fit(points, values).predict(targets)
+    for t in range(30):
+        near = np.argsort(np.linalg.norm(points - targets[t], axis=1))[:15]
+        expected, expected_variance = textbook(points[near], values[near], targets[t], damped)
+        assert estimate[t] == pytest.approx(expected, abs=1e-8)
+        assert variance[t] == pytest.approx(expected_variance, abs=1e-8)
+
+
+def test_an_invalid_correlation_never_gives_a_negative_variance():
+    """A box is no covariance: the textbook variance comes out negative, the rule does not."""
+    points, targets = scattered(60, 30, 200.0), scattered(50, 31, 200.0)
+
+    def box(d):
+        return np.where(d < 80.0, 0.95, 0.0)
+
+    model = OrdinaryKriging(box, 15, 300.0).fit(points, np.random.default_rng(32).normal(size=60))
+    rule = model.weights(targets)
+    assert (rule.variance >= 0).all()
+    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-9)
+    near = np.argsort(np.linalg.norm(points[None] - targets[:, None], axis=-1), axis=1)[:, :15]
+    plain = [textbook(points[near[t]], np.zeros(15), targets[t], box)[1] for t in range(50)]
+    assert min(plain) < 0, "the case is not hard"
+
+
+def test_nugget_is_a_jump_unless_it_is_noise():
+    points, values = scattered(40, 33, 200.0), np.random.default_rng(34).normal(size=40)
+
+    def noisy(d):
+        return 0.6 * np.exp(-d / 100.0)
+
+    at_sample, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points)
+    np.testing.assert_array_equal(at_sample, values)
+    assert (variance == 0).all()
+    beside, variance = OrdinaryKriging(noisy, sill=1.0).fit(points, values).predict(points + 1e-3)
+    assert (np.abs(beside - values) > 1e-3).mean() > 0.9
+    assert (variance > 0.4).all()
+    smooth, smooth_variance = OrdinaryKriging(noisy, sill=1.0, exact=False).fit(points, values).predict(points)
+    np.testing.assert_allclose(smooth, beside, atol=1e-3)
+    np.testing.assert_allclose(smooth_variance, variance, atol=1e-3)
+
+
+def test_cells_without_coverage_take_no_part():
+    grid = Grid.over_area((0.0, 300.0, 0.0, 300.0))
+    values = np.random.default_rng(35).integers(1, 5, (100, 3)).astype(float)
+    values[np.random.default_rng(36).random((100, 3)) < 0.4] = np.nan
+    values[:, 2] = np.nan
+    estimate, _ = OrdinaryKriging(PAPER, 6, 80.0).fit(grid.points_m, values).leave_one_out()
+    assert np.isnan(estimate[:, 2]).all()
+    for field in (0, 1):
+        kept = np.isfinite(values[:, field])
+        alone = OrdinaryKriging(PAPER, 6, 80.0).fit(grid.points_m[kept], values[kept, field])
+        np.testing.assert_allclose(estimate[kept, field], alone.leave_one_out()[0], atol=1e-12)
+        np.testing.assert_allclose(estimate[~kept, field], alone.predict(grid.points_m[~kept])[0], atol=1e-12)
+
+
+def test_random_selection_is_seeded_within_the_radius_and_fair():
+    grid = Grid.over_area((0.0, 600.0, 0.0, 600.0))
+
+    def rule(seed):
+        model = OrdinaryKriging(PAPER, 20, 150.0, selection="random", seed=seed).fit(grid.points_m, np.zeros(400))
+        return model.weights(grid.points_m + 0.5)
+
+    first = rule(1)
+    np.testing.assert_array_equal(first.index, rule(1).index)
+    assert (first.index != rule(2).index).any()
+    for t in range(400):
+        chosen = first.index[t][first.index[t] >= 0]
+        assert len(set(chosen)) == len(chosen) == 20
+        assert np.linalg.norm(grid.points_m[chosen] - grid.points_m[t] - 0.5, axis=1).max() <= 150.0
+    # 78 or so candidates: the mean distance of a fair draw is 2/3 of the radius, that of the nearest 20 is half
+    inner = grid.raster(np.arange(400))[6:-6, 6:-6].ravel()
+    far = np.linalg.norm(grid.points_m[first.index[inner]] - grid.points_m[inner, None] - 0.5, axis=-1)
+    assert far.mean() == pytest.approx(100.0, rel=0.05)
+
+
+def test_random_leave_one_out_does_not_see_the_target():
+    points = scattered(60, 37, 200.0)
+    model = OrdinaryKriging(PAPER, 5, 400.0, selection="random").fit(points, np.eye(60))
+    estimate, _ = model.leave_one_out()
+    np.testing.assert_allclose(np.diag(estimate), 0.0, atol=1e-14)  # a target that is used would show its weight
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"neighbours": 0}, "neighbours = 0"),
+        ({"radius_m": -1.0}, "radius_m"),
+        ({"selection": "all"}, "selection"),
+        ({"sill": -1.0}, "sill"),
+        ({"vertical_scale": 0.0}, "vertical_scale"),
+    ],
+)
+def test_wrong_settings_are_named(arguments, message):
+    with pytest.raises(UsageError, match=message):
+        OrdinaryKriging(PAPER, **arguments).fit([[0.0, 0.0]], [1.0])
+
+
+def test_wrong_shapes_are_named():
+    with pytest.raises(UsageError, match="shape"):
+        OrdinaryKriging(PAPER).fit([[0.0, 0.0]], [1.0, 2.0])
+    with pytest.raises(UsageError, match="2 coordinates"):
+        OrdinaryKriging(PAPER).fit(scattered(4, 1, 9.0, 3), np.zeros(4)).predict([[0.0, 0.0]])
+    with pytest.raises(UsageError, match="not finite"):
+        OrdinaryKriging(lambda d: d * np.nan).fit(scattered(4, 1, 50.0), np.zeros(4)).predict([[0.0, 0.0]])

@@ -1,0 +1,131 @@
+"""The readers on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+import scipy.io
+
+from aerpaw_cmp.ingest import Ingested, ingest
+from aerpaw_cmp.readers import ReadOptions, by_name
+
+ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
+pytestmark = [
+    pytest.mark.field,
+    pytest.mark.skipif(not Path(ROOT).is_dir() or not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set"),
+]
+OPTIONS = ReadOptions(timezone="America/New_York")
+FIELD = Path(ROOT)
+
+
+@pytest.fixture(scope="module")
+def everything() -> Ingested:
+    return ingest(FIELD, options=OPTIONS)
+
+
+def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
+    found = {str(Path(file.path).relative_to(FIELD)): file.result for file in everything}
+    expected = {
+        "telemetry/2022-01-13_13_57_23_vehicleOut.txt": ("vehicle_out", 1089, 0),
+        "telemetry/2022-06-10_19_52_44_vehicleOut.txt": ("vehicle_out", 1662, 0),
+        "telemetry/2024-07-02_flight3_vehicleOut.txt": ("vehicle_out", 1006, 0),
+        "telemetry/2025-05-24_vehicleOut.txt": ("vehicle_out", 404, 0),
+        "sounder/2023-12-13_12_33_02_power_log.txt": ("sounder_log", 21716, 0),
+        "sounder/results_useful_ori_exp_288_loc_1.mat": ("flight_mat", 20523, 0),
+        "dataset12/40m_fs10MHz.mat": ("flight_mat", 3304, 0),
+        "dataset12/70m_fs20MHz.mat": ("flight_mat", 3503, 0),
+        "nr_rank/july2_2024_flight1_nemo_nr.csv": ("nemo_csv", 1911, 0),
+        "nr_rank/july2_2024_flight3_nemo_nr.csv": ("nemo_csv", 1999, 0),
+        "nr_rank/flight3_pdsch_rank.kml.gz": ("nemo_kml", 1983, 0),
+        "modem/derived/Basic_and_Other_Params.csv": ("quectel_csv", 3, 0),
+        "modem/derived/Serving_cell_Params_ENDC.csv": ("quectel_csv", 2, 0),
+        "modem/derived/Serving_cell_Params_LTE_only.csv": ("quectel_csv", 2, 0),
+        "srsran/2022-06-10_19_52_35_radio_enb_log.txt": ("srsenb_log", 1690, 0),
+        "aadm/snr_log.csv": ("aadm_snr", 331, 0),
+    }
+    for path, account in expected.items():
+        result = found[path]
+        assert (result.reader, result.accepted, len(result.rejected)) == account, path
+
+
+def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:
+    skipped = {str(Path(file.path).relative_to(FIELD)) for file in everything.skipped}
+    assert {"telemetry/AERPAW_Big_Geofence.kml", "antennas/rad_pat.mat", "sounder/rover_positions.txt"} <= skipped
+    assert "srsran/2022-06-10_19_52_44_radio_log.txt" in skipped, "srsUE prints no rank"
+
+
+def test_the_power_log_holds_the_merged_flight_exactly() -> None:
+    """Two independent routes to 20 523 levels: our reader of the raw log, the authors' own merge."""
+    folder = FIELD / "sounder"
+    (log,) = ingest(folder / "2023-12-13_12_33_02_power_log.txt", options=OPTIONS)
+    (mat,) = ingest(folder / "results_useful_ori_exp_288_loc_1.mat", options=OPTIONS)
+    raw = log.result.streams[0].frame.set_index("time")["rss_db"]
+    merged = next(one for one in mat.result.streams if one.name == "power").frame
+    joined = raw.reindex(merged["time"])
+    assert len(merged) == 20_523
+    table = scipy.io.loadmat(folder / "results_useful_ori_exp_288_loc_1.mat")
+    assert np.array_equal(joined.to_numpy(), table["mpower"].ravel()), "bit for bit"
+    assert np.array_equal(merged["rss_db"].to_numpy(), table["mpower"].ravel())
+
+
+@pytest.mark.parametrize("flight", ["40m_fs10MHz.mat", "70m_fs20MHz.mat"])
+def test_velocity_of_merged_flights_is_north_east_down(flight: str) -> None:
+    (file,) = ingest(FIELD / "dataset12" / flight, options=OPTIONS)
+    frame = file.result.streams[0].frame
+    seconds = frame["time"].to_numpy().astype(np.int64) / 1e9
+    for position, velocity, sign in (
+        ("latitude_deg", "velocity_north_mps", 1),
+        ("longitude_deg", "velocity_east_mps", 1),
+        ("altitude_m", "velocity_down_mps", -1),
+    ):
+        rate = np.gradient(frame[position].to_numpy(), seconds)
+        assert sign * np.corrcoef(rate, frame[velocity])[0, 1] > 0.95
+    assert file.result.streams[1].attributes["channel"] == "USRP1"
+
+
+def test_vehicle_out_velocity_and_attitude() -> None:
+    (file,) = ingest(FIELD / "telemetry" / "2024-07-02_flight3_vehicleOut.txt", options=OPTIONS)
+    frame = file.result.streams[0].frame
+    seconds = frame["time"].to_numpy().astype(np.int64) / 1e9
+    east = np.gradient(frame["longitude_deg"].to_numpy(), seconds)
+    assert np.corrcoef(east, frame["velocity_east_mps"])[0, 1] > 0.95
+    yaw = np.radians(frame["yaw_deg"])
+    forward = frame["velocity_north_mps"] * np.cos(yaw) + frame["velocity_east_mps"] * np.sin(yaw)
+    right = -frame["velocity_north_mps"] * np.sin(yaw) + frame["velocity_east_mps"] * np.cos(yaw)
+    assert np.corrcoef(forward, frame["pitch_deg"])[0, 1] < -0.3, "flying forward puts the nose down"
+    assert np.corrcoef(right, frame["roll_deg"])[0, 1] > 0.3, "flying right puts the right wing down"
+
+
+def test_the_two_nemo_formats_tell_the_same_ranks() -> None:
+    (table,) = ingest(FIELD / "nr_rank" / "july2_2024_flight3_nemo_nr.csv")
+    (kml,) = ingest(FIELD / "nr_rank" / "flight3_pdsch_rank.kml.gz")
+    one = table.result.streams[0].frame.dropna(subset="rank")
+    other = kml.result.streams[0].frame
+    assert one["rank"].tolist() == other["rank"].tolist()
+    assert set(one["rank"]) == {1.0, 2.0, 3.0, 4.0}
+    # a place belongs to a time in both; which time a rank belongs to differs by some four seconds between
+    # the two exports (the table's times start again after nine rows), so nothing is claimed about that
+    places = one.drop_duplicates("time").set_index("time")["latitude_deg"]
+    others = other.set_index("time")["latitude_deg"]
+    both = places.index.intersection(others.index)
+    assert len(both) > 1900
+    assert (places[both] == others[both]).all()
+    assert any("steps back" in text for text in table.result.warnings)
+
+
+def test_controller_console_and_its_csv_agree() -> None:
+    console, table = ingest([FIELD / "aadm" / "controller_log.txt", FIELD / "aadm" / "snr_log.csv"], options=OPTIONS)
+    spoken = next(one for one in console.result.streams if one.name == "LW1").frame["rss_db"]
+    written = next(one for one in table.result.streams if one.name == "LW1").frame["rss_db"]
+    assert spoken.between(written.min() - 5, written.max() + 5).mean() > 0.9
+
+
+@pytest.mark.parametrize("name", ["2023-12-13_12_31_07_power_log.txt"])
+def test_real_logs_cut_at_every_byte_of_their_end(name: str) -> None:
+    data = (FIELD / "sounder" / name).read_bytes()
+    for end in range(len(data) - 120, len(data)):
+        result = by_name("sounder_log").read(data[:end], OPTIONS)
+        assert result.lines == result.accepted + len(result.rejected) + result.blank

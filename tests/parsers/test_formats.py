@@ -1,0 +1,376 @@
+"""What each format means: units, order, sentinels, clocks."""
+
+from __future__ import annotations
+
+import gzip
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.readers import ReadOptions, by_name
+from aerpaw_cmp.records import ReadResult, Stream
+from tests.parsers import samples
+from tests.parsers.samples import CASES, OPTIONS, SAMPLES
+
+
+def read(reader: str, data: bytes, options: ReadOptions = OPTIONS) -> ReadResult:
+    return by_name(reader).read(data, options)
+
+
+def stream(result: ReadResult, name: str) -> Stream:
+    return next(one for one in result.streams if one.name == name)
+
+
+def utc(text: str) -> pd.Timestamp:
+    return pd.Timestamp(text)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [samples.VEHICLE_10, samples.VEHICLE_9, samples.VEHICLE_8, samples.VEHICLE_11, samples.VEHICLE_UTC],
+    ids=["10", "9", "8", "11", "utc"],
+)
+def test_all_generations_of_telemetry_agree(data: bytes) -> None:
+    first = read("vehicle_out", data).streams[0].frame.iloc[0]
+    # New York is at UTC-5 on 2 March
+    assert first["time"] == utc("2025-03-02 15:00:00.25")
+    assert (first["longitude_deg"], first["latitude_deg"], first["altitude_m"]) == (-78.7000001, 35.7300002, 0.5)
+    assert first["satellites"] == 12
+    if not np.isnan(first["pitch_deg"]):
+        assert np.allclose(first[["pitch_deg", "yaw_deg", "roll_deg"]].astype(float), np.degrees([0.1, 1.5, -0.05]))
+
+
+def test_attitude_is_there_where_the_format_has_it() -> None:
+    for data, present in ((samples.VEHICLE_10, True), (samples.VEHICLE_11, True), (samples.VEHICLE_9, False)):
+        assert read("vehicle_out", data).streams[0].frame["yaw_deg"].notna().iloc[0] == present
+
+
+def test_velocity_is_north_east_down() -> None:
+    first = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[0]
+    names = ["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]
+    assert first[names].tolist() == [1.0, 2.0, -0.5]
+
+
+def test_no_fix_is_flagged_and_has_no_position() -> None:
+    row = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[1]
+    assert row["flag"] == "no_fix"
+    assert row[["latitude_deg", "longitude_deg", "altitude_m"]].isna().all()
+    assert row["yaw_deg"] == pytest.approx(np.degrees(1.5)), "the attitude does not need a fix"
+
+
+def test_a_fix_below_two_is_no_position_whatever_it_says() -> None:
+    line = samples.VEHICLE_8.splitlines(keepends=True)[0]
+    frame = read("vehicle_out", line + line.replace(b",3,12", b",1,12")).streams[0].frame
+    assert frame["flag"].tolist() == ["", "no_fix"]
+    assert frame["latitude_deg"].isna().tolist() == [False, True]
+
+
+def test_zero_attitude_is_flagged_and_unknown_where_it_is_all_there_is() -> None:
+    result = read("vehicle_out", samples.VEHICLE_10)
+    assert result.streams[0].frame["flag"].iloc[2] == "zero_attitude"
+    third = samples.VEHICLE_10.splitlines(keepends=True)[2]
+    converted = read("vehicle_out", third * 3)
+    assert converted.streams[0].frame[["yaw_deg", "velocity_north_mps"]].isna().all(axis=None)
+    assert any("unknown" in text for text in converted.warnings)
+
+
+def test_torn_and_impossible_telemetry_says_why() -> None:
+    lines = samples.VEHICLE_10.splitlines(keepends=True)
+    data = lines[0] + b"2,-78.7,35.7\r\n" + lines[2].replace(b"03-02", b"13-02") + lines[2].replace(b"1.5", b"x", 1)
+    result = read("vehicle_out", data)
+    assert [(line.number, line.reason.split(" ")[0]) for line in result.rejected] == [(2, "3"), (3, "the"), (4, "a")]
+    assert result.rejected[0].text == "2,-78.7,35.7"
+
+
+def test_digital_twin_is_named() -> None:
+    line = b"%d,-78.7000001,35.7300002,0.5,48.1,99,2025-03-02 10:00:%02d.250000,6,10\r\n"
+    twin = b"".join(line % (i + 1, i) for i in range(20))
+    assert any("digital-twin" in text for text in read("vehicle_out", twin).warnings)
+
+
+def test_sounder_offsets_are_octal_and_runs_come_back() -> None:
+    result = read("sounder_log", samples.SOUNDER)
+    frame = result.streams[0].frame
+    # offsets 0, 4, 010 = 8, then 030 = 24: samples 3, 4 and 5 were suppressed
+    assert len(frame) == 3 + 3 + 2
+    assert frame["flag"].str.contains("repeated").sum() == 3
+    assert result.accepted == 6, "five samples and the '*'; the repeats come on top"
+    assert result.streams[0].attributes["repeated_samples"] == 3
+    spacing = frame["time"].diff().iloc[1:7].dt.total_seconds()
+    assert np.allclose(spacing, 0.03276, atol=1e-6), "repeats are spread between their neighbours"
+
+
+def test_sounder_floor_is_out_of_coverage_not_a_level() -> None:
+    frame = read("sounder_log", samples.SOUNDER).streams[0].frame
+    silent = frame["flag"].str.contains("out_of_coverage")
+    assert silent.tolist() == [False, False, True, True, True, True, False, False]
+    assert frame["rss_db"].isna().tolist() == silent.tolist()
+
+
+@pytest.mark.parametrize("width", [7, 8, 9])
+@pytest.mark.parametrize("text", ["-17.210482", "0.42979813", "10.51112", "-0", "5", "-123.45678", "6.0000001", "-.5"])
+def test_sounder_numbers_are_read_as_python_reads_them(text: str, width: int) -> None:
+    data = f"[2025-03-02 10:00:00.000000] {0o1234:0{width}o}{text:>16}\n".encode()
+    frame = read("sounder_log", data).streams[0].frame
+    assert frame["rss_db"].iloc[0] == float(text)
+
+
+@pytest.mark.parametrize("text", ["- 5", "1 5", "1-5", "1.2.3", "", "-", ".", "1x"])
+def test_sounder_rejects_what_is_no_number(text: str) -> None:
+    data = f"[2025-03-02 10:00:00.000000] 0001234{text:>16}\n".encode()
+    result = read("sounder_log", samples.SOUNDER_GROWN + data)
+    assert (result.accepted, len(result.rejected)) == (4, 1)
+
+
+def test_sounder_offset_outgrows_seven_digits() -> None:
+    result = read("sounder_log", samples.SOUNDER_GROWN)
+    assert not [text for text in result.warnings if "jump" in text]
+    assert (result.streams[0].frame["flag"] == "").all()
+
+
+def test_sounder_tells_lost_samples() -> None:
+    lines = samples.SOUNDER_GROWN.splitlines(keepends=True)
+    result = read("sounder_log", lines[0] + lines[3])
+    assert any("2 samples are missing" in text for text in result.warnings)
+    assert result.streams[0].frame["flag"].tolist() == ["", "samples_lost_before"]
+
+
+def test_sounder_torn_last_value_is_not_taken() -> None:
+    cut = samples.SOUNDER_GROWN[:-3]  # '-23.5' without its end would read as -23
+    result = read("sounder_log", cut)
+    assert result.accepted == 3
+    assert "torn" in result.rejected[0].reason
+
+
+def test_sounder_run_cannot_fill_the_memory() -> None:
+    data = (
+        b"[2025-03-02 10:00:00.000000] 0000000       -20.12345\n[2025-03-02 10:00:00.032760] *\n"
+        b"[2025-03-02 10:00:00.065520] 777777777777       -20.12345\n"
+    )
+    result = read("sounder_log", data)
+    assert (result.accepted, len(result.rejected)) == (2, 1)
+    assert "believable" in result.rejected[0].reason
+
+
+def test_sounder_channel_names_the_stream() -> None:
+    quality = read("sounder_log", samples.SOUNDER, replace(OPTIONS, channel="quality", unit=None)).streams[0]
+    power = read("sounder_log", samples.SOUNDER, replace(OPTIONS, unit=None))
+    assert (quality.name, quality.attributes["unit"]) == ("quality", "dB")
+    assert (power.streams[0].name, power.streams[0].attributes["unit"]) == ("power", "dB re full scale")
+    assert any("one layout" in text for text in power.warnings)
+
+
+def test_mat_gives_telemetry_and_a_stream_per_channel() -> None:
+    result = read("flight_mat", samples.mat_flight(), replace(OPTIONS, unit=None))
+    assert [(one.kind, one.name) for one in result.streams] == [
+        ("telemetry", "vehicle"), ("rss", "USRP1"), ("rss", "USRP2"),
+    ]  # fmt: skip
+    vehicle = stream(result, "vehicle").frame
+    assert vehicle["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
+    assert vehicle["velocity_north_mps"].tolist() == [2.0] * 5
+    level = stream(result, "USRP1")
+    assert level.attributes["unit"] == "dB re full scale"
+    assert level.frame["rss_db"].isna().tolist() == [False, False, True, False, False]
+    assert level.frame["flag"].iloc[2] == "out_of_coverage"
+
+
+def test_mat_epoch_of_local_time() -> None:
+    """Without the text the epoch is wall clock stored as UTC, unless the user knows better."""
+    data = samples.mat_flight(timestamp_power_for_csv=None)
+    local = read("flight_mat", data)
+    assert local.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
+    assert any("local wall clock" in text for text in local.warnings)
+    true_utc = read("flight_mat", data, replace(OPTIONS, clock="utc", timezone=None))
+    assert true_utc.streams[0].frame["time"].iloc[0] == utc("2025-03-02 10:00:00.25")
+
+
+def test_mat_row_without_a_time_is_rejected() -> None:
+    times = np.array(["2025-03-02 10:00:00.250", "nonsense", "2025-03-02 10:00:00.750", "NaT", "2025-02-30 10:00:00.0"])
+    result = read("flight_mat", samples.mat_flight(timestamp_power_for_csv=times))
+    assert (result.lines, result.accepted) == (5, 2)
+    assert [line.number for line in result.rejected] == [2, 4, 5]
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"mX": np.zeros((3, 1))}, "differ in length"),
+        ({"timestamp_power": None, "timestamp_power_for_csv": None}, "no clock"),
+        ({"mpower1": np.array(["a", "b", "c", "d", "e"])}, "not numeric"),
+    ],
+)
+def test_mat_that_is_no_flight(changes: dict[str, object], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        read("flight_mat", samples.mat_flight(**changes))
+
+
+def test_mat_of_another_kind_is_not_sniffed() -> None:
+    import io
+
+    import scipy.io
+
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"pattern": np.zeros((4, 4))})
+    assert not by_name("flight_mat").sniff(file.getvalue())
+
+
+def test_quectel_zero_is_no_csi() -> None:
+    result = read("quectel_csv", samples.QUECTEL_CSI)
+    frame = stream(result, "nr5g_csi").frame
+    assert frame["ri_raw"].tolist() == [2, 0, 4]
+    assert frame["rank"].fillna(-1).tolist() == [2, -1, 4]
+    assert frame["flag"].tolist() == ["", "no_csi", ""]
+    assert frame["mcs"].isna().tolist() == [False, True, False]
+    assert stream(result, "lte_csi").frame["rank"].tolist() == [1, 1, 1]
+    assert result.blank == 1, "the bare OK"
+    assert "torn" in result.rejected[0].reason
+
+
+def test_quectel_first_generation_and_impossible_ri() -> None:
+    frame = stream(read("quectel_csv", samples.QUECTEL_FIRST), "nr5g_csi").frame
+    assert frame["rank"].fillna(-1).tolist() == [3, -1]
+    assert frame["flag"].iloc[1] == "ri_out_of_range"
+    assert frame["time"].iloc[1] - frame["time"].iloc[0] == pd.Timedelta(seconds=9)
+
+
+def test_quectel_rows_are_told_by_their_rat() -> None:
+    """NSA writes RSRP, SINR, RSRQ; SA writes RSRP, RSRQ, SINR and is filed among LTE rows."""
+    endc = read("quectel_csv", samples.QUECTEL_ENDC, replace(OPTIONS, unit=None))
+    nsa = stream(endc, "nr_rsrp").frame
+    assert nsa["rss_db"].iloc[0] == -82
+    assert nsa["sinr_db"].iloc[0] == 21
+    assert np.isnan(nsa["rss_db"].iloc[1])
+    assert stream(endc, "lte_rsrp").frame["rss_db"].tolist() == [-91, -91]
+    assert stream(endc, "nr_rsrp").attributes["unit"] == "dBm"
+    assert "searching" in endc.rejected[0].reason
+    one_line = read("quectel_csv", samples.QUECTEL_ONE_LINE)
+    assert stream(one_line, "lte_rsrp").frame["rss_db"].tolist() == [-93]
+    sa = stream(one_line, "nr_rsrp").frame
+    assert (sa["rss_db"].tolist(), sa["sinr_db"].tolist()) == ([-71], [32])
+
+
+def test_rank_table() -> None:
+    frame = read("quectel_ri", samples.RI_TABLE).streams[0].frame
+    assert frame["rank"].fillna(-1).tolist() == [2, -1]
+    assert frame["altitude_m"].tolist() == [30.1, 30.2]
+
+
+@pytest.mark.parametrize(
+    ("reader", "data"),
+    [("nemo_csv", samples.NEMO_CSV), ("nemo_kml", samples.NEMO_KML)],
+)
+def test_nemo_relative_times(reader: str, data: bytes) -> None:
+    result = read(reader, data)
+    frame = result.streams[0].frame
+    assert frame["time"].iloc[0] == utc("2025-03-02 14:59:58.49975")
+    assert frame["rank"].iloc[0] == 2
+    assert frame["rank"].iloc[-1] == 4
+    assert result.streams[0].attributes["clock"] == "utc"
+    relative = read(reader, data, replace(OPTIONS, time_origin=None))
+    assert relative.streams[0].frame["time"].iloc[0] == utc("1969-12-31 23:59:58.49975")
+    assert relative.streams[0].attributes["clock"] == "relative"
+    assert any("relative" in text for text in relative.warnings)
+
+
+def test_nemo_local_origin() -> None:
+    local = read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="2025-03-02 10:00:00"))
+    zoned = read("nemo_csv", samples.NEMO_CSV)
+    assert local.streams[0].frame["time"].equals(zoned.streams[0].frame["time"])
+    with pytest.raises(UsageError, match="timezone:"):
+        read("nemo_csv", samples.NEMO_CSV, ReadOptions(time_origin="2025-03-02 10:00:00"))
+    with pytest.raises(UsageError, match="time_origin"):
+        read("nemo_csv", samples.NEMO_CSV, replace(OPTIONS, time_origin="yesterday"))
+
+
+def test_nemo_row_without_rank_keeps_its_level() -> None:
+    row = read("nemo_csv", samples.NEMO_CSV).streams[0].frame.iloc[1]
+    assert np.isnan(row["rank"])
+    assert (row["flag"], row["rsrp_dbm"], row["cqi"]) == ("no_rank_in_row", -80.5, 14)
+
+
+def test_kml_with_styles_in_front_is_still_known() -> None:
+    styles = b"    <Style id='8'><width>3</width></Style>\n" * 2000
+    data = samples.NEMO_KML.replace(b"  <Document>\n", b"  <Document>\n" + styles)
+    assert by_name("nemo_kml").sniff(data[:65536])
+    fence = (
+        b"<?xml version='1.0'?>\n<kml><Document><Style/><Placemark><name>fence</name></Placemark></Document></kml>\n"
+    )
+    assert not by_name("nemo_kml").sniff(fence)
+
+
+def test_towers_of_snr_logs() -> None:
+    table = read("aadm_snr", samples.SNR_CSV)
+    assert [(one.name, one.attributes["node"], one.attributes["unit"]) for one in table.streams] == [
+        ("LW1", "LW1", "dB"), ("LW2", "LW2", "dB"),
+    ]  # fmt: skip
+    assert table.streams[1].frame["flag"].tolist() == ["", "out_of_coverage"]
+    console = read("controller_log", samples.CONTROLLER)
+    assert stream(console, "LW1").frame["rss_db"].tolist() == [9.5, 8.5], "the Download block holds no levels"
+    assert stream(console, "LW2").frame["rss_db"].tolist() == [-1.25]
+
+
+def test_srsenb_counts_from_zero() -> None:
+    one = read("srsenb_log", samples.SRSENB).streams[0]
+    assert one.attributes["ri_base"] == "zero"
+    assert one.frame["rank"].fillna(-1).tolist() == [1, 2, -1]
+    assert one.frame["flag"].tolist() == ["", "", "no_csi"]
+
+
+def test_generic_columns() -> None:
+    one = read("generic_csv", samples.GENERIC).streams[0]
+    assert one.frame["rss_db"].tolist() == [-81.5, -82.5]
+    assert one.frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+    epoch = read("generic_csv", b"Time,Level\n1740927600.5,-81.5\n", replace(OPTIONS, time_origin=None))
+    assert epoch.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+    wall = read(
+        "generic_csv", b"Time,Level\n1740909600.5,-81.5\n", replace(OPTIONS, time_origin=None, clock="local_as_utc")
+    )
+    assert wall.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+    since = read("generic_csv", b"Time,Level\n0.5,-81.5\n")
+    assert since.streams[0].frame["time"].iloc[0] == utc("2025-03-02 15:00:00.5")
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"kind": None}, "kind:"),
+        ({"columns": {"time": "Time"}}, "lacks rss_db"),
+        ({"columns": {"time": "Time", "rss_db": "Levle"}}, "did you mean 'Level'"),
+        ({"columns": {"time": "Time", "rss_dbm": "Level"}}, "did you mean 'rss_db'"),
+        ({"kind": "rank", "columns": {"time": "Time", "ri_raw": "Level"}}, "ri_base:"),
+    ],
+)
+def test_generic_says_what_is_missing(change: dict[str, object], message: str) -> None:
+    with pytest.raises(UsageError, match=message):
+        read("generic_csv", samples.GENERIC, replace(OPTIONS, **change))
+
+
+@pytest.mark.parametrize(("base", "expected"), [("one", [np.nan, 1, 2]), ("zero", [1, 2, 3])])
+def test_generic_rank_base(base: str, expected: list[float]) -> None:
+    options = replace(OPTIONS, kind="rank", ri_base=base, columns={"time": "t", "ri_raw": "ri"})
+    frame = read("generic_csv", b"t,ri\n1,0\n2,1\n3,2\n", options).streams[0].frame
+    assert np.array_equal(frame["rank"], expected, equal_nan=True)
+
+
+@pytest.mark.parametrize(
+    ("reader", "sample"),
+    [case for case in CASES if case[0] not in ("nemo_csv", "nemo_kml") and case[1] != "utc_offset"],
+)
+def test_a_clock_without_zone_names_the_key(reader: str, sample: str) -> None:
+    with pytest.raises(UsageError, match="timezone:"):
+        read(reader, SAMPLES[reader][sample][0], replace(OPTIONS, timezone=None))
+
+
+def test_a_clock_with_offset_needs_no_zone() -> None:
+    frame = read("vehicle_out", samples.VEHICLE_UTC, ReadOptions()).streams[0].frame
+    assert frame["time"].iloc[0] == utc("2025-03-02 15:00:00.25")
+
+
+def test_gzip_is_transparent(tmp_path) -> None:
+    from aerpaw_cmp.ingest import ingest
+
+    (tmp_path / "a.kml.gz").write_bytes(gzip.compress(samples.NEMO_KML))
+    assert ingest(tmp_path / "a.kml.gz", options=OPTIONS)[0].result.accepted == 2

@@ -1,0 +1,176 @@
+"""What every reader owes: it knows its own format only, accounts for each line, and never fails raw."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.errors import AerpawCmpError
+from aerpaw_cmp.readers import by_name, catalogue, identify
+from aerpaw_cmp.records import ReadResult
+from tests.parsers.samples import CASES, OPTIONS, SAMPLES
+
+SNIFFED = [case for case in CASES if case[0] != "generic_csv"]
+TEXT_CASES = [case for case in CASES if case[0] != "flight_mat"]
+
+
+def count_lines(data: bytes) -> int:
+    """Second definition of a line, by Python's own split."""
+    pieces = data.split(b"\n")
+    return len(pieces) - (pieces[-1] == b"")
+
+
+def check_law(reader: str, data: bytes) -> ReadResult | None:
+    """Read; a clear error is an answer, any other exception fails the test."""
+    try:
+        result = by_name(reader).read(data, OPTIONS)
+    except AerpawCmpError:
+        return None
+    assert result.lines == result.accepted + len(result.rejected) + result.blank
+    if reader != "flight_mat":
+        assert result.lines == count_lines(data)
+    numbers = [line.number for line in result.rejected]
+    assert len(set(numbers)) == len(numbers)
+    assert numbers == sorted(numbers)
+    assert all(line.reason and len(line.text) <= 500 for line in result.rejected)
+    records = set()
+    for stream in result.streams:
+        frame = stream.frame
+        assert frame["time"].dtype == np.dtype("datetime64[ns]")
+        assert not frame["time"].isna().any()
+        assert frame["line"].between(1, result.lines).all()
+        records |= set(frame["line"].tolist())
+        assert frame["flag"].map(type).eq(str).all()
+        if stream.kind == "rank":
+            assert not (frame["rank"] == 0).any(), "0 is never a rank"
+            assert stream.attributes["ri_base"] in ("zero", "one")
+    assert records.isdisjoint(numbers), "a rejected line gave a record"
+    assert len(records) <= result.accepted
+    return result
+
+
+@pytest.mark.parametrize(("reader", "sample"), CASES)
+def test_sample_is_accounted_for(reader: str, sample: str) -> None:
+    data, accepted, rejected = SAMPLES[reader][sample]
+    result = check_law(reader, data)
+    assert result is not None
+    assert (result.accepted, len(result.rejected)) == (accepted, rejected)
+    assert result.reader == reader
+
+
+@pytest.mark.parametrize(("reader", "sample"), SNIFFED)
+def test_only_its_own_sniffer_accepts_a_sample(reader: str, sample: str) -> None:
+    data = SAMPLES[reader][sample][0]
+    assert [other.name for other in catalogue() if other.sniff(data)] == [reader]
+    assert identify(data).name == reader
+
+
+def test_generic_csv_is_never_guessed() -> None:
+    assert not any(
+        by_name("generic_csv").sniff(data) for samples in SAMPLES.values() for data, _, _ in samples.values()
+    )
+
+
+@pytest.mark.parametrize(
+    "reader", ["vehicle_out", "sounder_log", "quectel_csv", "quectel_ri", "nemo_csv", "srsenb_log"]
+)
+def test_the_sample_line_shown_to_users_is_a_record(reader: str) -> None:
+    result = by_name(reader).read(by_name(reader).sample.encode() + b"\n", OPTIONS)
+    assert (result.accepted, result.rejected) == (1, ())
+
+
+def test_every_reader_has_a_sample() -> None:
+    assert {reader.name for reader in catalogue()} == set(SAMPLES)
+
+
+@pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
+def test_cut_at_every_byte(reader: str, sample: str) -> None:
+    data = SAMPLES[reader][sample][0]
+    for end in range(len(data)):
+        check_law(reader, data[:end])
+
+
+def test_mat_cut_at_many_bytes() -> None:
+    data = SAMPLES["flight_mat"]["two_channels"][0]
+    for end in [*range(0, 300), *range(300, len(data), 7)]:
+        check_law("flight_mat", data[:end])
+
+
+@pytest.mark.parametrize(("reader", "sample"), CASES)
+def test_sniffers_stand_any_cut(reader: str, sample: str) -> None:
+    data = SAMPLES[reader][sample][0]
+    for end in range(0, len(data), 5):
+        for other in catalogue():
+            assert other.sniff(data[:end]) in (True, False)
+
+
+@pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
+def test_line_ends_do_not_matter(reader: str, sample: str) -> None:
+    data = SAMPLES[reader][sample][0].replace(b"\r\n", b"\n")
+    unix, dos = check_law(reader, data), check_law(reader, data.replace(b"\n", b"\r\n"))
+    assert unix is not None
+    assert dos is not None
+    assert (unix.accepted, unix.blank, unix.rejected) == (dos.accepted, dos.blank, dos.rejected)
+    for one, other in zip(unix.streams, dos.streams, strict=True):
+        assert one.frame.equals(other.frame)
+
+
+@pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
+def test_trailing_text_without_line_end(reader: str, sample: str) -> None:
+    data, accepted, rejected = SAMPLES[reader][sample]
+    result = check_law(reader, data + b"trailing text")
+    assert result is not None
+    assert result.accepted == accepted
+    # consoles and markup talk freely: there it is a comment
+    assert len(result.rejected) == rejected + (reader not in ("controller_log", "srsenb_log", "nemo_kml"))
+
+
+@pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
+def test_nul_bytes_and_a_huge_line(reader: str, sample: str) -> None:
+    data, accepted, _ = SAMPLES[reader][sample]
+    result = check_law(reader, data + b"\0" * 4096 + b"\n" + b"1" * 1_000_000 + b"\n" + b",1" * 300_000 + b"\n")
+    assert result is not None
+    assert result.accepted == accepted
+
+
+@pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
+def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> None:
+    lines = SAMPLES[reader][sample][0].split(b"\n")
+    result = check_law(reader, b"\n".join(lines[:-1]) + b"\n")
+    assert result is not None
+    last = max(int(stream.frame["line"].max()) for stream in result.streams)
+    cut = check_law(reader, b"\n".join(lines[:last]).rstrip(b"\r"))
+    if cut is None or cut.accepted != result.accepted:
+        assert reader == "sounder_log"  # there the layout tells a cut line
+        return
+    flagged = [flag for stream in cut.streams for flag in stream.frame.loc[stream.frame["line"] == last, "flag"]]
+    assert flagged
+    assert all("unterminated_line" in flag for flag in flagged)
+
+
+@pytest.mark.parametrize("reader", [reader.name for reader in catalogue()])
+@given(data=st.data())
+@settings(max_examples=60, deadline=None)
+def test_damaged_bytes(reader: str, data: st.DataObject) -> None:
+    """Bytes overwritten, inserted and removed at random places of its own samples."""
+    sample = bytearray(data.draw(st.sampled_from([s for s, _, _ in SAMPLES[reader].values()])))
+    for _ in range(data.draw(st.integers(1, 6))):
+        at = data.draw(st.integers(0, len(sample) - 1))
+        new = data.draw(
+            st.binary(max_size=4) | st.sampled_from([b"\n", b"\r\n", b",", b"*", b"999999999999", b"-", b"."])
+        )
+        sample[at : at + data.draw(st.integers(0, 3))] = new
+        if not sample:
+            return
+    check_law(reader, bytes(sample))
+    for other in catalogue():
+        assert other.sniff(bytes(sample)) in (True, False)
+
+
+@given(st.binary(max_size=300))
+@settings(max_examples=100, deadline=None)
+def test_any_bytes(rubbish: bytes) -> None:
+    for reader in catalogue():
+        check_law(reader.name, rubbish)

@@ -1,0 +1,117 @@
+"""One conversion of wall clocks, checked against the zone database through pandas and datetime."""
+
+from __future__ import annotations
+
+from datetime import datetime, timezone
+from zoneinfo import ZoneInfo
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.readers import ReadOptions
+from aerpaw_parsers import _time
+
+NEW_YORK = "America/New_York"
+
+
+def wall(*texts: str) -> np.ndarray:
+    return np.array(texts, dtype="datetime64[ns]").astype(np.int64)
+
+
+def utc_of(*texts: str, zone: str = NEW_YORK) -> list[str]:
+    made = _time.local_to_utc(wall(*texts), zone, needed_by="a test")
+    return [str(time)[:19] for time in made.time.astype("datetime64[s]")]
+
+
+def test_summer_and_winter() -> None:
+    assert utc_of("2024-07-02T11:00:00", "2023-12-13T12:00:00") == ["2024-07-02T15:00:00", "2023-12-13T17:00:00"]
+
+
+@given(
+    st.datetimes(datetime(1971, 1, 1), datetime(2037, 1, 1)), st.sampled_from([NEW_YORK, "Australia/Lord_Howe", "UTC"])
+)
+def test_agrees_with_datetime(moment: datetime, zone: str) -> None:
+    made = _time.local_to_utc(wall(moment.isoformat()), zone, needed_by="a test")
+    expected = moment.replace(tzinfo=ZoneInfo(zone)).astimezone(timezone.utc).replace(tzinfo=None)
+    assert pd.Timestamp(made.time[0]) == pd.Timestamp(expected)
+
+
+@given(st.lists(st.integers(0, 10**9), min_size=1, max_size=50))
+def test_round_trip_through_the_zone(seconds: list[int]) -> None:
+    """Any instant, written as local time and read again, is itself unless its hour came twice."""
+    utc = np.sort(np.array(seconds, dtype=np.int64)) + 10**9
+    local = pd.DatetimeIndex(utc * 10**9, tz="UTC").tz_convert(NEW_YORK).tz_localize(None).to_numpy()
+    made = _time.local_to_utc(local.astype("datetime64[ns]").astype(np.int64), NEW_YORK, needed_by="a test")
+    sure = ~made.ambiguous
+    assert not made.nonexistent.any()
+    assert np.array_equal(made.time.astype(np.int64)[sure], utc[sure] * 10**9)
+
+
+def test_the_hour_that_comes_twice() -> None:
+    """3 November 2024: 01:30 is first 05:30Z, and after the clock stepped back 06:30Z."""
+    texts = (
+        "2024-11-03T00:59:00",
+        "2024-11-03T01:30:00",
+        "2024-11-03T01:59:00",
+        "2024-11-03T01:01:00",
+        "2024-11-03T02:00:00",
+    )
+    assert utc_of(*texts) == [
+        "2024-11-03T04:59:00", "2024-11-03T05:30:00", "2024-11-03T05:59:00", "2024-11-03T06:01:00", "2024-11-03T07:00:00",
+    ]  # fmt: skip
+    made = _time.local_to_utc(wall(*texts), NEW_YORK, needed_by="a test")
+    assert made.ambiguous.tolist() == [False, True, True, True, False]
+    assert "twice" in made.warnings[0]
+    column = np.full(5, "", dtype=object)
+    column[1] = "no_fix"
+    made.flag(column)
+    assert column.tolist() == ["", "no_fix;ambiguous_local_time", "ambiguous_local_time", "ambiguous_local_time", ""]
+
+
+def test_the_hour_that_never_was() -> None:
+    made = _time.local_to_utc(wall("2024-03-10T02:30:00", "2024-03-10T03:00:00"), NEW_YORK, needed_by="a test")
+    assert made.nonexistent.tolist() == [True, False]
+    assert "skipped" in made.warnings[0]
+
+
+@pytest.mark.parametrize("name", [None, "", "America/New_Yrok", "../etc/passwd", "/etc/passwd"])
+def test_no_or_wrong_zone(name: str | None) -> None:
+    with pytest.raises(UsageError, match="timezone:"):
+        _time.local_to_utc(wall("2024-07-02T11:00:00"), name, needed_by="a test")
+
+
+@given(st.datetimes(datetime(1970, 1, 1), datetime(2261, 1, 1)), st.sampled_from([0, 3, 6]))
+def test_digits(moment: datetime, fraction: int) -> None:
+    text = moment.strftime("%Y-%m-%d %H:%M:%S.%f").zfill(26)
+    text = text[: 20 + fraction] if fraction else text[:19]
+    made, valid = _time.parse_digits(np.frombuffer(text.encode(), dtype=np.uint8)[None, :], fraction)
+    assert valid[0]
+    assert made[0] == pd.Timestamp(text).as_unit("ns").value
+
+
+@pytest.mark.parametrize("text", ["2025-02-29", "2100-02-29", "2025-04-31", "2025-13-01", "2025-00-10", "2025-01-00", "0000-01-01", "9999-01-01"])  # fmt: skip
+def test_days_that_are_none(text: str) -> None:
+    _, valid = _time.parse_digits(np.frombuffer(f"{text} 10:00:00".encode(), dtype=np.uint8)[None, :], 0)
+    assert not valid[0]
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        (b"2025-03-02T10:00:00Z", "2025-03-02T10:00:00"),
+        (b"2025-03-02 10:00:00.5+00:00", "2025-03-02T10:00:00.5"),
+        (b"2025-03-02 10:00:00-0500", "2025-03-02T15:00:00"),
+        (b"2025-03-02 10:00:00.123456789+05:30", "2025-03-02T04:30:00.123456789"),
+        (b"2025-03-02 10:00:00", "2025-03-02T15:00:00"),
+    ],
+)
+def test_offsets_in_the_text(text: bytes, expected: str) -> None:
+    options = ReadOptions(timezone=NEW_YORK)
+    made, valid = _time.texts_to_utc(np.array([text, b"2025-07-02 10:00:00.25"]), options, needed_by="a test")
+    assert valid.all()
+    assert made.time[0] == np.datetime64(expected, "ns")
+    assert made.time[1] == np.datetime64("2025-07-02T14:00:00.25", "ns")

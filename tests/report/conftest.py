@@ -1,0 +1,412 @@
+"""A flight that never was: free space and one ground reflection, seeded noise, every part of a report filled."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from shapely.geometry import Polygon, box
+
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.records import RejectedLine
+from aerpaw_cmp.report.data import (
+    Audit,
+    Baseline,
+    ChannelPair,
+    Engine,
+    ErrorSpan,
+    Histogram,
+    InputFile,
+    KCurve,
+    OffsetCurve,
+    RankAtK,
+    RankPanel,
+    ReportData,
+    RssPanel,
+    SpeedRow,
+    Track,
+    Variant,
+    Waypoint,
+)
+from aerpaw_cmp.report.maps_data import Correlation, Layer, LearningCurve, MapError, MapsData, PaperRow, RankMap, RssMap
+from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Tower, Trees
+
+WAVELENGTH = 299_792_458.0 / 3.3e9
+
+
+def make_site() -> Site:
+    frame = SiteFrame(35.7275, -78.6960)
+    towers = {}
+    for name, east, north in (
+        ("LW1", 0.0, 0.0),
+        ("LW2", -130.0, 420.0),
+        ("LW3", 380.0, -560.0),
+        ("LW4", -420.0, -700.0),
+        ("LW5", 430.0, 830.0),
+    ):
+        lat, lon = frame.to_geographic(east, north)
+        towers[name] = Tower(name, float(lat), float(lon), east, north)
+    rng = np.random.default_rng(3)
+    n = 400
+    trees = Trees(
+        rng.uniform(150, 420, n),
+        rng.uniform(150, 420, n),
+        np.zeros(n),
+        np.full(n, 20.0),
+        np.full(n, 10.0),
+        np.full(n, 4.0),
+        np.full(n, 0.4),
+    )
+    return Site(
+        "Lake Wheeler (made for a test)",
+        frame,
+        towers,
+        buildings=(
+            Building("barn", box(-60, 20, -30, 45), 8.0),
+            Building("house", Polygon([(60, -80), (85, -70), (80, -50), (55, -60)]), 6.0),
+        ),
+        forests=(
+            Forest("wood", box(150, 150, 420, 420)),
+            Forest("edge", Polygon([(-480, -300), (-300, -320), (-280, -100), (-470, -60)])),
+        ),
+        trees=trees,
+        geofences=(Geofence("fence", box(-250, -120, 250, 330)),),
+        illustrative=True,
+        notes=("Tower heights are 10 m.",),
+    )
+
+
+def make_track(n: int = 6000) -> Track:
+    s = np.linspace(0.0, 1.0, n)
+    legs = 7
+    phase = s * legs
+    east = -180 + 360 * np.abs(2 * (phase / 2 - np.floor(phase / 2 + 0.5)))
+    north = -80 + 360 * s
+    up = 40.0 * np.clip(np.minimum(s / 0.08, (1 - s) / 0.08), 0.0125, 1)
+    time = np.datetime64("2024-07-15T17:02:11", "ns") + (s * 950e9).astype("timedelta64[ns]")
+    return Track(time=time, east_m=east, north_m=north, up_m=up)
+
+
+def rmse_of(difference: np.ndarray) -> float:
+    return float(np.sqrt(np.nanmean(difference**2)))
+
+
+def make_rss(site: Site, track: Track, tower: str, channel: str, seed: int) -> RssPanel:
+    rng = np.random.default_rng(seed)
+    position = np.stack([track.east_m, track.north_m, track.up_m], axis=1)
+    t = site.towers[tower].position_m
+    d = np.linalg.norm(position - t, axis=1)
+    mirrored = np.linalg.norm(position - t * [1, 1, -1], axis=1)
+    free = 40 + 20 * np.log10(WAVELENGTH / (4 * np.pi * d))
+    two = 40 + 20 * np.log10(
+        WAVELENGTH
+        / (4 * np.pi)
+        * np.abs(
+            np.exp(-2j * np.pi * d / WAVELENGTH) / d - 0.6 * np.exp(-2j * np.pi * mirrored / WAVELENGTH) / mirrored
+        )
+    )
+    azimuth = np.degrees(np.arctan2(track.north_m - t[1], track.east_m - t[0]))
+    simulated = two - 3.0 * np.cos(np.radians(azimuth - 40)) ** 2
+    truth = (
+        simulated + np.convolve(rng.normal(0, 9.0, len(d)), np.ones(25) / 25, mode="same") + rng.normal(0, 2.0, len(d))
+    )
+    measured = np.round(truth - 42.13, 1)
+    blocked = (track.up_m < 12) & (d > 300) if tower != "LW1" else np.zeros(len(d), dtype=bool)
+    simulated = np.where(blocked, np.nan, simulated)
+    silent = (np.arange(len(d)) > 5900) & (tower == "LW4")
+    measured = np.where(silent, np.nan, measured)
+    offset = round(float(np.nanmean(simulated - measured)), 1)
+    residual = measured + offset - simulated
+    candidates = np.arange(-500, 501) / 10
+    curve = np.sqrt(np.nanmean(residual**2) + 0 * candidates + (candidates - offset) ** 2)
+    baselines = []
+    for name, level in (("free_space", free), ("two_ray", two)):
+        own = round(float(np.nanmean(level - measured)), 1)
+        baselines.append(Baseline(name=name, level_dbm=level, offset_db=own, rmse_db=rmse_of(measured + own - level)))
+    rmse = rmse_of(residual)
+    worst = int(np.nanargmax(np.abs(residual)))
+    return RssPanel(
+        tower=tower, channel=channel, unit="dB re full scale", time=track.time, measured_db=measured,
+        simulated_dbm=simulated, measured_out_of_coverage=np.isnan(measured),
+        simulated_out_of_coverage=np.isnan(simulated), offset_db=offset, rmse_db=rmse,
+        correlation=float(np.corrcoef(simulated[np.isfinite(residual)], measured[np.isfinite(residual)])[0, 1]),
+        n=int(np.isfinite(residual).sum()), n_out_of_coverage=int(np.isnan(residual).sum()), at_search_edge=False,
+        rmse_ci95_db=(rmse - 0.24, rmse + 0.31), offset_ci95_db=(offset - 0.5, offset + 0.4), n_effective=311.0,
+        lag_s=0.12, lag_verdict="ok", baselines=tuple(baselines),
+        offset_curve=OffsetCurve(offset_db=candidates, rmse_db=curve), east_m=track.east_m, north_m=track.north_m,
+        up_m=track.up_m,
+        geometry={"distance_m": d, "azimuth_deg": azimuth, "elevation_deg": np.degrees(np.arcsin((track.up_m - t[2]) / d)), "altitude_m": track.up_m},
+        line_of_sight=~blocked,
+        variants=(Variant(name="iso arrays", offset_db=offset, rmse_db=rmse + 1, rmse_ci95_db=(rmse, rmse + 2)), Variant(name="patterns, attitude", offset_db=offset, rmse_db=rmse, fitted="mount, on flight 70 m")),
+        extra={"repeatability_db": 3.0, "robust": {"offset_db": offset}},
+        worst=(ErrorSpan(start=track.time[max(worst - 20, 0)], end=track.time[min(worst + 20, len(d) - 1)], east_m=float(track.east_m[worst]), north_m=float(track.north_m[worst]), up_m=float(track.up_m[worst]), mean_error_db=float(residual[worst]), cause="a null of the two-ray pattern"),),
+    )  # fmt: skip
+
+
+def shares(rank: np.ndarray) -> np.ndarray:
+    rank = rank[np.isfinite(rank) & (rank > 0)]
+    return np.array([(rank == r).mean() if len(rank) else np.nan for r in (1, 2, 3, 4)])
+
+
+def make_rank(site: Site, track: Track) -> RankPanel:
+    pick = slice(0, None, 6)
+    east, north, up, time = track.east_m[pick], track.north_m[pick], track.up_m[pick], track.time[pick]
+    rng = np.random.default_rng(11)
+    d = np.hypot(east, north) + 20
+    slow = np.convolve(rng.normal(0, 6, len(d)), np.ones(12) / 12, mode="same")
+    ratio = np.stack([-8 - 0.02 * d + slow, -22 - 0.06 * d + slow, -40 - 0.1 * d + slow], axis=1)
+    measured = 1.0 + (ratio + rng.normal(0, 3, ratio.shape) > -24).sum(axis=1)
+    measured[40:55] = np.nan
+    at = []
+    for k in (10.0, 100.0, 1000.0):
+        rank = 1 + (ratio > -20 * np.log10(k)).sum(axis=1)
+        rank[up < 3] = 0
+        both = np.isfinite(measured) & (rank > 0)
+        table = np.array([[int(((measured == m) & (rank == s)).sum()) for s in range(5)] for m in (1, 2, 3, 4)])
+        difference = np.abs(shares(measured) - shares(rank.astype(float)))
+        h = shares(rank.astype(float))
+        at.append(RankAtK(k=k, rank=rank, histogram=Histogram(share=h, low=(h - 0.03).clip(0), high=h + 0.03), n_out_of_coverage=int((rank == 0).sum()), agreement=float((measured == rank)[both].mean()), total_variation=float(difference.sum() / 2), wasserstein=0.3, kappa=0.21, agreement_ci95=(0.3, 0.5), total_variation_ci95=(0.1, 0.2), confusion=table))  # fmt: skip
+    ks = np.geomspace(2, 3000, 60)
+    agreement = np.array([float(np.nanmean((1 + (ratio > -20 * np.log10(k)).sum(axis=1)) == measured)) for k in ks])
+    variation = np.array(
+        [np.abs(shares(1.0 + (ratio > -20 * np.log10(k)).sum(axis=1)) - shares(measured)).sum() / 2 for k in ks]
+    )
+    h = shares(measured)
+    return RankPanel(
+        tower="LW1", time=time, east_m=east, north_m=north, up_m=up, measured=measured,
+        histogram=Histogram(share=h, low=(h - 0.04).clip(0), high=h + 0.04), simulated=tuple(at),
+        best_k=float(ks[agreement.argmax()]), best_k_ci95=(13.0, 21.0),
+        curve=KCurve(k=ks, agreement=agreement, total_variation=variation), singular_ratio_db=ratio,
+        sinr_db=18 + slow, stale=np.arange(len(d)) % 50 > 45,
+    )  # fmt: skip
+
+
+def make_speed() -> tuple[SpeedRow, ...]:
+    rows = [
+        SpeedRow(
+            engine="image",
+            samples=None,
+            arrays="spherical float64",
+            depth=2,
+            seconds=0.09,
+            links_per_s=11000,
+            peak_mib=210,
+            missing_paths=0,
+            extra_paths=0,
+            rss_max_error_db=0.0,
+            rss_rms_error_db=0.0,
+            rank_disagreement={10.0: 0.0, 1000.0: 0.0},
+            reference=True,
+        )
+    ]
+    for samples, seconds, error in ((1000, 0.9, 18.0), (10000, 1.6, 9.0), (100000, 6.0, 2.1), (1000000, 31.0, 0.3)):
+        for arrays, wrong in (("plane wave", 0.45), ("explicit float32", 0.31), ("float64", 0.02)):
+            rows.append(
+                SpeedRow(
+                    engine="sionna",
+                    samples=samples,
+                    arrays=arrays,
+                    depth=2,
+                    seconds=seconds * (1.4 if "explicit" in arrays else 1.0),
+                    links_per_s=1000 / seconds,
+                    peak_mib=900,
+                    missing_paths=int(error * 20),
+                    extra_paths=0,
+                    rss_max_error_db=error,
+                    rss_rms_error_db=error / 10,
+                    rank_disagreement={10.0: wrong / 4, 1000.0: wrong},
+                )
+            )
+    rows.append(
+        SpeedRow(
+            engine="image",
+            samples=None,
+            arrays="spherical float64",
+            depth=1,
+            seconds=0.02,
+            links_per_s=50000,
+            peak_mib=180,
+            missing_paths=90,
+            extra_paths=0,
+            rss_max_error_db=1.2,
+            rss_rms_error_db=0.1,
+            rank_disagreement={10.0: 0.0, 1000.0: 0.05},
+        )
+    )
+    return tuple(rows)
+
+
+def make_report() -> ReportData:
+    site, track = make_site(), make_track()
+    waypoints = tuple(
+        Waypoint(
+            label=c,
+            time=track.time[i],
+            east_m=float(track.east_m[i]),
+            north_m=float(track.north_m[i]),
+            up_m=float(track.up_m[i]),
+        )
+        for c, i in zip("ABCDEF", (480, 1700, 2560, 3420, 4280, 5500), strict=True)
+    )
+    rss = tuple(
+        make_rss(site, track, tower, channel, seed)
+        for seed, (tower, channel) in enumerate((("LW1", "USRP1"), ("LW1", "USRP2"), ("LW4", "USRP1")))
+    )
+    difference = rss[0].calibrated_db - rss[1].calibrated_db
+    pair = ChannelPair(
+        tower="LW1",
+        first="USRP1",
+        second="USRP2",
+        time=track.time,
+        difference_db=difference,
+        simulated_difference_db=np.zeros(len(difference)),
+        apart=rss[0].worst,
+    )
+    engine = Engine(
+        engine="image",
+        links=18000,
+        seconds=0.71,
+        paths=38211,
+        settings={"max_depth": 2, "relevance_db": 0.01},
+        left_out=("shed (0.002 dB at most)",),
+        audit=Audit(
+            reference="sionna",
+            links=200,
+            missing_paths=0,
+            extra_paths=2,
+            rss_max_error_db=0.004,
+            rank_disagreement={10.0: 0.0, 100.0: 0.0, 1000.0: 0.005},
+            seconds=0.01,
+            reference_seconds=9.2,
+        ),
+    )
+    inputs = (
+        InputFile(
+            path="logs/vehicleOut.txt",
+            sha256="ab" * 32,
+            reader="vehicle_out",
+            lines=9500,
+            accepted=9490,
+            rejected=3,
+            blank=7,
+            role="telemetry",
+            rejected_lines=(
+                RejectedLine(17, "11 fields instead of 10", "1,2,3,4,5,6,7,8,9,10,11"),
+                RejectedLine(9500, "torn line", '1,"(35.7'),
+            ),
+        ),
+        InputFile(
+            path="logs/power_log.txt",
+            sha256="cd" * 32,
+            reader="sounder",
+            lines=6000,
+            accepted=6000,
+            rejected=0,
+            blank=0,
+            role="LW1 USRP1",
+            warnings=("57 repeated lines were re-expanded from '*'.",),
+        ),
+    )
+    return ReportData(
+        title="Sample flight around LW1, 2024-07-15", flight="sample", site=site, generated="2026-11-21T00:00:00Z",
+        versions={"aerpaw-cmp": "0.1.0", "numpy": np.__version__}, inputs=inputs, track=track, waypoints=waypoints,
+        rss=rss, rank=(make_rank(site, track),), pairs=(pair,), engine=engine, speed=make_speed(), synthetic=True,
+        settings={"flight": "sample", "rt": {"max_depth": 2}}, stages_s={"ingest": 0.2, "replay": 0.71, "report": 6.0},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def report_data() -> ReportData:
+    return make_report()
+
+
+@pytest.fixture(scope="session")
+def small_report(report_data: ReportData) -> ReportData:
+    """One RSS panel and the rank, for tests that draw."""
+    return dataclasses.replace(report_data, rss=report_data.rss[2:])
+
+
+def make_maps() -> MapsData:
+    """Free space over the paper's grid, with a made-up wood that blocks low positions, and ranks by distance."""
+    site = make_site()
+    east, north = np.arange(-525.0, 526, 30), np.arange(-1050.0, 1051, 30)
+    at = np.stack(np.meshgrid(east, north), axis=-1)
+    towers = list(site.towers.values())
+    reach = np.array([np.hypot(at[..., 0] - t.east_m, at[..., 1] - t.north_m) for t in towers])
+    nearest = reach.argmin(axis=0)
+    wood = (at[..., 0] > 150) & (at[..., 0] < 420) & (at[..., 1] > 150) & (at[..., 1] < 420)
+    rss, rank, errors = [], [], []
+    for antennas in ("SISO", "MIMO"):
+        for height in (30.0, 70.0, 110.0):
+            level = []
+            for t, d in zip(towers, reach, strict=True):
+                distance = np.hypot(d, height - 10)
+                beam = (
+                    0.0
+                    if antennas == "SISO"
+                    else 6 * np.cos(4 * np.arctan2(at[..., 1] - t.north_m, at[..., 0] - t.east_m))
+                )
+                value = 40 + beam + 20 * np.log10(WAVELENGTH / (4 * np.pi * distance))
+                blocked = wood & (height < 40) | ((d > 1200) & (height < 40))
+                level.append(np.where(blocked, np.nan, value))
+                rss.append(
+                    RssMap(
+                        tower=t.name,
+                        antennas=antennas,
+                        altitude_m=height,
+                        rss_dbm=level[-1],
+                        coverage=float(np.isfinite(level[-1]).mean()),
+                        foliage="opaque",
+                    )
+                )
+            joint = np.take_along_axis(np.array(level), nearest[None], axis=0)[0]
+            rss.append(
+                RssMap(
+                    tower="joint",
+                    antennas=antennas,
+                    altitude_m=height,
+                    rss_dbm=joint,
+                    coverage=float(np.isfinite(joint).mean()),
+                    foliage="opaque",
+                )
+            )
+    d = reach.min(axis=0)
+    for k, radius in ((10.0, 60.0), (100.0, 160.0), (1000.0, 320.0)):
+        for height in (3.0, *range(30, 111, 10)):
+            value = np.where(d < radius / 3, 3, np.where(d < radius * (1 + height / 300), 2, 1))
+            value = np.where(wood & (height < 40) | ((d > 250) & (height < 10)), 0, value)
+            rank.append(
+                RankMap(
+                    k=k, altitude_m=float(height), rank=value, share=np.array([(value == r).mean() for r in range(5)])
+                )
+            )
+            if height > 10:
+                for method, factor in (("Kriging", 1.0), ("makima", 1.6), ("spline", 1.9)):
+                    errors.append(
+                        MapError(
+                            evaluation="leave one out",
+                            method=method,
+                            k=k,
+                            altitude_m=float(height),
+                            mae=factor * (0.03 + radius / 4000 + 1 / height),
+                            n=2556,
+                        )
+                    )
+    distance = np.arange(15.0, 500, 30)
+    model = 0.2932 * np.exp(-0.0508 * distance) + 0.7057 * np.exp(-0.001 * distance)
+    lines = tuple(np.array([[-540.0, y], [540.0, y + 150]]) for y in (-350.0, 200.0))
+    return MapsData(
+        title="Coverage and rank of Lake Wheeler", name="lw", site=site, generated="2026-11-21T00:00:00Z", east_m=east, north_m=north,
+        borders_m=lines, rss=tuple(rss), rank=tuple(rank),
+        layers=(*(Layer(name="Singular value spread", label="sigma 1 over sigma 2 [dB]", altitude_m=h, values=20 + d / 30 + h / 10) for h in (30.0, 70.0)), Layer(name="Foliage loss", label="RSS with minus without trees [dB]", altitude_m=30.0, values=np.where(wood, -12.0, 0.0), difference=True),),
+        correlation=(Correlation(title="Rank, horizontal", distance_m=distance, correlation=model + 0.01 * np.cos(distance), fit_distance_m=distance, fit=model, fit_label="bi-exponential, RMSE 0.007", excluded=7),),
+        errors=tuple(errors), learning=(LearningCurve(method="Kriging", samples=np.array([50, 100, 400, 1600]), mae=np.array([0.3, 0.25, 0.16, 0.1])),),
+        paper=(PaperRow(where="Fig. 12", what="c1", paper="0.2932", ours="0.2931", plate="correlation"), PaperRow(where="Fig. 13", what="lowest MAE", paper="K = 10", ours="K = 10", plate="mae_leave_one_out")),
+        warnings=("Towers of another source differ by up to 9 m.",), versions={"numpy": np.__version__}, settings={"rt": {"max_depth": 2}}, stages_s={"replay": 3.0}, metrics={"fit": {"rmse": 0.0153}},
+    )  # fmt: skip
+
+
+@pytest.fixture(scope="session")
+def maps_data() -> MapsData:
+    return make_maps()

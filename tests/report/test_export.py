@@ -1,0 +1,141 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.report import export
+from aerpaw_cmp.report.data import Engine
+
+
+def test_metrics_hold_the_contract(report_data):
+    m = json.loads(json.dumps(export.metrics(report_data), allow_nan=False))
+    for key in ("flight", "versions", "inputs", "rss", "rank", "rt", "stages"):
+        assert key in m
+    assert {"path", "sha256", "reader", "lines", "accepted", "rejected"} <= set(m["inputs"][0])
+    one = m["rss"]["LW1"]["USRP2"]
+    panel = report_data.rss[1]
+    assert one["offset_db"] == panel.offset_db
+    assert one["rmse_ci95_db"] == list(panel.rmse_ci95_db)
+    assert one["baselines"]["two_ray"] == {
+        "offset_db": panel.baselines[1].offset_db,
+        "rmse_db": panel.baselines[1].rmse_db,
+    }
+    assert {"n", "n_out_of_coverage", "at_search_edge", "correlation", "lag_s"} <= set(one)
+    rank = m["rank"]["LW1"]
+    assert list(rank["simulated"]) == ["10", "100", "1000"]
+    assert list(rank["measured"]["histogram"]) == ["1", "2", "3", "4"]
+    assert sum(rank["measured"]["histogram"].values()) == pytest.approx(1.0)
+    assert {"histogram", "out_of_coverage", "agreement", "total_variation", "wasserstein"} <= set(
+        rank["simulated"]["100"]
+    )
+    assert m["rt"]["audit"]["rank_disagreement"]["1000"] == 0.005
+    assert m["stages"]["replay_s"] == 0.71
+
+
+def test_nan_is_null_and_extra_metrics_are_merged(report_data):
+    bad = dataclasses.replace(
+        report_data.rss[0],
+        rmse_db=float("nan"),
+        correlation=float("-inf"),
+        rmse_ci95_db=(float("nan"), 1.0),
+        extra={"when": np.datetime64("2024-01-01"), "mask": np.array([True])},
+    )
+    data = dataclasses.replace(
+        report_data,
+        rss=(bad,),
+        extra_metrics={"rss": {"LW1": {"USRP1": {"repeat_db": np.float32(3.0)}}}, "new": {1: (np.int8(2), None)}},
+    )
+    m = json.loads(json.dumps(export.metrics(data), allow_nan=False))
+    one = m["rss"]["LW1"]["USRP1"]
+    assert one["rmse_db"] is None
+    assert one["correlation"] is None
+    assert one["rmse_ci95_db"] == [None, 1.0]
+    assert one["repeat_db"] == 3.0
+    assert one["n"] == bad.n, "merging must not drop what was there"
+    assert one["when"] == "2024-01-01"
+    assert one["mask"] == [True]
+    assert m["new"] == {"1": [2, None]}
+
+
+def test_key_order_does_not_depend_on_the_order_of_versions(report_data):
+    a = dataclasses.replace(report_data, versions={"b": "1", "a": "2"})
+    b = dataclasses.replace(report_data, versions={"a": "2", "b": "1"})
+    assert json.dumps(export.metrics(a)) == json.dumps(export.metrics(b))
+
+
+def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
+    path = tmp_path / "rss.csv"
+    export.rss_frame(report_data.rss).to_csv(path, index=False)
+    back = pd.read_csv(path, parse_dates=["time_utc"])
+    assert [c for c in export.RSS_COLUMNS if c not in back.columns] == []
+    for panel in report_data.rss:
+        rows = back[(back.tower == panel.tower) & (back.channel == panel.channel)]
+        assert len(rows) == len(panel.time)
+        np.testing.assert_allclose(rows.measured_db, panel.measured_db, atol=6e-5)
+        np.testing.assert_allclose(rows.residual_db, panel.residual_db, atol=6e-5)
+        np.testing.assert_allclose(rows.two_ray_dbm, panel.baselines[1].level_dbm, atol=6e-5)
+        np.testing.assert_array_equal(rows.simulated_out_of_coverage == 1, panel.simulated_out_of_coverage)
+        late = np.abs(rows.time_utc.dt.tz_localize(None).to_numpy() - panel.time)
+        assert late.max() <= np.timedelta64(500, "us")
+    # the columns agree with each other, as a reader of the file alone would compute them
+    np.testing.assert_allclose(back.calibrated_db - back.simulated_dbm, back.residual_db, atol=2e-4)
+
+
+def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
+    path = tmp_path / "rank.csv"
+    export.rank_frame(report_data.rank).to_csv(path, index=False)
+    assert ".0," not in path.read_text().splitlines()[1].split(",", 5)[5], "ranks are integers in the file"
+    back = pd.read_csv(path)
+    panel = report_data.rank[0]
+    np.testing.assert_array_equal(back.measured_rank.isna(), np.isnan(panel.measured))
+    np.testing.assert_array_equal(back["simulated_rank_k10"], panel.simulated[0].rank)
+    assert (back["simulated_rank_k10"] == 0).sum() == panel.simulated[0].n_out_of_coverage
+
+
+def test_tables_without_rows_have_their_columns():
+    assert list(export.rss_frame([]).columns) == list(export.RSS_COLUMNS)
+    assert list(export.rank_frame([]).columns) == list(export.RANK_COLUMNS)
+
+
+def test_panels_with_different_baselines_share_one_table(report_data):
+    bare = dataclasses.replace(report_data.rss[0], baselines=(), channel="bare", east_m=None)
+    frame = export.rss_frame([bare, report_data.rss[1]])
+    assert frame[frame.channel == "bare"].free_space_dbm.isna().all()
+    assert frame[frame.channel == "USRP2"].free_space_dbm.notna().all()
+
+
+@pytest.mark.parametrize(
+    ("stored", "text"),
+    [
+        ("2024-07-02T15:00:00.999999999", "2024-07-02T15:00:01.000Z"),
+        ("2024-07-02T15:00:00.0004", "2024-07-02T15:00:00.000Z"),
+        ("1969-12-31T23:59:59.9996", "1970-01-01T00:00:00.000Z"),
+        ("NaT", ""),
+    ],
+)
+def test_time_is_rounded_not_cut(stored, text):
+    assert export.iso_time([np.datetime64(stored, "ns")]).tolist() == [text]
+
+
+def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path, monkeypatch):
+    path = tmp_path / "metrics.json"
+    export.write_atomic(path, "old")
+
+    def fail(self, target):
+        raise OSError("no space left on device")
+
+    monkeypatch.setattr(export.Path, "replace", fail)
+    with pytest.raises(OSError, match="no space"):
+        export.write_atomic(path, "new")
+    assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
+    assert path.read_text() == "old"
+
+
+def test_no_engine_no_audit(report_data):
+    assert export.metrics(dataclasses.replace(report_data, engine=None))["rt"] is None
+    bare = dataclasses.replace(report_data, engine=Engine(engine="sionna", links=1, seconds=1.0))
+    assert export.metrics(bare)["rt"]["audit"] is None

@@ -1,0 +1,238 @@
+from __future__ import annotations
+
+import dataclasses
+import re
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+
+from aerpaw_cmp.report import figures
+from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, Track
+
+
+def drawn(data: ReportData):
+    for plate in figures.plates(data):
+        with figures.style():
+            fig = plate.draw()
+        yield plate, fig
+
+
+def data_axes(fig):
+    return [ax for ax in fig.axes if ax.get_visible() and ax.get_label() != "<colorbar>"]
+
+
+def test_every_figure_has_labels_with_units_and_a_legend(small_report):
+    seen = []
+    for plate, fig in drawn(small_report):
+        seen.append(plate.name)
+        axes = data_axes(fig)
+        assert axes, plate.name
+        assert any(ax.get_xlabel() for ax in axes), plate.name
+        assert any(ax.get_ylabel() for ax in axes), plate.name
+        labels = [ax.get_xlabel() for ax in fig.axes] + [ax.get_ylabel() for ax in fig.axes]
+        assert any("[" in label or "rank" in label.lower() or "K (" in label for label in labels), (plate.name, labels)
+        has_legend = (
+            fig.legends or any(ax.get_legend() for ax in axes) or any(ax.get_label() == "<colorbar>" for ax in fig.axes)
+        )
+        assert has_legend, plate.name
+        assert all((plate.alt, plate.caption, plate.title)), plate.name
+    assert {
+        "trajectory",
+        "altitude",
+        "rss_LW4_USRP1",
+        "rank_map_LW1",
+        "rank_histogram_LW1",
+        "speed_against_error",
+    } <= set(seen)
+    assert len(seen) == len(set(seen))
+
+
+def test_file_names_are_safe_and_unique(report_data):
+    panels = tuple(dataclasses.replace(report_data.rss[0], tower="../LW 1", channel=c) for c in ("a/b", "a b"))
+    names = [p.name for p in figures.plates(dataclasses.replace(report_data, rss=panels))]
+    assert all(re.fullmatch(r"[A-Za-z0-9._-]+", name) for name in names)
+    assert len(names) == len(set(names))
+
+
+def long_panel(panel: RssPanel, times: int) -> RssPanel:
+    n = len(panel.time) * times
+    time = panel.time[0] + (np.arange(n) * 1e8).astype("timedelta64[ns]")
+    rows = {
+        f: np.tile(getattr(panel, f), times)
+        for f in ("measured_db", "simulated_dbm", "measured_out_of_coverage", "simulated_out_of_coverage")
+    }
+    baselines = tuple(dataclasses.replace(b, level_dbm=np.tile(b.level_dbm, times)) for b in panel.baselines)
+    return dataclasses.replace(panel, time=time, baselines=baselines, geometry={}, line_of_sight=None, **rows)
+
+
+def test_svg_stays_small_however_long_the_flight(report_data):
+    panel = long_panel(report_data.rss[2], 8)
+    data = dataclasses.replace(report_data, rss=(panel,))
+    with figures.style():
+        svg, _ = figures.save(figures.rss_over_time(data, panel))
+    assert len(panel.time) == 48_000
+    assert len(svg) < 500_000
+
+
+def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
+    plate = next(p for p in figures.plates(small_report) if p.name == "altitude")
+    one, two = figures.render(plate), figures.render(plate)
+    assert one.svg == two.svg
+    fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.svg)
+    assert all(f.startswith((b"#", b"data:")) for f in fetched)
+
+
+def test_style_leaves_the_users_settings_alone(small_report):
+    import matplotlib
+
+    before = dict(matplotlib.rcParams)
+    figures.render(figures.plates(small_report)[1])
+    assert dict(matplotlib.rcParams) == before
+
+
+def one_sample(panel: RssPanel) -> RssPanel:
+    pick = slice(3000, 3001)
+    fields = (
+        "time",
+        "measured_db",
+        "simulated_dbm",
+        "measured_out_of_coverage",
+        "simulated_out_of_coverage",
+        "east_m",
+        "north_m",
+        "up_m",
+        "line_of_sight",
+    )
+    baselines = tuple(dataclasses.replace(b, level_dbm=b.level_dbm[pick]) for b in panel.baselines)
+    return dataclasses.replace(
+        panel,
+        n=1,
+        baselines=baselines,
+        geometry={k: v[pick] for k, v in panel.geometry.items()},
+        **{f: getattr(panel, f)[pick] for f in fields},
+    )
+
+
+def all_out(panel: RssPanel) -> RssPanel:
+    nothing = np.full(len(panel.time), np.nan)
+    return dataclasses.replace(
+        panel,
+        simulated_dbm=nothing,
+        simulated_out_of_coverage=np.ones(len(nothing), dtype=bool),
+        offset_db=np.nan,
+        rmse_db=np.nan,
+        correlation=np.nan,
+        n=0,
+        n_out_of_coverage=len(nothing),
+        offset_curve=None,
+        baselines=(),
+        rmse_ci95_db=None,
+    )
+
+
+def no_csi(panel: RankPanel) -> RankPanel:
+    nothing = Histogram(share=np.full(4, np.nan))
+    at = tuple(
+        dataclasses.replace(
+            a,
+            rank=np.zeros_like(a.rank),
+            histogram=nothing,
+            agreement=np.nan,
+            total_variation=np.nan,
+            confusion=np.zeros((4, 5), dtype=int),
+        )
+        for a in panel.simulated
+    )
+    return dataclasses.replace(
+        panel,
+        measured=np.full(len(panel.time), np.nan),
+        histogram=nothing,
+        simulated=at,
+        curve=None,
+        singular_ratio_db=np.full((len(panel.time), 3), np.nan),
+        best_k=np.nan,
+        best_k_ci95=None,
+    )
+
+
+def still(track: Track) -> Track:
+    return dataclasses.replace(
+        track,
+        east_m=np.full(len(track.time), 5.0),
+        north_m=np.full(len(track.time), 5.0),
+        up_m=np.full(len(track.time), 0.5),
+    )
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda d: {"rss": (one_sample(d.rss[0]),), "rank": ()},
+        lambda d: {"rss": (all_out(d.rss[2]),), "rank": ()},
+        lambda d: {"rss": (dataclasses.replace(d.rss[2], offset_db=50.0, at_search_edge=True),), "rank": ()},
+        lambda d: {"rss": (), "rank": (no_csi(d.rank[0]),)},
+        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=(), curve=None, singular_ratio_db=None),)},
+        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=d.rank[0].simulated[:1]),), "speed": d.speed[:1]},
+        lambda d: {"rss": (), "rank": (), "track": still(d.track)},
+        lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], east_m=d.track.east_m[:1], north_m=d.track.north_m[:1], up_m=d.track.up_m[:1])},
+        lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, up_m=np.full(len(d.track.time), np.nan))},
+        lambda d: {"rss": (), "rank": (), "speed": (), "site": dataclasses.replace(d.site, towers={}, buildings=(), forests=(), geofences=(), trees=type(d.site.trees).none())},
+    ],
+    ids=["one sample", "all out of coverage", "edge", "no CSI at all", "rank without simulation", "one K", "hovering", "one pose", "no height", "bare site"],
+)  # fmt: skip
+def test_odd_flights_are_drawn_without_a_warning(report_data, change):
+    data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
+    for _, fig in drawn(data):
+        with figures.style():
+            fig.draw_without_rendering()  # lays out and draws every part; warnings are errors
+
+
+@given(arrays(bool, st.integers(0, 60)))
+def test_runs_cover_exactly_the_true_samples(mask):
+    again = np.zeros(len(mask), dtype=bool)
+    spans = figures.runs(mask)
+    for a, b in spans:
+        assert not again[a : b + 1].any()
+        again[a : b + 1] = True
+    np.testing.assert_array_equal(again, mask)
+    assert all(b + 1 < c for (_, b), (c, _) in pairwise(spans)), "neighbouring spans are one"
+
+
+@given(st.integers(0, 500), st.integers(10, 80), st.randoms())
+def test_thinning_keeps_extremes_order_and_size(n, limit, random):
+    level = np.array([random.gauss(0, 1) for _ in range(n)])
+    at = np.arange(n, dtype=float)
+    a, b = figures.thinned(at, level, limit)
+    assert len(a) <= max(limit + 2, n if n <= limit else 0)
+    assert (np.diff(a) >= 0).all()
+    assert set(zip(a, b, strict=True)) <= set(zip(at, level, strict=True))
+    if n:
+        assert (b.min(), b.max()) == (level.min(), level.max())
+
+
+def test_thinning_keeps_a_gap_open():
+    level = np.sin(np.arange(10_000.0))
+    level[4000:6000] = np.nan
+    a, b = figures.thinned(np.arange(10_000.0), level, 500)
+    assert not np.isfinite(b[(a > 4050) & (a < 5950)]).any()
+    assert np.isnan(b).any()
+
+
+def test_pareto_front_is_not_beaten():
+    seconds, error = [3.0, 1.0, 2.0, 2.0, 5.0], [1.0, 5.0, 3.0, 4.0, np.nan]
+    assert figures.pareto_front(seconds, error) == [1, 2, 0]
+
+
+def test_residual_sign_is_measured_minus_simulated(report_data):
+    panel = report_data.rss[0]
+    higher = dataclasses.replace(panel, measured_db=panel.measured_db + 1.0)
+    np.testing.assert_allclose(higher.residual_db - panel.residual_db, 1.0)
+
+
+def test_grey_steps_of_the_ranks_are_apart():
+    grey = [np.dot(figures.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
+    assert min(np.diff(grey)) > 0.12

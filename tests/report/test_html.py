@@ -1,0 +1,248 @@
+from __future__ import annotations
+
+import dataclasses
+import re
+from html import unescape
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.records import RejectedLine
+from aerpaw_cmp.report import html, words
+from aerpaw_cmp.report.data import InputFile, ReportData
+from aerpaw_cmp.report.figures import Picture
+
+VOID = {"meta", "img", "br", "link", "input", "hr"}
+HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&{{ 7*7 }}"
+
+
+class Page(HTMLParser):
+    """Checks the nesting and gathers what a browser would load, and the text."""
+
+    def __init__(self) -> None:
+        super().__init__(convert_charrefs=True)
+        self.open: list[str] = []
+        self.loads: list[str] = []
+        self.links: list[str] = []
+        self.ids: list[str] = []
+        self.tags: list[str] = []
+        self.alts: list[str] = []
+        self.text = ""
+
+    def handle_starttag(self, tag, attrs):
+        values = dict(attrs)
+        self.tags.append(tag)
+        if tag not in VOID:
+            self.open.append(tag)
+        self.ids += [values["id"]] if "id" in values else []
+        self.loads += [values[k] for k in ("src", "srcset", "data", "poster") if k in values]
+        if tag == "link":
+            self.loads.append(values.get("href", ""))
+        if tag == "a":
+            self.links.append(values["href"])
+        if tag == "img":
+            self.alts.append(values.get("alt", ""))
+        assert not any(k.startswith("on") for k in values), f"event handler in <{tag}>"
+
+    def handle_endtag(self, tag):
+        assert self.open[-1:] == [tag], f"</{tag}> closes {self.open[-3:]}"
+        self.open.pop()
+
+    def handle_data(self, data):
+        self.text += data
+
+
+def parse(text: str) -> Page:
+    page = Page()
+    page.feed(text)
+    page.close()
+    assert page.open == []
+    return page
+
+
+def fake_pictures(data: ReportData) -> list[Picture]:
+    from aerpaw_cmp.report.figures import plates
+
+    return [
+        Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, svg=b"<svg/>", png=b"")
+        for p in plates(data)
+    ]
+
+
+def render(data: ReportData) -> Page:
+    return parse(html.page(data, fake_pictures(data), ["metrics.json"]))
+
+
+def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
+    text = html.page(report_data, fake_pictures(report_data), ["metrics.json"])
+    page = parse(text)
+    assert text.lstrip().startswith("<!DOCTYPE html>")
+    assert page.loads
+    assert all(load.startswith("data:image/svg+xml;base64,") for load in page.loads)
+    assert not {"script", "iframe", "object", "embed", "form"} & set(page.tags)
+    assert not re.search(r"@import|url\(", text)
+    assert "default-src 'none'" in unescape(text)
+    assert len(page.ids) == len(set(page.ids))
+    assert all(link[0] == "#" and link[1:] in page.ids for link in page.links)
+    assert all(page.alts)
+    assert page.tags.count("table") == page.tags.count("caption")
+
+
+def test_every_figure_has_a_place(report_data):
+    from aerpaw_cmp.report.figures import plates
+
+    page = render(report_data)
+    assert [p.name for p in plates(report_data) if p.name not in page.ids] == []
+
+
+def test_first_screen_says_what_and_how_well(report_data):
+    text = render(report_data).text
+    head = text[: text.index("The flight")]
+    panel = report_data.rss[0]
+    for piece in (
+        f"{panel.offset_db:.1f}",
+        f"{panel.rmse_db:.2f}",
+        f"{panel.baselines[0].rmse_db:.2f}",
+        f"{panel.baselines[1].rmse_db:.2f}",
+        "synthetic",
+        "illustrative",
+    ):
+        assert piece in head
+
+
+def test_not_called_synthetic_or_illustrative_when_it_is_neither(report_data):
+    data = dataclasses.replace(
+        report_data,
+        synthetic=False,
+        site=dataclasses.replace(report_data.site, illustrative=False, name="here"),
+        rss=(),
+        rank=(),
+    )
+    text = render(data).text
+    assert "synthetic" not in text
+    assert "illustrative" not in text
+
+
+def hostile_report(data: ReportData, text: str) -> ReportData:
+    site = dataclasses.replace(data.site, name=text, notes=(text,))
+    panel = dataclasses.replace(
+        data.rss[0],
+        tower=text,
+        channel=text,
+        unit=text,
+        lag_verdict=text,
+        fitted=(text,),
+        worst=(dataclasses.replace(data.rss[0].worst[0], cause=text),),
+    )
+    bad_input = InputFile(
+        path=text,
+        sha256=text,
+        reader=text,
+        lines=1,
+        accepted=0,
+        rejected=1,
+        blank=0,
+        role=text,
+        warnings=(text,),
+        rejected_lines=(RejectedLine(1, text, text),),
+    )
+    engine = dataclasses.replace(data.engine, engine=text, left_out=(text,), settings={text: text})
+    return dataclasses.replace(
+        data,
+        title=text,
+        flight=text,
+        site=site,
+        generated=text,
+        versions={text: text},
+        inputs=(bad_input,),
+        rss=(panel,),
+        rank=(dataclasses.replace(data.rank[0], tower=text),),
+        engine=engine,
+        warnings=(text,),
+        notes=(text,),
+        settings={text: {text: [text]}},
+        stages_s={text: 1.0},
+    )
+
+
+def test_hostile_text_is_only_text(report_data):
+    page = render(hostile_report(report_data, HOSTILE))
+    assert "script" not in page.tags
+    assert page.tags.count("img") == len(page.alts) == len(page.loads)
+    assert HOSTILE in page.text
+
+
+@settings(max_examples=15, deadline=None)
+@given(text=st.text(min_size=1, max_size=30))
+def test_any_text_keeps_the_page_well_formed(report_data, text):
+    page = render(hostile_report(report_data, text))
+    assert all(load.startswith("data:") for load in page.loads)
+
+
+@pytest.mark.parametrize(
+    "missing",
+    ["track", "waypoints", "rss", "rank", "pairs", "engine", "speed", "inputs", "settings", "versions", "stages_s"],
+)
+def test_a_part_may_be_missing(report_data, missing):
+    empty = {"track": None, "engine": None, "settings": {}, "versions": {}, "stages_s": {}}.get(missing, ())
+    render(dataclasses.replace(report_data, **{missing: empty}))
+
+
+def test_all_parts_missing(report_data):
+    page = render(ReportData(title="t", flight="f", site=report_data.site, generated="now"))
+    assert "no radio measurement" in page.text
+
+
+def test_panels_are_said_in_their_own_section(report_data):
+    text = html.page(report_data, fake_pictures(report_data), [])
+    for panel in report_data.rss:
+        section = text[text.index(f"<h3>{panel.name}</h3>") :]
+        assert words.rss_verdict(panel) in section[: section.index("</p>")]
+    section = text[text.index('<section id="rank">') :]
+    assert words.rank_verdict(report_data.rank[0]) in section[: section.index("</p>")]
+
+
+class TestWords:
+    def test_worse_than_a_baseline_is_said(self, report_data):
+        panel = dataclasses.replace(report_data.rss[0], rmse_db=9.0, rmse_ci95_db=(8.5, 9.5))
+        assert "WORSE than two-ray" in words.rss_verdict(panel)
+
+    def test_a_gain_within_the_interval_is_doubted(self, report_data):
+        panel = report_data.rss[0]
+        assert "within the interval" in words.rss_verdict(dataclasses.replace(panel, rmse_ci95_db=(0.1, 99.0)))
+        assert "within the interval" not in words.rss_verdict(
+            dataclasses.replace(panel, rmse_ci95_db=(panel.rmse_db, panel.rmse_db))
+        )
+
+    def test_edge_of_the_search(self, report_data):
+        data = dataclasses.replace(report_data, rss=(dataclasses.replace(report_data.rss[0], at_search_edge=True),))
+        assert any("edge of the searched span" in w for w in words.warnings(data))
+        assert not any("edge of the searched span" in w for w in words.warnings(report_data))
+
+    def test_nothing_to_score(self, report_data):
+        panel = dataclasses.replace(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)
+        assert "nothing to score" in words.rss_verdict(panel)
+
+    @pytest.mark.parametrize(
+        ("verdict", "lag", "said"),
+        [
+            ("ok", 0.1, False),
+            ("ok", -3.0, True),
+            ("ambiguous", 0.0, True),
+            ("failed", np.nan, True),
+            ("", np.nan, False),
+        ],
+    )
+    def test_clock(self, report_data, verdict, lag, said):
+        data = dataclasses.replace(
+            report_data, rss=(dataclasses.replace(report_data.rss[0], lag_verdict=verdict, lag_s=lag),)
+        )
+        assert any("radio clock" in w for w in words.warnings(data)) == said
+
+    def test_best_k_is_the_nearest_distribution(self, report_data):
+        panel = report_data.rank[0]
+        best = min(panel.simulated, key=lambda at: at.total_variation)
+        assert f"K = {best.k:g} comes nearest" in words.rank_verdict(panel)

@@ -1,0 +1,138 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.report import figures, maps_figures, maps_html
+from aerpaw_cmp.report.figures import Picture
+from aerpaw_cmp.report.maps_data import MapsData
+
+
+def pictures(data):
+    return [
+        Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, svg=b"<svg/>", png=b"")
+        for p in maps_figures.plates(data)
+    ]
+
+
+@pytest.fixture
+def few_maps(maps_data):
+    """One height and one K: enough to draw every kind of figure."""
+    return dataclasses.replace(maps_data, rss=maps_data.rss[:6], rank=maps_data.rank[:2])
+
+
+def test_files(few_maps, tmp_path):
+    files = maps_html.write_maps(few_maps, tmp_path)
+    assert files[0].name == "map.html"
+    page = files[0].read_text()
+    names = {p.name for p in maps_figures.plates(few_maps)}
+    assert all(f'id="{name}"' in page for name in names)
+    assert not re.search(r'(?:src|href)="(?!data:|#)', page)
+    assert page.count("<script") == 0
+    assert max(f.stat().st_size for f in files if f.suffix == ".svg") < 500_000
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics["grid"]["positions"] == 2556
+    assert metrics["fit"]["rmse"] == 0.0153
+    assert sum(metrics["rank"][0]["share"].values()) == pytest.approx(1.0)
+
+
+def test_every_map_figure_has_units_and_a_legend(few_maps):
+    for plate in maps_figures.plates(few_maps):
+        with figures.style():
+            fig = plate.draw()
+        labels = [ax.get_xlabel() + ax.get_ylabel() for ax in fig.axes]
+        assert any("[" in label or "Number" in label for label in labels), plate.name
+        assert fig.legends or any(ax.get_legend() for ax in fig.axes), plate.name
+
+
+def test_north_is_up_and_east_is_right(maps_data):
+    """The one bright cell of a map must lie where its tower stands."""
+    values = np.full((len(maps_data.north_m), len(maps_data.east_m)), -100.0)
+    values[70, 0] = 0.0  # north-west corner
+    with figures.style():
+        _, (ax,) = maps_figures.map_axes(maps_data, 1)
+        image = maps_figures.draw_map(ax, maps_data, values)
+    west, east, south, north = image.get_extent()
+    assert (west, east, south, north) == (-540.0, 540.0, -1065.0, 1065.0)
+    assert image.origin == "lower"
+    assert image.get_cursor_data(_event(ax, -525.0, 1050.0)) == 0.0
+    assert image.get_cursor_data(_event(ax, 525.0, 1050.0)) == -100.0
+
+
+def _event(ax, east, north):
+    from types import SimpleNamespace
+
+    x, y = ax.transData.transform((east, north))
+    return SimpleNamespace(x=x, y=y, xdata=east, ydata=north, inaxes=ax)
+
+
+def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
+    maps = [m for m in maps_data.rss if m.antennas == "SISO"]
+    with figures.style():
+        fig = maps_figures.cdfs(maps)
+    lines = fig.axes[0].get_lines()
+    for line, one in zip(lines, maps, strict=False):
+        assert line.get_ydata()[0] == pytest.approx(1 - one.coverage, abs=2 / one.rss_dbm.size)
+        assert line.get_ydata()[-1] == 1.0
+
+
+def test_borders_only_where_towers_share_the_area(maps_data):
+    with figures.style():
+        _, axes = maps_figures.map_axes(maps_data, 2)
+        maps_figures.draw_map(axes[0], maps_data, maps_data.rss[0].rss_dbm, highlight="LW1")
+        maps_figures.draw_map(axes[1], maps_data, maps_data.rss[0].rss_dbm)
+    triangles = [sum(line.get_marker() == "^" for line in ax.get_lines()) for ax in axes]
+    assert triangles == [1, 5]
+    assert len(axes[1].get_lines()) - len(axes[0].get_lines()) == 2 * len(maps_data.borders_m) + 4
+
+
+def test_tables(maps_data):
+    heads, rows = maps_html.coverage_table(maps_data)
+    assert heads == ["30 m", "70 m", "110 m"]
+    assert len(rows) == 12
+    assert rows[5][0] == ["SISO", "opaque", "joint"]
+    ((title, heights, table),) = maps_html.error_tables(maps_data.errors)
+    assert title == "leave one out"
+    assert len(heights) == 9
+    method, k, mae, mean = table[0]
+    assert (method, k) == ("Kriging", "10")
+    assert mean == pytest.approx(np.mean(mae))
+
+
+def test_hostile_names_are_escaped(maps_data):
+    text = "<script>alert(1)</script>"
+    data = dataclasses.replace(
+        maps_data,
+        title=text,
+        name=text,
+        warnings=(text,),
+        notes=(text,),
+        site=dataclasses.replace(maps_data.site, name=text),
+        errors=(dataclasses.replace(maps_data.errors[0], method=text, evaluation=text),),
+        paper=(dataclasses.replace(maps_data.paper[0], what=text, plate=text),),
+    )
+    page = maps_html.maps_page(data, pictures(data), [text])
+    assert "<script" not in page
+
+
+@pytest.mark.parametrize(
+    "missing", ["rss", "rank", "layers", "correlation", "errors", "learning", "paper", "borders_m"]
+)
+def test_a_part_may_be_missing(maps_data, missing):
+    data = dataclasses.replace(maps_data, **{missing: ()})
+    maps_html.maps_page(data, pictures(data), [])
+    json.dumps(maps_html.maps_metrics(data), allow_nan=False)
+
+
+def test_nothing_at_all_and_nothing_covered(maps_data):
+    empty = MapsData(
+        title="t", name="n", site=maps_data.site, generated="", east_m=maps_data.east_m, north_m=maps_data.north_m
+    )
+    maps_html.maps_page(empty, pictures(empty), [])
+    dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
+    for plate in maps_figures.plates(dataclasses.replace(empty, rss=(dark,))):
+        figures.render(plate)

@@ -1,0 +1,104 @@
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+from shapely.geometry import Polygon, box
+
+from aerpaw_cmp.report import figures, site_view
+from aerpaw_cmp.report.site_view import PathLine
+from aerpaw_cmp.site.site import Building, Site, Trees
+
+
+@pytest.fixture
+def paths(report_data):
+    tower, uav = report_data.site.towers["LW1"].position_m, np.array([100.0, 200.0, 40.0])
+    return (
+        PathLine(points_m=np.array([tower, uav]), label="direct"),
+        PathLine(points_m=np.array([tower, [20, 40, 0], uav]), label="ground"),
+    )
+
+
+def scene_of(page: str):
+    return json.loads(re.search(r'<script type="application/json" id="scene">(.*?)</script>', page, re.S).group(1))
+
+
+def test_writes_plan_picture_and_page(report_data, paths, tmp_path):
+    files = site_view.write_site_view(report_data.site, tmp_path, track=report_data.track, paths=paths)
+    assert [f.suffix for f in files] == [".html", ".svg", ".png", ".svg", ".png"]
+    for file in files:
+        if file.suffix == ".png":
+            assert file.read_bytes().startswith(b"\x89PNG")
+    page = files[0].read_text()
+    assert not re.search(r"(?:src|href)=|@import|url\(|fetch\(|XMLHttp|import\(", page), "nothing is loaded"
+    assert "illustrative" in page
+    scene = scene_of(page)
+    assert [t["name"] for t in scene["towers"]] == list(report_data.site.towers)
+    assert scene["paths"][1]["kind"] == 1
+    assert len(scene["flight"]) <= 2 * site_view.FLIGHT_POINTS
+
+
+def test_a_hostile_name_stays_a_name(report_data):
+    name = "</script><script>alert(1)</script>"
+    tower = dataclasses.replace(report_data.site.towers["LW1"], name=name)
+    site = dataclasses.replace(report_data.site, name=name, towers={name: tower})
+    page = site_view.viewer(site, paths=[PathLine(points_m=np.zeros((2, 3)), label=name)])
+    assert page.count("<script") == 2
+    assert "alert(1)<" not in page
+    assert scene_of(page)["towers"][0]["name"] == name
+
+
+def test_walls_enclose_the_prism():
+    """Areas of walls with holes: perimeter times height, and one roof."""
+    shape = Polygon([(0, 0), (10, 0), (10, 6), (0, 6)], [[(2, 2), (2, 4), (4, 4), (4, 2)]])
+    faces = site_view.walls(Building("b", shape, 5.0, base_m=2.0))
+    area = sum(np.linalg.norm(np.cross(f[1] - f[0], f[3] - f[0])) for f in faces[:-1])
+    assert area == pytest.approx((32 + 8) * 5.0)
+    assert {z for f in faces for z in f[:, 2]} == {2.0, 7.0}
+
+
+def test_limits_hold_everything(report_data, paths):
+    far = PathLine(points_m=np.array([[0.0, 0, 0], [5000.0, -9000.0, 300.0]]), label="far")
+    limits = site_view.view_limits(report_data.site, report_data.track, (*paths, far))
+    for tower in report_data.site.towers.values():
+        assert (limits[:, 0] <= tower.position_m).all()
+        assert (tower.position_m <= limits[:, 1]).all()
+    assert (limits[:, 1] >= [5000.0, 830.0, 300.0]).all()
+    assert limits[1, 0] <= -9000.0
+
+
+def test_an_empty_site_can_be_shown(report_data):
+    bare = Site("nothing", report_data.site.frame, {})
+    for draw in (site_view.plan, site_view.solid):
+        with figures.style():
+            figures.save(draw(bare))
+    assert scene_of(site_view.viewer(bare))["trees"] == []
+
+
+def test_ten_thousand_trees_keep_the_files_small(report_data):
+    n = 10_000
+    rng = np.random.default_rng(0)
+    full = np.full
+    trees = Trees(
+        rng.uniform(-500, 500, n),
+        rng.uniform(-1000, 1000, n),
+        np.zeros(n),
+        full(n, 20.0),
+        full(n, 10.0),
+        full(n, 5.0),
+        full(n, 0.4),
+    )
+    site = dataclasses.replace(
+        report_data.site,
+        trees=trees,
+        buildings=tuple(Building(f"b{i}", box(i, 0, i + 1, 1), 5.0) for i in range(0, 200, 2)),
+    )
+    page = site_view.viewer(site)
+    assert len(page) < 500_000
+    assert f"10000 trees ({site_view.TREES_IN_PAGE} drawn)" in page
+    with figures.style():
+        svg, _ = figures.save(site_view.solid(site))
+    assert len(svg) < 500_000

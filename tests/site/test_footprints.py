@@ -1,0 +1,327 @@
+"""One village written in four formats gives one site; every kind of broken outline is repaired and reported."""
+
+import json
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
+from aerpaw_cmp.site.siteyaml import build_site, load_site
+
+FRAME = SiteFrame(35.7275, -78.696)
+Ring = list[tuple[float, float]]
+
+
+def square(east: float, north: float, size: float = 20.0) -> Ring:
+    return [(east, north), (east + size, north), (east + size, north + size), (east, north + size)]
+
+
+def lonlat(ring: Ring, frame: SiteFrame = FRAME) -> list[list[float]]:
+    latitude, longitude = frame.to_geographic(*np.array([*ring, ring[0]]).T)
+    return [[float(x), float(y)] for x, y in zip(longitude, latitude, strict=True)]
+
+
+def geojson(path: Path, *features: tuple[list[Ring], dict[str, object]]) -> Path:
+    content = {
+        "type": "FeatureCollection",
+        "features": [
+            {
+                "type": "Feature",
+                "id": f"f{n}",
+                "properties": tags,
+                "geometry": {"type": "Polygon", "coordinates": [lonlat(ring) for ring in rings]},
+            }
+            for n, (rings, tags) in enumerate(features)
+        ],
+    }
+    path.write_text(json.dumps(content))
+    return path
+
+
+BARN: dict[str, object] = {"building": "barn", "height": "7.5"}
+VILLAGE: list[tuple[str, list[Ring], dict[str, str]]] = [
+    ("barn", [square(0, 0)], {"building": "barn", "height": "25 ft", "name": "barn"}),
+    ("yard", [square(100, 0, 40), square(110, 10, 20)], {"building": "yes", "building:levels": "2", "name": "yard"}),
+    ("hut", [square(200, 0, 6)], {"building": "yes", "name": "hut"}),
+    ("wood", [square(-200, -200, 150)], {"natural": "wood", "name": "wood"}),
+]
+
+
+def osm_parts() -> tuple[
+    list[tuple[int, float, float]],
+    list[tuple[int, list[int], dict[str, str]]],
+    list[tuple[list[tuple[int, str]], dict[str, str]]],
+]:
+    nodes: list[tuple[int, float, float]] = []
+    ways: list[tuple[int, list[int], dict[str, str]]] = []
+    relations = []
+    for _, rings, tags in VILLAGE:
+        members = []
+        for number, ring in enumerate(rings):
+            first = len(nodes) + 1
+            nodes += [(first + i, lat, lon) for i, (lon, lat) in enumerate(lonlat(ring)[:-1])]
+            around = [*range(first, len(nodes) + 1), first]
+            if len(rings) == 1:
+                ways.append((len(ways) + 1, around, tags))
+            else:  # the outline in two pieces, one of them backwards
+                half = len(around) // 2
+                for piece in (around[: half + 1], around[half:][::-1]):
+                    ways.append((len(ways) + 1, piece, {}))
+                    members.append((len(ways), "inner" if number else "outer"))
+        if members:
+            relations.append((members, {**tags, "type": "multipolygon"}))
+    ways.append((len(ways) + 1, [1, 2, 6], {"highway": "track"}))
+    return nodes, ways, relations
+
+
+def osm_xml(path: Path) -> Path:
+    nodes, ways, relations = osm_parts()
+
+    def tag_lines(tags: dict[str, str]) -> str:
+        return "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+
+    text = '<?xml version="1.0"?><osm version="0.6">'
+    text += "".join(f'<node id="{i}" lat="{lat!r}" lon="{lon!r}"/>' for i, lat, lon in nodes)
+    for i, refs, tags in ways:
+        text += f'<way id="{i}">' + "".join(f'<nd ref="{r}"/>' for r in refs) + tag_lines(tags) + "</way>"
+    for n, (members, tags) in enumerate(relations):
+        text += f'<relation id="{n}">' + "".join(f'<member type="way" ref="{r}" role="{role}"/>' for r, role in members)
+        text += tag_lines(tags) + "</relation>"
+    path.write_text(text + "</osm>")
+    return path
+
+
+def overpass(path: Path) -> Path:
+    nodes, ways, relations = osm_parts()
+    where = {i: {"lat": lat, "lon": lon} for i, lat, lon in nodes}
+    lines = {i: [where[r] for r in refs] for i, refs, _ in ways}
+    elements: list[dict[str, object]] = [
+        {"type": "way", "id": i, "tags": tags, "geometry": lines[i]} for i, _, tags in ways if tags
+    ]
+    for n, (members, tags) in enumerate(relations):
+        listed = [{"type": "way", "ref": r, "role": role, "geometry": lines[r]} for r, role in members]
+        elements.append({"type": "relation", "id": n, "tags": tags, "members": listed})
+    path.write_text(json.dumps({"version": 0.6, "elements": elements}))
+    return path
+
+
+def kml(path: Path) -> Path:
+    def ring(points: Ring, role: str) -> str:
+        text = " ".join(f"{lon!r},{lat!r},0" for lon, lat in lonlat(points))
+        return f"<{role}BoundaryIs><LinearRing><coordinates>\n{text}\n</coordinates></LinearRing></{role}BoundaryIs>"
+
+    text = '<?xml version="1.0"?><kml xmlns="http://www.opengis.net/kml/2.2"><Document>'
+    for name, rings, tags in VILLAGE:
+        data = "".join(f'<Data name="{k}"><value>{v}</value></Data>' for k, v in tags.items())
+        areas = ring(rings[0], "outer") + "".join(ring(hole, "inner") for hole in rings[1:])
+        text += (
+            f"<Placemark><name>{name}</name><ExtendedData>{data}</ExtendedData><Polygon>{areas}</Polygon></Placemark>"
+        )
+    path.write_text(text + "</Document></kml>")
+    return path
+
+
+def village_geojson(path: Path) -> Path:
+    return geojson(path, *[(rings, dict(tags)) for _, rings, tags in VILLAGE])
+
+
+@pytest.mark.parametrize("writer", [village_geojson, osm_xml, overpass, kml])
+def test_one_village_in_four_formats(tmp_path: Path, writer: object) -> None:
+    found = import_footprints([writer(tmp_path / "village")], FRAME)  # type: ignore[operator]
+    heights = {b.name: b.height_m for b in found.buildings}
+    assert heights == {"barn": pytest.approx(7.62), "yard": 6.0, "hut": 6.0}
+    areas = {b.name: b.footprint.area for b in found.buildings}
+    assert areas == pytest.approx({"barn": 400, "yard": 40**2 - 20**2, "hut": 36}, rel=1e-4)
+    barn = next(b for b in found.buildings if b.name == "barn")
+    assert barn.footprint.symmetric_difference(box(0, 0, 20, 20)).area < 0.01
+    assert [(f.name, round(f.area.area)) for f in found.forests] == [("wood", 22500)]
+    assert not found.geofences
+
+
+def test_round_trip_through_site_yaml(tmp_path: Path) -> None:
+    model, actions = import_site([village_geojson(tmp_path / "v.json")])
+    write_site_yaml(model, tmp_path / "site.yaml", header=["imported", *actions])
+    site, again = load_site(tmp_path / "site.yaml"), build_site(model)
+    assert not site.illustrative
+    assert not any("illustrative" in note for note in site.notes)
+    assert list(site.towers) == ["LW1", "LW2", "LW3", "LW4", "LW5"]
+    assert [b.height_m for b in site.buildings] == [b.height_m for b in again.buildings]
+    for one, other in zip(site.buildings, again.buildings, strict=True):
+        assert one.footprint.equals_exact(other.footprint, 1e-3)
+    np.testing.assert_array_equal(site.trees.east_m, again.trees.east_m)
+    assert len(site.trees) > 100
+
+
+def test_geofence_and_untagged_areas(tmp_path: Path) -> None:
+    plain = geojson(tmp_path / "plain.json", ([square(0, 0)], {}))
+    with pytest.raises(InputError, match=r"no building, forest, geofence or tree found in plain.json"):
+        import_footprints([plain], FRAME)
+    assert len(import_footprints([plain], FRAME, untagged="forest").forests) == 1
+    fence = tmp_path / "fence.kml"
+    fence.write_text(kml(fence).read_text().replace("<ExtendedData>", "<x>").replace("</ExtendedData>", "</x>"))
+    fence.write_text(fence.read_text().replace('name="building', 'name="b').replace('name="natural', 'name="n'))
+    found = import_footprints([fence], FRAME)
+    assert (len(found.geofences), len(found.buildings)) == (4, 0)
+
+
+def imported(tmp_path: Path, *features: tuple[list[Ring], dict[str, object]]) -> Footprints:
+    return import_footprints([geojson(tmp_path / "a.json", *features)], FRAME)
+
+
+def said(found: Footprints, words: str) -> bool:
+    return any(words in action for action in found.actions)
+
+
+def test_self_crossing_ring_is_repaired(tmp_path: Path) -> None:
+    found = imported(tmp_path, ([[(0, 0), (20, 20), (20, 0), (0, 20)]], BARN))  # a bow tie
+    assert sum(b.footprint.area for b in found.buildings) == pytest.approx(200, rel=1e-3)
+    assert all(b.footprint.is_valid for b in found.buildings)
+    assert said(found, "self-crossing ring was repaired (self-intersection)")
+
+
+def test_three_equal_points_are_left_out(tmp_path: Path) -> None:
+    found = imported(tmp_path, ([[(5, 5)] * 3], BARN), ([square(0, 0)], BARN))
+    assert len(found.buildings) == 1
+    assert said(found, "f0: left out, it has no area")
+    assert said(found, "fewer than 3 distinct points")
+
+
+def test_duplicates_slivers_and_overlaps(tmp_path: Path) -> None:
+    tall: dict[str, object] = {"building": "yes", "height": "20"}
+    found = imported(
+        tmp_path,
+        ([square(0, 0)], {"building": "yes"}),
+        ([square(0.05, 0)], BARN),  # the same again, with a height
+        ([[(50, 0), (90, 0), (90, 0.1)]], BARN),  # a sliver
+        ([square(200, 0)], BARN),
+        ([square(210, 0)], BARN),  # overlaps at the same height
+        ([square(300, 0)], BARN),
+        ([square(310, 0)], tall),  # overlaps a higher one
+        ([square(315, 5, 5)], BARN),  # inside the higher one, over both
+    )
+    assert said(found, "f1: left out, it repeats")
+    assert said(found, "sliver of 2.0 m2 was left out")
+    assert said(found, "they were merged")
+    assert said(found, "part under a higher building was cut away")
+    assert said(found, "lies inside buildings at least as high")
+    by_area = sorted((round(b.footprint.area), b.height_m) for b in found.buildings)
+    assert by_area == [(200, 7.5), (400, 7.5), (400, 20.0), (600, 7.5)]
+    shapes = [b.footprint for b in found.buildings]
+    assert all(a.intersection(b).area < 0.01 for i, a in enumerate(shapes) for b in shapes[:i])
+
+
+def test_overlapping_forests_do_not_double_the_trees(tmp_path: Path) -> None:
+    wood: dict[str, object] = {"landuse": "forest"}
+    found = imported(tmp_path, ([square(0, 0, 100)], wood), ([square(50, 0, 100)], wood))
+    assert sum(f.area.area for f in found.forests) == pytest.approx(15_000, rel=1e-3)
+
+
+def test_hole_outside_and_multipolygon_keep_their_area(tmp_path: Path) -> None:
+    path = tmp_path / "m.json"
+    parts = [[lonlat(square(0, 0, 40)), lonlat(square(10, 10))], [lonlat(square(100, 0))]]
+    geometry = {"type": "MultiPolygon", "coordinates": parts}
+    path.write_text(json.dumps({"type": "Feature", "properties": BARN, "geometry": geometry}))
+    found = import_footprints([path], FRAME)
+    assert sorted(round(b.footprint.area) for b in found.buildings) == [400, 1200]
+    assert len({b.name for b in found.buildings}) == 2
+
+
+@pytest.mark.parametrize(
+    ("written", "metres"), [("12", 12), ("12,5 m", 12.5), ("40 ft", 12.192), ("40'", 12.192), ("39'4\"", 11.9888)]
+)
+def test_heights_with_units(tmp_path: Path, written: str, metres: float) -> None:
+    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": written}))
+    assert found.buildings[0].height_m == pytest.approx(metres, abs=0.006)
+
+
+def test_heights_that_cannot_be_metres(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match=r"2400 m high.*feet or centimetres"):
+        imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "2400"}))
+    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "20", "building:levels": "2"}))
+    assert said(found, "warning: a.json: f0: 20 m for 2 levels; are these feet?")
+    found = imported(tmp_path, ([square(0, 0)], {"building": "yes", "height": "tall", "building:levels": "2"}))
+    assert found.buildings[0].height_m == 6
+    assert said(found, "height 'tall' is not a length")
+    high = [([square(100 * n, 0)], {"building": "yes", "height": "30"}) for n in range(4)]
+    assert said(imported(tmp_path, *high), "warning: the median stated height")  # type: ignore[arg-type]
+
+
+def raw(path: Path, *points: tuple[float, float]) -> Path:
+    geometry = {"type": "Polygon", "coordinates": [[list(p) for p in points]]}
+    path.write_text(json.dumps({"type": "Feature", "properties": BARN, "geometry": geometry}))
+    return path
+
+
+def test_swapped_far_and_antimeridian(tmp_path: Path) -> None:
+    swapped = [(lat, lon) for lon, lat in lonlat(square(0, 0))]
+    with pytest.raises(InputError, match="latitude and longitude are swapped"):
+        import_footprints([raw(tmp_path / "s.json", *swapped)], FRAME)
+    with pytest.raises(InputError, match=r"\d+ km from the site.*a map of another place"):
+        import_footprints([raw(tmp_path / "p.json", (2.0, 48.0), (2.1, 48.0), (2.1, 48.1))], FRAME)
+    with pytest.raises(InputError, match=r"antimeridian"):
+        import_footprints([raw(tmp_path / "d.json", (179.9, 35.0), (-179.9, 35.0), (179.9, 35.1))], FRAME)
+    with pytest.raises(InputError, match="metres or feet in place of degrees"):
+        import_footprints([raw(tmp_path / "f.json", (2020.5, 1971.5), (2050, 1971), (2050, 1990))], FRAME)
+
+
+def test_site_on_the_antimeridian_is_whole(tmp_path: Path) -> None:
+    frame = SiteFrame(-16.8, 180.0)
+    path = raw(tmp_path / "d.json", *[(p[0], p[1]) for p in lonlat(square(-10, -10), frame)])
+    found = import_footprints([path], frame)
+    assert found.buildings[0].footprint.area == pytest.approx(400, rel=1e-4)
+    assert said(found, "crosses the antimeridian")
+
+
+def test_osm_with_missing_nodes_is_reported(tmp_path: Path) -> None:
+    path = osm_xml(tmp_path / "a.osm")
+    path.write_text(path.read_text().replace('<node id="2" ', '<node id="999" '))
+    found = import_footprints([path], FRAME)
+    assert said(found, "1 of 5 nodes are not in the file")
+    assert any(b.name == "barn" and b.footprint.area == pytest.approx(200, rel=1e-3) for b in found.buildings)
+
+
+def test_single_trees_of_osm(tmp_path: Path) -> None:
+    longitude, latitude = lonlat(square(50, 60))[0]
+    path = tmp_path / "t.osm"
+    path.write_text(
+        f'<osm><node id="1" lat="{latitude!r}" lon="{longitude!r}"><tag k="natural" v="tree"/></node></osm>'
+    )
+    model, _ = import_site([path])
+    assert len(build_site(model).trees) == 1
+    [(east, north)] = import_footprints([path], FRAME).trees_m
+    assert math.hypot(east - 50, north - 60) < 0.01
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (b"", "empty"),
+        (b"version https://git-lfs.github.com/spec/v1\n", "Git-LFS"),
+        (b"\x89PNG\r\n", "not a map file"),
+        (b'{"type": "FeatureCollection", "features": [', "not JSON"),
+        (b'{"type": "FeatureCollection", "features": [3]}', "not as it should be"),
+        (b'{"a": 1}', "neither GeoJSON nor Overpass"),
+        (b"<osm><node", "not XML"),
+        (b"<gpx></gpx>", "XML of 'gpx'"),
+        (b'<!DOCTYPE x [<!ENTITY a "b">]><osm/>', "declares entities"),
+        (b'{"type":"Polygon","coordinates":[[["a",1],[2,3],[4,5]]]}', "is not longitude, latitude"),
+        (b'{"type":"Feature","crs":{"properties":{"name":"EPSG:3857"}}}', "expected WGS84"),
+    ],
+)
+def test_bad_files_are_one_message(tmp_path: Path, content: bytes, words: str) -> None:
+    path = tmp_path / "bad"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=words):
+        import_footprints([path], FRAME)
+
+
+def test_nothing_named() -> None:
+    with pytest.raises(UsageError, match="no map file named"):
+        import_site([])
+    with pytest.raises(InputError, match="cannot be read"):
+        import_footprints(["/nowhere/at/all.osm"], FRAME)

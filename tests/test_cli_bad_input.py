@@ -1,0 +1,114 @@
+"""Every bad input is one clear message and exit code 2 or 3, through the command line; never a traceback."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.__main__ import main
+
+GOOD_TELEMETRY = "".join(
+    f'{i},{-78.6963 + i * 1e-5:.7f},35.7274,{10 + i * 0.1:.3f},"(0.01,1.57,0.0)","(0.0,0.9,0.0)",48.2,'
+    f"2025-06-01 10:00:{i:02d}.000000,3,15\r\n"
+    for i in range(1, 40)
+)
+GOOD_POWER = "".join(
+    f"[2025-06-01 10:00:{i:02d}.500000] {4 * (i - 1):07o}      {-30 - i * 0.1:.6f}\n" for i in range(1, 39)
+)
+FLIGHT = """\
+flight: bad
+site: lake_wheeler
+timezone: America/New_York
+logs:
+  - {path: vehicleOut.txt, reader: vehicle_out}
+  - {path: power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}
+rt: {audit_links: 0}
+rss: {bootstrap: 0, lag: "off"}
+"""
+
+Run = Callable[..., tuple[int, str]]
+
+
+@pytest.fixture
+def run(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> Run:
+    """Write the files of a flight (changed as asked) and run ``report`` on it."""
+
+    def go(flight: str = FLIGHT, **files: bytes | str | None) -> tuple[int, str]:
+        contents: dict[str, bytes | str | None] = {"vehicleOut": GOOD_TELEMETRY, "power_log": GOOD_POWER, **files}
+        for name, content in contents.items():
+            if content is not None:
+                data = content.encode() if isinstance(content, str) else content
+                (tmp_path / f"{name}.txt").write_bytes(data)
+        (tmp_path / "flight.yaml").write_text(flight)
+        code = main(["report", str(tmp_path / "flight.yaml"), "-o", str(tmp_path / "out")])
+        captured = capsys.readouterr()
+        assert "Traceback" not in captured.err + captured.out
+        return code, captured.err
+
+    return go
+
+
+def test_the_unchanged_flight_passes(run: Run, tmp_path: Path) -> None:
+    code, err = run()
+    assert code == 0, err
+    assert (tmp_path / "out" / "report.html").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize(
+    ("name", "files", "code", "words"),
+    [
+        ("missing", {"power_log": None}, 3, "no such log"),
+        ("empty", {"power_log": b""}, 3, "empty"),
+        ("rubbish", {"power_log": bytes(range(256)) * 8}, 3, "power_log.txt"),
+        ("lfs", {"power_log": "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 5\n"}, 3, "Git-LFS"),
+        ("other_kind", {"power_log": GOOD_TELEMETRY}, 3, "vehicle_out"),
+        ("no_overlap", {"power_log": GOOD_POWER.replace("2025-06-01", "2025-06-03")}, 3, "no overlap"),
+        ("hours_off", {"power_log": GOOD_POWER.replace(" 10:", " 14:")}, 3, "-4 h"),
+        ("minus_999", {"vehicleOut": GOOD_TELEMETRY.replace("35.7274,", "-999,").replace("-78.69", "-999.69")}, 3, ""),
+    ],
+)
+def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], code: int, words: str) -> None:
+    found, err = run(**files)
+    assert found == code, err
+    assert words in err
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (("site: lake_wheeler", "sit: lake_wheeler"), "'site'"),
+        (("site: lake_wheeler", "site: lake_wheeler\nsite: lake_wheeler"), "stands twice"),
+        (("site: lake_wheeler", "site: lake_weeler"), "lake_wheeler"),
+        (("node: LW1", "node: LW9"), "LW9"),
+        (("timezone: America/New_York\n", ""), "timezone"),
+        (("America/New_York", "America/New_Pork"), "America/New_Pork"),
+        (("reader: sounder_log", "reader: sounder_lug"), "sounder_log"),
+        (("channel: USRP1", "chanel: USRP1"), "'channel'"),
+        (("audit_links: 0", "audit_links: many"), "audit_links"),
+        (("rt: {audit_links: 0}", "rt: {audit_links: 0, max_depth: 9}"), "max_depth"),
+    ],
+)
+def test_bad_flight_files(run: Run, change: tuple[str, str], words: str) -> None:
+    assert change[0] in FLIGHT
+    code, err = run(FLIGHT.replace(*change))
+    assert code == 2, err
+    assert words in err
+
+
+def test_nan_positions_are_left_out_not_fatal(run: Run) -> None:
+    lines = GOOD_TELEMETRY.splitlines(keepends=True)
+    lines[5] = lines[5].replace("35.7274", "nan")
+    lines[7] = lines[7].replace("35.7274", "-999").replace("-78.69", "-999.69")
+    code, err = run(vehicleOut="".join(lines))
+    assert code == 0, err
+
+
+@pytest.mark.parametrize("command", ["report", "ingest", "simulate"])
+def test_missing_file_named(command: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    code = main([command, str(tmp_path / "nothing.yaml")])
+    err = capsys.readouterr().err
+    assert code in (2, 3)
+    assert "nothing.yaml" in err
+    assert "Traceback" not in err

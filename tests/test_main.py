@@ -1,0 +1,196 @@
+"""The way into the program: light help, one message per failure, exit codes."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+import types
+from pathlib import Path
+
+import pytest
+
+import aerpaw_cmp
+from aerpaw_cmp import __main__ as program
+from aerpaw_cmp.commands import COMMANDS
+from aerpaw_cmp.errors import CheckError, InputError, UsageError
+
+ROOT = Path(__file__).resolve().parents[1]
+HEAVY = (
+    "sionna",
+    "mitsuba",
+    "drjit",
+    "matplotlib",
+    "pandas",
+    "numpy",
+    "scipy",
+    "h5py",
+    "typer",
+    "click",
+    "rich",
+    "pydantic",
+)
+
+
+def python(*arguments: str, **environ: str) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, *arguments],
+        cwd=ROOT,
+        env={**os.environ, **environ},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+
+
+@pytest.mark.parametrize(
+    "statement", ["import aerpaw_cmp", "main(['--help'])", "main(['--version'])", "main([])", "main(['x'])"]
+)
+def test_nothing_heavy_is_loaded(statement: str) -> None:
+    done = python(
+        "-c", f"from aerpaw_cmp.__main__ import main; import sys; {statement}; print(*sys.modules, file=sys.stderr)"
+    )
+    loaded = {name.partition(".")[0] for name in done.stderr.split()}
+    assert "aerpaw_cmp" in loaded
+    assert loaded.isdisjoint(HEAVY), loaded.intersection(HEAVY)
+
+
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_help_names_every_command(flag: str) -> None:
+    done = python("-m", "aerpaw_cmp", flag)
+    assert done.returncode == 0
+    assert done.stderr == ""
+    for name, line in COMMANDS.items():
+        assert f"  {name} " in done.stdout
+        assert line in done.stdout
+    assert max(map(len, done.stdout.splitlines())) <= 100
+
+
+def test_version() -> None:
+    assert python("-m", "aerpaw_cmp", "--version").stdout == f"aerpaw-cmp {aerpaw_cmp.__version__}\n"
+
+
+def test_no_arguments_is_help_and_wrong_usage() -> None:
+    done = python("-m", "aerpaw_cmp")
+    assert done.returncode == 2
+    assert done.stdout.startswith("Usage:")
+
+
+def test_unknown_command_names_the_nearest() -> None:
+    done = python("-m", "aerpaw_cmp", "reprot", "x.yaml")
+    assert done.returncode == 2
+    assert done.stdout == ""
+    assert done.stderr == "aerpaw-cmp: there is no command 'reprot'; did you mean 'report'?\n"
+
+
+@pytest.fixture
+def command_line(monkeypatch: pytest.MonkeyPatch):
+    """Put a function in the place of ``aerpaw_cmp.cli.main``."""
+
+    def put(function) -> None:
+        module = types.ModuleType("aerpaw_cmp.cli")
+        module.main = function  # type: ignore[attr-defined]
+        monkeypatch.setitem(sys.modules, "aerpaw_cmp.cli", module)
+        monkeypatch.setattr(aerpaw_cmp, "cli", module, raising=False)
+
+    monkeypatch.delenv("AERPAW_CMP_DEBUG", raising=False)
+    return put
+
+
+def raising(error: BaseException):
+    def main(arguments: list[str]) -> int:
+        raise error
+
+    return main
+
+
+@pytest.mark.parametrize(
+    ("error", "code", "said"),
+    [
+        (CheckError("RMSE 7 dB", expected="at most 5 dB"), 1, "aerpaw-cmp: RMSE 7 dB; expected at most 5 dB\n"),
+        (
+            UsageError("unknown key 'sight'", path="f.yaml", line=3),
+            2,
+            "aerpaw-cmp: f.yaml, line 3: unknown key 'sight'\n",
+        ),
+        (InputError("the file is empty", path="a.txt"), 3, "aerpaw-cmp: a.txt: the file is empty\n"),
+        (KeyboardInterrupt(), 130, "aerpaw-cmp: interrupted\n"),
+        (ModuleNotFoundError("x", name="distributed"), 1, "the Python package 'distributed' is not installed"),
+    ],
+)
+def test_one_message_and_the_exit_code(error: BaseException, code: int, said: str, command_line, capsys) -> None:
+    command_line(raising(error))
+    assert program.main(["report"]) == code
+    out, err = capsys.readouterr()
+    assert out == ""
+    assert said in err
+    assert err.count("\n") == 1
+
+
+def test_a_fault_of_ours_is_called_one(command_line, capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    command_line(raising(ZeroDivisionError("division by zero")))
+    assert program.main(["report"]) == 70
+    err = capsys.readouterr().err
+    assert "internal error, ZeroDivisionError: division by zero" in err
+    assert "Traceback" not in err
+    assert program.main(["report", "--debug"]) == 70
+    assert "Traceback" in capsys.readouterr().err
+    monkeypatch.setenv("AERPAW_CMP_DEBUG", "1")
+    assert program.main(["report"]) == 70
+    assert "Traceback" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "said"),
+    [
+        (["report"], 2, "aerpaw-cmp report: Missing argument 'flight'; 'aerpaw-cmp report --help' tells the options"),
+        (["report", "f.yaml", "--nope"], 2, "aerpaw-cmp report: No such option: --nope"),
+        (["report", "f.yaml", "--batch", "many"], 2, "aerpaw-cmp report: "),
+        (["report", "f.yaml", "--batch", "3"], 3, ""),
+        (["report", "f.yaml"], 0, ""),
+    ],
+)
+def test_wrong_options_are_one_line_whatever_copy_of_click_typer_uses(
+    arguments: list[str], code: int, said: str, command_line, capsys
+) -> None:
+    import typer
+
+    app = typer.Typer(add_completion=False)
+
+    @app.command("report")
+    def report(flight: str, batch: int = 0) -> None:
+        raise typer.Exit(batch)
+
+    @app.command("formats")
+    def formats() -> None: ...
+
+    command_line(lambda words: app(args=words, prog_name="aerpaw-cmp", standalone_mode=False) or 0)
+    assert program.main(arguments) == code
+    err = capsys.readouterr().err
+    assert err.startswith(said)
+    assert err.count("\n") == bool(said)
+
+
+def test_debug_is_taken_out_of_the_arguments_but_not_after_two_dashes(command_line) -> None:
+    seen: list[list[str]] = []
+    command_line(lambda arguments: seen.append(arguments) or 0)
+    assert program.main(["report", "--debug", "f.yaml"]) == 0
+    assert program.main(["report", "--", "--debug"]) == 0
+    assert seen == [["report", "f.yaml"], ["report", "--", "--debug"]]
+
+
+def test_a_reader_that_goes_away_is_no_fault() -> None:
+    """The pipe's far end is closed before the first line is written."""
+    code = (
+        "import sys, types, aerpaw_cmp; module = types.ModuleType('aerpaw_cmp.cli');"
+        "module.main = lambda arguments: print('line' * 100000) or 0;"
+        "sys.modules['aerpaw_cmp.cli'] = aerpaw_cmp.cli = module;"
+        "from aerpaw_cmp.__main__ import main; sys.exit(main(['formats']))"
+    )
+    read, write = os.pipe()
+    os.close(read)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, stdout=write, stderr=subprocess.PIPE, text=True, check=False
+    )
+    os.close(write)
+    assert (done.returncode, done.stderr) == (141, "")

@@ -1,0 +1,67 @@
+"""What the project says about itself is true: documents against code."""
+
+from __future__ import annotations
+
+import re
+import stat
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.commands import COMMANDS
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+ROOT = Path(__file__).resolve().parents[1]
+PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+DOCUMENTS = sorted([*ROOT.glob("*.md"), *ROOT.glob("docs/*.md")])
+
+
+def test_every_dependency_has_its_reason() -> None:
+    extras = PROJECT["optional-dependencies"].values()
+    needed = {re.split(r"[^\w.-]", line)[0].lower() for group in [PROJECT["dependencies"], *extras] for line in group}
+    rows = [line for line in (ROOT / "docs/dependencies.md").read_text().splitlines() if line.startswith("| ")]
+    named = {re.split(r"[^\w.-]", name)[0].lower() for row in rows for name in row.split("|")[1].strip().split(", ")}
+    assert needed <= named, needed - named
+    assert named - {"package", "---", "hatchling"} <= needed, "a reason for something that is not there"
+
+
+def test_the_readme_names_every_command() -> None:
+    text = (ROOT / "README.md").read_text()
+    rows = [line for line in text.splitlines() if line.startswith("| `")]
+    assert {re.match(r"\| `([\w-]+)", row)[1] for row in rows} == set(COMMANDS)
+
+
+@pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
+def test_links_between_documents_lead_somewhere(document: Path) -> None:
+    targets = re.findall(r"\]\(([^)#\s]+)", document.read_text())
+    missing = [target for target in targets if "://" not in target and not (document.parent / target).exists()]
+    assert missing == []
+
+
+@pytest.mark.parametrize("script", ["tools/setup_venv", ".ci/run"])
+def test_scripts_can_run(script: str) -> None:
+    path = ROOT / script
+    assert path.stat().st_mode & stat.S_IXUSR
+    assert subprocess.run(["bash", "-n", str(path)], check=False).returncode == 0
+
+
+def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
+    """A machine on which no Python is new enough: one message with one line, exit code 1."""
+    for tool in ("bash", "dirname", "id"):
+        (tmp_path / tool).symlink_to(Path("/usr/bin") / tool)
+    done = subprocess.run(
+        ["/usr/bin/bash", str(ROOT / "tools/setup_venv"), str(tmp_path / "venv")],
+        env={"PATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].strip() == "sudo apt-get update && sudo apt-get install -y python3 python3-venv"
+    assert not (tmp_path / "venv").exists()

@@ -1,0 +1,89 @@
+"""Simulate, ingest, report: what was planted must come back, through the command line and the real formats."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.comparison import compare_rss_series
+from aerpaw_cmp.config import load_flight
+from aerpaw_cmp.flight import gather, read_logs
+from aerpaw_cmp.replaying import estimate_clocks, replay_rss
+from aerpaw_cmp.report.data import RssPanel
+
+SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"
+OFFSETS = {"LW1": {"USRP1": 12.3, "USRP2": -8.7}, "LW2": {"USRP1": 38.6}}
+
+
+def flight(folder: Path, **plan: object) -> Path:
+    """The sample flight with two towers and what is planted changed."""
+    content = yaml.safe_load(SAMPLE.read_text())
+    content["flight"]["plan"] |= {"fading_db": 0.0, "bad_lines": 0, "clock_shift_s": {}, "offsets_db": OFFSETS, **plan}
+    content["logs"] = [
+        log for log in content["logs"] if "node" not in log or log.get("channel") in OFFSETS.get(log["node"], {})
+    ]
+    content["rt"] = {"engine": "image", "audit_links": 0}
+    content["rss"] = {"lag": "apply" if plan.get("clock_shift_s") else "off", "bootstrap": 400}
+    path = folder / "flight.yaml"
+    path.write_text(yaml.safe_dump(content))
+    return path
+
+
+def round_trip(folder: Path, **plan: object) -> dict[str, dict[str, RssPanel]]:
+    """Simulate through the command line, read the files back, compare; panels by tower and channel."""
+    path = flight(folder, **plan)
+    assert main(["simulate", str(path)]) == 0
+    settings = load_flight(path)
+    data = gather(settings, folder, read_logs(settings, folder))
+    clocks = estimate_clocks(data, print)
+    panels: dict[str, dict[str, RssPanel]] = {}
+    for series, replayed in zip(data.rss, replay_rss(data, print, clocks), strict=True):
+        panels.setdefault(series.tower, {})[series.channel] = compare_rss_series(data, series, replayed).panel
+    return panels
+
+
+def test_planted_offsets_come_back_to_a_tenth_without_noise(tmp_path: Path) -> None:
+    rss = round_trip(tmp_path)
+    for tower, channels in OFFSETS.items():
+        for channel, planted in channels.items():
+            found = rss[tower][channel]
+            assert abs(found.offset_db - planted) < 0.1 + 1e-9, (tower, channel, found.offset_db)
+            assert not found.at_search_edge
+
+
+def test_planted_offsets_lie_in_their_intervals_with_noise(tmp_path: Path) -> None:
+    inside = []
+    for seed in (1, 2, 3, 4):
+        folder = tmp_path / str(seed)
+        folder.mkdir()
+        rss = round_trip(folder, fading_db=3.0, seed=seed, rank_interval_s=5.0)
+        for tower, channels in OFFSETS.items():
+            for channel, planted in channels.items():
+                low, high = rss[tower][channel].offset_ci95_db
+                assert high - low < 3.0
+                inside.append(low <= planted <= high)
+    # 12 intervals of 95 %: fewer than 9 inside has a probability below 3e-4
+    assert np.sum(inside) >= 9
+
+
+def test_planted_clock_shift_is_found_and_applied(tmp_path: Path) -> None:
+    rss = round_trip(tmp_path, clock_shift_s={"LW1": 3.25, "LW2": -1.5})
+    for tower, shift in {"LW1": 3.25, "LW2": -1.5}.items():
+        clock = rss[tower]["USRP1"].extra["clock"]
+        assert clock["verdict"] == "ok"
+        assert clock["applied"] == "estimated and applied"
+        assert abs(clock["shift_s"] - shift) < 0.1
+        assert abs(rss[tower]["USRP1"].offset_db - OFFSETS[tower]["USRP1"]) < 0.2
+
+
+def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:
+    path = flight(tmp_path, bad_lines=5, fading_db=2.0)
+    assert main(["simulate", str(path)]) == 0
+    truth = json.loads((tmp_path / "truth.json").read_text())
+    settings = load_flight(path)
+    for log, file in zip(settings.logs, read_logs(settings, tmp_path), strict=True):
+        assert len(file.result.rejected) == 5 == len(truth["bad_lines"][log.path])

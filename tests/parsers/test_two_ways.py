@@ -42,6 +42,30 @@ def test_samples(reader: str, sample: str) -> None:
     assert_same(by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data))
 
 
+@pytest.mark.parametrize(
+    ("reader", "sample", "old", "new"),
+    [
+        ("vehicle_out", "ten_fields", b"35.7300002", b"35.73(00002"),
+        ("vehicle_out", "ten_fields", b"35.7300002", b'35.73"00002'),
+        ("vehicle_out", "ten_fields", b'-0.05)","(1.0', b'-0.05,"(1.0'),
+        ("vehicle_out", "ten_fields", b"35.7300002", b""),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35.73.0002"),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35 7300002"),
+        ("nemo_csv", "table", b",4.0,,,", b",NA,,,"),
+        ("nemo_csv", "table", b",4.0,,,", b",4.0,--1,,"),
+        ("nemo_csv", "table", b"1000.0", b""),
+        ("nemo_csv", "table", b",4.0,,,", b",4\r.0,,,"),
+        ("quectel_csv", "csi", b"24,4,12,5", b"24,4.,12,NA"),
+    ],
+)
+def test_what_is_wrong_is_rejected_by_both(reader: str, sample: str, old: bytes, new: bytes) -> None:
+    data = SAMPLES[reader][sample][0].replace(old, new, 1)
+    good = by_name(reader).read(SAMPLES[reader][sample][0], OPTIONS)
+    fast, slow = by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data)
+    assert fast.accepted == good.accepted - 1
+    assert_same(fast, slow)
+
+
 def test_the_fast_way_is_taken() -> None:
     from aerpaw_parsers import _lines, nemo_csv, quectel_csv
 

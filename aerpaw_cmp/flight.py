@@ -139,7 +139,7 @@ def gather(
     rss: list[RssSeries] = []
     rank: list[RankSeries] = []
     for log, file in zip(settings.logs, files, strict=True):
-        warnings += [f"{Path(file.path).name}: {text}" for text in file.result.warnings]
+        warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         for stream in file.result.streams:
             if stream.name in log.skip:
                 continue

@@ -148,10 +148,7 @@ def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any,
     from .report.data import ReportData
 
     settings = data.settings
-    site_note = "Buildings and forests of this site are illustrative: they were not surveyed."
     warnings = list(data.warnings)
-    if data.site.illustrative and (data.site.buildings or settings.rt.foliage != "none"):
-        warnings.append(site_note)
     warnings += [w for result in (*rss, *rank) for w in result.warnings]
     return ReportData(
         title=settings.report.title or settings.flight.title or settings.flight.name,

@@ -169,7 +169,7 @@ def test_two_taps_in_one_process(modem, tap, tmp_path):
     session = tap(sim.port)
     session.wait(lambda: len(sim.journal) > 5)
     with pytest.raises(InputError, match="the port is held"):
-        run_tap(TapSettings(tmp_path / "second", str(sim.port)))
+        run_tap(TapSettings(tmp_path / "second", str(sim.port), duration_s=3.0))
     session.end()
 
 

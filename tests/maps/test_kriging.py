@@ -336,6 +336,31 @@ def test_an_invalid_correlation_never_gives_a_negative_variance():
     assert min(plain) < 0, "the case is not hard"
 
 
+def test_a_curve_that_is_no_covariance_does_not_blow_up():
+    """Found on a real flight log: 1 up to 8 m and then a jump. Textbook weights exceed 1e4, most with a variance > 0."""
+
+    def shelf(d):
+        return np.where(d < 8.0, 1.0, 0.55 * np.exp(-d / 75))
+
+    rng = np.random.default_rng(0)
+    along = np.linspace(0, 600, 150)
+    points = np.column_stack([along, 30 * np.sin(along / 60)]) + rng.normal(0, 1, (150, 2))
+    targets = points[rng.integers(0, 150, 3000)] + rng.normal(0, 8, (3000, 2))
+    rule = OrdinaryKriging(shelf, 20, outside="nearest").fit(points, np.zeros(150)).weights(targets)
+    assert np.abs(rule.weight).max() < 2
+    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-9)
+    assert (rule.variance >= 0).all()
+
+
+def test_a_correlation_above_one_counts_as_one():
+    points = scattered(60, 38)
+    values = np.random.default_rng(39).normal(size=60)
+    high = OrdinaryKriging(lambda d: 2.2 * np.exp(-d / 55), 10, outside="nearest").fit(points, values)
+    one = OrdinaryKriging(lambda d: np.minimum(2.2 * np.exp(-d / 55), 1.0), 10, outside="nearest").fit(points, values)
+    np.testing.assert_array_equal(high.leave_one_out()[0], one.leave_one_out()[0])
+    assert np.abs(high.leave_one_out()[0]).max() < 2 * np.abs(values).max()
+
+
 def test_nugget_is_a_jump_unless_it_is_noise():
     points, values = scattered(40, 33, 200.0), np.random.default_rng(34).normal(size=40)
 

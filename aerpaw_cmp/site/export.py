@@ -49,7 +49,8 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db
         for name, mesh in meshes.items():
             write_ply(mesh, folder / "meshes" / f"{name}.ply")
             lines.append(
-                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}><string name="filename" value="meshes/{name}.ply"/>'
+                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}>'
+                f'<string name="filename" value="meshes/{name}.ply"/>'
                 f'<boolean name="face_normals" value="true"/><ref id={quoteattr(_bsdf_id(name))} name="bsdf"/></shape>'
             )
         path = folder / "scene.xml"

@@ -263,7 +263,7 @@ def run_site_show(
     if export:
         from .site.export import export_scene
 
-        written.append(export_scene(place, out / "scene"))
+        written += export_scene(place, out / "scene")
     return written
 
 

@@ -29,7 +29,7 @@ LEAFLESS_FACTOR = 1 / 1.2
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
-_PIECES_AT_ONCE = 400_000  # about 200 MB of temporary arrays
+_PAIRS_AT_ONCE = 1_500_000  # of a piece and a body; about 150 MB of temporary arrays
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
@@ -307,10 +307,11 @@ class CrownIndex:
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         done = np.cumsum(pieces)
+        at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
             used = done[begin - 1] if begin else 0
-            stop = max(begin + 1, int(np.searchsorted(done, used + _PIECES_AT_ONCE, side="right")))
+            stop = max(begin + 1, int(np.searchsorted(done, used + at_once, side="right")))
             some = live[begin:stop]
             total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop])
             begin = stop

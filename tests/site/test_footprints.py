@@ -2,6 +2,7 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
@@ -344,3 +345,14 @@ def test_nothing_named() -> None:
         import_site([])
     with pytest.raises(InputError, match="cannot be read"):
         import_footprints(["/nowhere/at/all.osm"], FRAME)
+
+
+@pytest.mark.field
+@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
+def test_geofence_of_the_field() -> None:
+    path = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "telemetry" / "AERPAW_Big_Geofence.kml"
+    site = load_site("lake_wheeler")
+    found = import_footprints([path], site.frame)
+    assert (len(found.geofences), len(found.buildings), found.actions) == (1, 0, [])
+    assert 1e4 < found.geofences[0].area.area < 5e6
+    assert found.geofences[0].area.distance(shapely.Point(0, 0)) < 500  # the flights start near LW1

@@ -135,6 +135,12 @@ def test_towers_in_the_wrong_place(tmp_path: Path, tower: str, words: str) -> No
         load_site(site_file(tmp_path, text))
 
 
+def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
+    hall = "buildings:\n- {name: hall, height_m: %g, polygon_m: [[-9, -9], [9, -9], [9, 9], [-9, 9]]}"
+    assert any("inside building 'hall'" in n for n in load_site(site_file(tmp_path, MINIMAL + hall % 12)).notes)
+    assert not load_site(site_file(tmp_path, MINIMAL + hall % 9)).notes  # on the roof
+
+
 def test_no_such_site(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no site 'lake_weeler'.*did you mean 'lake_wheeler'"):
         load_site("lake_weeler")

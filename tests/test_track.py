@@ -12,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.geodesy import SiteFrame
 from aerpaw_cmp.replay.arrays import rotation_from_aircraft
-from aerpaw_cmp.track import Track, body_rotation, clock_trap, estimate_lag
+from aerpaw_cmp.track import Track, body_rotation, clock_trap, combine_lags, direction_terms, estimate_lag
 
 FRAME = SiteFrame(35.7275, -78.6960)
 START = np.datetime64("2024-07-15T15:48:16", "ns")
@@ -362,6 +362,79 @@ def test_too_little_data_fails():
         estimate_lag(t, np.zeros(3), level)
     with pytest.raises(ValueError, match="predictor gave"):
         estimate_lag(t, level(t), lambda x: x[:5])
+
+
+def patterned_flight(seed, pattern_db=6.0):
+    """A flight with sharp turns and a UAV pattern that the prediction does not know: (level, terms) of true time."""
+    knots = np.arange(-50.0, 700.0, 25.0)
+    heading = np.random.default_rng(seed).uniform(0, 360, len(knots))
+
+    def route(x):
+        leg = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 1)
+        turned = np.clip((x - knots[leg]) / 2.0, 0, 1)  # two seconds for a turn
+        before = heading[np.maximum(leg - 1, 0)]
+        yaw = before + turned * ((heading[leg] - before + 180) % 360 - 180)
+        angle = x / 120.0
+        east, north = 150 * np.cos(angle) + 30, 150 * np.sin(2 * angle)
+        azimuth = np.degrees(np.arctan2(east, north))
+        distance = np.sqrt(east**2 + north**2 + 30**2)
+        return -20 * np.log10(distance), azimuth, np.degrees(np.arcsin(30 / distance)), azimuth + 180 - yaw
+
+    def level(x):
+        free_space, _, _, relative = route(x)
+        return free_space + pattern_db * np.cos(np.radians(relative - 40))
+
+    def predictor(x):
+        free_space, azimuth, elevation, relative = route(x)
+        return np.column_stack([free_space, direction_terms(azimuth, elevation, relative)])
+
+    return level, predictor, lambda x: route(x)[0]
+
+
+def test_unknown_patterns_are_fitted_while_the_lag_is_found():
+    level, predictor, free_space = patterned_flight(1)
+    t = np.arange(0, 600, 0.25)
+    measured = level(t + 1.7) - 30 + np.random.default_rng(2).normal(0, 3, len(t))
+    fit = estimate_lag(t, measured, predictor)
+    assert fit.verdict == "ok", fit.reason
+    assert abs(fit.lag_s - 1.7) < 0.1
+    assert fit.interval_s[0] <= 1.7 <= fit.interval_s[1]
+    assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
+    # without the terms, the pattern that turns with the UAV hides the lag
+    assert estimate_lag(t, measured, free_space).verdict != "ok"
+
+
+def test_channels_that_share_a_clock_add_their_evidence():
+    t = np.arange(0, 300, 0.25)
+    fits = []
+    for seed in (3, 4):
+        level, predictor, _ = patterned_flight(1, pattern_db=1.2)
+        measured = level(t - 2.2) + np.random.default_rng(seed).normal(0, 3, len(t))
+        fits.append(estimate_lag(t, measured, predictor))
+    both = combine_lags(fits)
+    assert abs(both.lag_s + 2.2) < 0.5
+    assert both.n == sum(fit.n for fit in fits)
+    assert np.ptp(both.interval_s) <= max(np.ptp(fit.interval_s) for fit in fits)
+    assert both.interval_s[0] <= -2.2 <= both.interval_s[1]
+    assert combine_lags(fits[:1]) is fits[0]
+    failed = estimate_lag(t[:5], t[:5], predictor)
+    assert combine_lags([failed, fits[0]]) is fits[0]
+    assert combine_lags([failed, failed]) is failed
+    with pytest.raises(ValueError, match="same window"):
+        combine_lags([fits[0], estimate_lag(t, t, predictor, window_s=5.0)])
+    with pytest.raises(ValueError, match="at least one"):
+        combine_lags([])
+
+
+def test_no_drift_where_none_shows():
+    level = two_ray_flight(900)
+    t = np.arange(0, 900, 0.25)
+    noise = np.random.default_rng(9).normal(0, 3, len(t))
+    fit = estimate_lag(t, level(t + 1.0) + noise, level)
+    low, high = fit.drift_interval_s_per_s
+    assert low <= 0 <= high
+    flat = estimate_lag(t, noise, lambda x: np.zeros(len(x)))
+    assert flat.drift_s_per_s == 0.0
 
 
 def test_predictor_gaps_and_missing_levels_do_not_matter():

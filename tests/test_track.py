@@ -467,30 +467,59 @@ def test_whole_hours_are_recognised():
     assert clock_trap(tuple(s - np.timedelta64(330, "m") for s in span), span).hours == 5.5
 
 
-@pytest.mark.field
-def test_track_of_a_real_flight():
+def real_flight(name):
+    """Track, epoch seconds and channels of a real flight, or skip."""
     folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
     if not folder:
         pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
     from scipy.io import loadmat
 
-    data = {
-        k: np.ravel(v)
-        for k, v in loadmat(Path(folder) / "dataset12" / "40m_fs10MHz.mat").items()
-        if k[0] == "m" or "power" in k
-    }
-    longitude, latitude = data["mX"].astype(float), data["mY"].astype(float)
-    if np.abs(longitude).mean() < np.abs(latitude).mean():
-        longitude, latitude = latitude, longitude
-    frame = telemetry(np.zeros(len(longitude)), 0, 0, 0)
-    epoch = data["timestamp_power"].astype(float)
+    found = loadmat(Path(folder) / "dataset12" / f"{name}.mat")
+    data = {k: np.ravel(v).astype(float) for k, v in found.items() if k[0] == "m" or k == "timestamp_power"}
+    epoch = data["timestamp_power"]
+    frame = telemetry(np.zeros(len(epoch)), 0, 0, 0)
     frame["time"] = pd.to_datetime(epoch, unit="s")
-    frame["latitude_deg"], frame["longitude_deg"], frame["altitude_m"] = latitude, longitude, data["mZ"].astype(float)
-    for name, key in (("roll_deg", "mRoll"), ("pitch_deg", "mPitch"), ("yaw_deg", "mYaw")):
-        frame[name] = data[key].astype(float)
-    track = Track(frame, FRAME)
+    # the authors' x and y are not the same axis in all their files: longitudes of Lake Wheeler are the negative ones
+    east, north = ("mX", "mY") if data["mX"].mean() < 0 else ("mY", "mX")
+    columns = {"longitude_deg": east, "latitude_deg": north, "altitude_m": "mZ"}
+    columns |= {"roll_deg": "mRoll", "pitch_deg": "mPitch", "yaw_deg": "mYaw"}
+    for ours, theirs in columns.items():
+        frame[ours] = data[theirs]
+    return Track(frame, SiteFrame(35.72750947, -78.69595819)), epoch, [data["mpower1"], data["mpower2"]]
+
+
+@pytest.mark.field
+@pytest.mark.parametrize(("name", "height"), [("40m_fs10MHz", 40), ("70m_fs20MHz", 70)])
+def test_track_of_a_real_flight(name, height):
+    track, epoch, _ = real_flight(name)
     poses = track.pose_at(epoch)
     assert poses.valid.mean() > 0.99
-    assert poses.position_m[:, 2].max() == pytest.approx(40, abs=3)
+    assert np.nanmax(poses.position_m[:, 2]) == pytest.approx(height, abs=3)
     speed = np.linalg.norm(poses.velocity_mps[:, :2], axis=1)
     assert 3 < np.nanmax(speed) < 25
+    assert poses.attitude_known.mean() > 0.99
+
+
+@pytest.mark.field
+@pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
+def test_real_clocks_agree_as_far_as_the_data_can_tell(name):
+    """Free space alone says nothing about the lag; with direction terms the interval shrinks to a few seconds."""
+    track, epoch, channels = real_flight(name)
+
+    def predictor(times):
+        poses = track.pose_at(times)
+        line = poses.position_m - np.array([0.0, 0.0, 10.0])
+        distance = np.linalg.norm(line, axis=1)
+        azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+        level = np.where(poses.position_m[:, 2] > 15, -20 * np.log10(distance), np.nan)
+        elevation = np.degrees(np.arcsin(line[:, 2] / distance))
+        return np.column_stack([level, direction_terms(azimuth, elevation, azimuth + 180 - poses.heading_deg)])
+
+    alone = estimate_lag(epoch, channels[0], lambda times: predictor(times)[:, 0], resolution_s=0.1)
+    assert alone.verdict == "ambiguous"
+    both = combine_lags([estimate_lag(epoch, level, predictor, resolution_s=0.1) for level in channels])
+    assert both.verdict != "failed"
+    assert abs(both.lag_s) < 1.5
+    assert both.interval_s[0] < 1.0
+    assert np.ptp(both.interval_s) < 0.6 * np.ptp(alone.interval_s)
+    assert both.rmse_db < 3.7

@@ -74,9 +74,7 @@ def ingest(
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
-    summary = run.run_ingest(
-        paths, out=out, reader=reader, timezone=timezone, time_origin=time_origin, ri_base=ri_base
-    )
+    summary = run.run_ingest(paths, out=out, reader=reader, timezone=timezone, time_origin=time_origin, ri_base=ri_base)
     if as_json:
         _print_json(summary)
         return
@@ -99,7 +97,18 @@ def ingest(
                 "\n".join(file["warnings"]) or "-",
             ]
         )
-    header = ["file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "span UTC", "warnings"]
+    header = [
+        "file",
+        "reader",
+        "streams (rows)",
+        "lines",
+        "accepted",
+        "rejected",
+        "blank",
+        "rate Hz",
+        "span UTC",
+        "warnings",
+    ]
     _table(header, rows)
     for skipped in summary.get("skipped", []):
         _say(f"skipped: {skipped}")
@@ -114,10 +123,17 @@ def formats(as_json: Json = False) -> None:
 
     readers = sorted(catalogue(), key=lambda r: r.name)
     if as_json:
-        _print_json({"readers": [{"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers]})
+        _print_json(
+            {
+                "readers": [
+                    {"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers
+                ]
+            }
+        )
         return
     _table(
-        ["reader", "what", "streams", "a line of it"], [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers]
+        ["reader", "what", "streams", "a line of it"],
+        [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers],
     )
 
 
@@ -173,7 +189,9 @@ def _print_report_summary(outcome: Any) -> None:
     rows = []
     for tower, m in outcome.metrics["rank"].items():
         for k, s in m["simulated"].items():
-            rows.append([tower, k, _number(s["agreement"], "{:.3f}"), _number(s["total_variation"], "{:.3f}"), str(m["n"])])
+            rows.append(
+                [tower, k, _number(s["agreement"], "{:.3f}"), _number(s["total_variation"], "{:.3f}"), str(m["n"])]
+            )
     if rows:
         _table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
     print(f"report: {outcome.folder / 'report.html'}")
@@ -197,7 +215,7 @@ def simulate(
 
 @app.command(help=COMMANDS["doctor"])
 def doctor(as_json: Json = False) -> int:
-    """Is this machine ready?"""
+    """Check this machine."""
     from . import doctor as doctor_room
 
     checks = doctor_room.checks()
@@ -210,10 +228,12 @@ def doctor(as_json: Json = False) -> int:
 
 @app.command(help=COMMANDS["tap"])
 def tap(
-    port: Annotated[Optional[str], typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,  # noqa: UP045
+    port: Annotated[str | None, typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the log segments.")] = Path("tap"),
     status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
-    enable_csi: Annotated[bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")] = False,
+    enable_csi: Annotated[
+        bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")
+    ] = False,
     ri_hz: Annotated[float, typer.Option(help="Rate of the rank indicator.")] = 2.0,
     other_hz: Annotated[float, typer.Option(help="Rate of each other query.")] = 1.0,
     no_csi_alarm: Annotated[Optional[float], typer.Option(help="Bell when no CSI came for so many seconds.")] = None,  # noqa: UP045
@@ -223,7 +243,7 @@ def tap(
     replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
     export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
     flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
-    telemetry: Annotated[Optional[Path], typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,  # noqa: UP045
+    telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     if export is not None:
@@ -267,7 +287,9 @@ def tap(
 
     summary = run_tap(settings, on_status=show, predict=predict)
     rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
-    _say(("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}")
+    _say(
+        ("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}"
+    )
     for segment in summary.segments:
         print(segment)
     return int(summary.exit_code)
@@ -283,7 +305,7 @@ def modem_sim(
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     from .live.simulator import ModemSimSettings, run_modem_sim
 
-    settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]
+    settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there
     return run_modem_sim(settings, on_ready=lambda port: print(port, flush=True))
 
 
@@ -293,15 +315,95 @@ def _faults(pairs: list[str]) -> Any:
 
     from .live.simulator import Faults
 
-    known = {f.name: f.default for f in dataclasses.fields(Faults)}
+    known: dict[str, Any] = {f.name: f.default for f in dataclasses.fields(Faults)}
     values: dict[str, Any] = {}
     for pair in pairs:
         name, _, text = pair.partition("=")
         if name not in known:
             raise UsageError(f"--fault {pair!r}", expected="NAME=VALUE with one of " + ", ".join(known))
-        kind = type(known[name])
+        kind: Any = type(known[name])
         try:
             values[name] = text.lower() in ("", "1", "true", "yes") if kind is bool else kind(text)
         except ValueError as error:
             raise UsageError(f"--fault {pair!r}", expected=f"a value of type {kind.__name__}") from error
     return Faults(**values)
+
+
+@app.command(help=COMMANDS["bench"])
+def bench(
+    poses: Annotated[int, typer.Option(min=2, help="Poses of the flight that is replayed.")] = 200,
+    quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
+    as_json: Json = False,
+) -> None:
+    """Speed against error on this machine."""
+    from . import run
+
+    if quick:
+        result = run.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=_say)
+    else:
+        result = run.run_bench(poses=poses, progress=_say)
+    if as_json:
+        _print_json(result)
+        return
+    rows = []
+    for r in result["replay"]["rows"]:
+        what = "" if r["thinning"] == 1 else f", every {r['thinning']}th pose"
+        rows.append(
+            [
+                f"{r['engine']}{what}",
+                "-" if r["samples"] is None else f"{r['samples']:.0e}",
+                r["arrays"],
+                str(r["depth"]),
+                f"{r['seconds']:.3g}",
+                f"{r['links_per_s']:.3g}",
+                f"{r['peak_mib']:.0f}",
+                "-" if r["missing_paths"] is None else f"{r['missing_paths']} / {r['extra_paths']}",
+                f"{_number(r['rss_max_error_db'], '{:.2g}')} / {_number(r['rss_rms_error_db'], '{:.2g}')}",
+                ", ".join(f"{k}: {share:.3f}" for k, share in r["rank_disagreement"].items()),
+            ]
+        )
+    header = [
+        "engine",
+        "samples",
+        "arrays",
+        "depth",
+        "s",
+        "links/s",
+        "peak MiB",
+        "missing / extra",
+        "RSS error dB max / rms",
+    ]
+    _table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
+    for name, ratio in result["ratios"].items():
+        print(f"{name}: {ratio:.3g} times")
+
+
+@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML) to a site.yaml.")
+def site_import(
+    files: Annotated[list[Path], typer.Argument(help="Map files.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
+    base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
+    untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
+) -> None:
+    """Import footprints."""
+    from . import run
+
+    for line in run.run_site_import(files, out, base=base, untagged=untagged):
+        _say(line)
+    print(out)
+
+
+@site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
+def site_show(
+    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
+    flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
+    logs_root: LogsRoot = None,
+    pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
+    export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+) -> None:
+    """Look at a site."""
+    from . import run
+
+    for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
+        print(path)

@@ -37,8 +37,8 @@ def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[st
     place, link = data.site.towers[tower], replayed.link
     source, target = place.position_m[None, :], replayed.poses.position_m
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
-    ground = {"ground_material": data.site.ground_material, "ground_m": place.ground_m}
-    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray_dbm(*ends, **ground)[:, 0]}
+    two_ray = two_ray_dbm(*ends, ground_material=data.site.ground_material, ground_m=place.ground_m)
+    return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
 
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> Compared:
@@ -159,10 +159,18 @@ def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, Flo
 
 
 def _worst(
-    series: RssSeries, result: rss.RssComparison, position: FloatArray, geometry: dict[str, FloatArray], direct: FloatArray
+    series: RssSeries,
+    result: rss.RssComparison,
+    position: FloatArray,
+    geometry: dict[str, FloatArray],
+    direct: FloatArray,
 ) -> tuple[Any, ...]:
     """The spans of largest error, with place and likely cause."""
-    context: dict[str, Any] = {"los": direct, "elevation_deg": geometry["elevation_deg"], "height_m": geometry["altitude_m"]}
+    context: dict[str, Any] = {
+        "los": direct,
+        "elevation_deg": geometry["elevation_deg"],
+        "height_m": geometry["altitude_m"],
+    }
     for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
         if ours in geometry:
             context[theirs] = geometry[ours]
@@ -202,7 +210,7 @@ def _rss_warnings(series: RssSeries, result: rss.RssComparison, clock: Clock | N
         low, high = clock.shift_ci95_s
         if low > 0 or high < 0:
             out.append(
-                f"{name}: the radio clock shows {clock.shift_s:+.2f} s ({low:+.2f} .. {high:+.2f}) against the telemetry; "
+                f"{name}: the radio clock shows {clock.shift_s:+.2f} s ({low:+.2f} .. {high:+.2f}) too much; "
                 "not applied (rss.lag: apply would)."
             )
     if result.n == 0:
@@ -253,7 +261,9 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         singular_ratio_db=ratio_db,
         sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
         stale=~result.staleness.fresh,
-        extra={k: v for k, v in result.as_dict().items() if k not in ("measured", "simulated", "best_k", "best_k_ci95")},
+        extra={
+            k: v for k, v in result.as_dict().items() if k not in ("measured", "simulated", "best_k", "best_k_ci95")
+        },
     )
     return Compared(panel, _rank_warnings(series, result, len(series.rank) - len(rows)))
 
@@ -283,7 +293,7 @@ def _at_k(k: float, fit: ranks.RankFit, sigma: FloatArray) -> Any:
 def _rank_warnings(series: RankSeries, result: ranks.RankComparison, left_out: int) -> tuple[str, ...]:
     out = []
     if left_out:
-        out.append(f"Rank {series.tower}: {left_out} of {len(series.rank)} samples are below the minimum height or have no pose.")
+        out.append(f"Rank {series.tower}: {left_out} of {len(series.rank)} samples are too low or have no pose.")
     if result.n == 0:
         out.append(f"Rank {series.tower}: the modem reported no rank at any compared pose.")
     if result.staleness.verdict == "held":

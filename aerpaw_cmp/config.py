@@ -1,4 +1,4 @@
-"""flight.yaml and campaign.yaml -> checked settings.
+"""flight.yaml -> checked settings.
 
 Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
 are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.
@@ -115,18 +115,19 @@ class ArraySettings(Settings):
 
 def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``."""
-    if settings.model == "iso":
-        return Isotropic()
     from .site import antennas
 
     if settings.model == "dipole":
-        return antennas.half_wave_dipole()
+        return antennas.HalfWaveDipole()
     if settings.model == "tr38901":
-        return antennas.tr38901()
-    path = folder / str(settings.file)
+        return antennas.TR38901()
     if settings.model == "file":
-        return antennas.measured_pattern(path)
-    return antennas.gain_grid(path, settings.variable)
+        return antennas.read_pattern_text(folder / str(settings.file))
+    if settings.model == "gain_grid":
+        if settings.variable is None:
+            raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
+        return antennas.read_gain_grid(folder / str(settings.file), settings.variable)
+    return Isotropic()
 
 
 class LinkSettings(Settings):
@@ -382,7 +383,9 @@ class FlightFile(Settings):
             try:
                 ZoneInfo(value)
             except (KeyError, ValueError, OSError) as error:
-                raise ValueError(f"unknown time zone {value!r}; expected an IANA name such as America/New_York") from error
+                raise ValueError(
+                    f"unknown time zone {value!r}; expected an IANA name such as America/New_York"
+                ) from error
         return value
 
 

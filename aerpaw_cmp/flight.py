@@ -55,6 +55,7 @@ class FlightData:
 
     settings: FlightFile
     folder: Path
+    """Where logs and antenna files resolve: ``--logs-root``, else the folder of the flight file."""
     site: Site
     files: tuple[IngestedFile, ...]
     track: Track | None
@@ -94,7 +95,10 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
         if not path.exists():
             root = logs_root or folder
             raise InputError(
-                "there is no such log", expected=f"the file below {root}", cause="a wrong path, or --logs-root", path=path
+                "there is no such log",
+                expected=f"the file below {root}",
+                cause="a wrong path, or --logs-root",
+                path=path,
             )
         reader = None if log.reader is None else by_name(log.reader)
         if reader is not None:
@@ -125,7 +129,9 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
     )
 
 
-def gather(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) -> FlightData:
+def gather(
+    settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
+) -> FlightData:
     """Sort the streams into track, RSS and rank, and check that they belong together."""
     site = choose_site(settings.site, folder)
     warnings: list[str] = []
@@ -133,7 +139,7 @@ def gather(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) ->
     rss: list[RssSeries] = []
     rank: list[RankSeries] = []
     for log, file in zip(settings.logs, files, strict=True):
-        warnings += [f"{Path(file.path).name}: {text}" for text in file.result.warnings]
+        warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         for stream in file.result.streams:
             if stream.name in log.skip:
                 continue
@@ -146,11 +152,18 @@ def gather(settings: FlightFile, folder: Path, files: Sequence[IngestedFile]) ->
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (
-        Track(telemetry[0][1].frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m)
+        Track(
+            telemetry[0][1].frame,
+            site.frame,
+            maximum_gap_s=settings.rt.maximum_gap_s,
+            ground_m=site.datum.takeoff_ground_m,
+        )
         if telemetry
         else None
     )
-    data = FlightData(settings, folder, site, tuple(files), track, tuple(rss), tuple(rank), tuple(warnings))
+    data = FlightData(
+        settings, logs_root or folder, site, tuple(files), track, tuple(rss), tuple(rank), tuple(warnings)
+    )
     _check_overlap(data)
     return data
 
@@ -217,8 +230,9 @@ def _check_overlap(data: FlightData) -> None:
         start, end = np.datetime64(data.track.start_ns, "ns"), np.datetime64(data.track.end_ns, "ns")
         if len(time) == 0 or time.min() > end or time.max() < start:
             shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
+            flown = f"{pd.Timestamp(start)} .. {pd.Timestamp(end)}"
             raise InputError(
-                f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {pd.Timestamp(start)} .. {pd.Timestamp(end)} (UTC)",
+                f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
                 expected="logs of the same flight",
                 cause=_clock_cause(data, time, start, end),
             )
@@ -236,7 +250,7 @@ def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.da
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
     """Positions (n, 3) [m] and which of them are known."""
     if series.position_m is not None:
-        return series.position_m, np.isfinite(series.position_m).all(axis=1)
+        return series.position_m, np.asarray(np.isfinite(series.position_m).all(axis=1))
     assert track is not None
     pose = track.pose_at(series.time)
     return pose.position_m, pose.valid

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -40,7 +41,9 @@ class Stages:
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
 
 
-def run_ingest(paths: list[Path], *, out: Path | None = None, reader: str | None = None, **options: Any) -> dict[str, Any]:
+def run_ingest(
+    paths: list[Path], *, out: Path | None = None, reader: str | None = None, **options: Any
+) -> dict[str, Any]:
     """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3."""
     from .ingest import ingest, summary
     from .readers import ReadOptions
@@ -95,7 +98,7 @@ def run_report(
     with stages("read"):
         settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
-        data = gather(settings, flight.parent, files)
+        data = gather(settings, flight.parent, files, logs_root)
     from .comparison import audit_replays, compare_rank_series, compare_rss_series
     from .replaying import estimate_clocks, replay_rank, replay_rss
 
@@ -105,9 +108,12 @@ def run_report(
         rss_replays = replay_rss(data, progress, clocks)
         rank_replays = replay_rank(data, progress)
     with stages("compare"):
-        rss = [compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)]
+        rss = [
+            compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)
+        ]
         rank = [
-            compare_rank_series(data, series, replayed) for series, replayed in zip(data.rank, rank_replays, strict=True)
+            compare_rank_series(data, series, replayed)
+            for series, replayed in zip(data.rank, rank_replays, strict=True)
         ]
     with stages("audit"):
         engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
@@ -142,10 +148,7 @@ def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any,
     from .report.data import ReportData
 
     settings = data.settings
-    site_note = "Buildings and forests of this site are illustrative: they were not surveyed."
     warnings = list(data.warnings)
-    if data.site.illustrative and (data.site.buildings or settings.rt.foliage != "none"):
-        warnings.append(site_note)
     warnings += [w for result in (*rss, *rank) for w in result.warnings]
     return ReportData(
         title=settings.report.title or settings.flight.title or settings.flight.name,
@@ -180,3 +183,154 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
     return tuple(failed)
+
+
+def run_bench(
+    *,
+    poses: int = 200,
+    samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
+    ratios: bool = True,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
+    from .peers import ingest_vs_pandas, kriging_vs_pykrige
+    from .replay.arrays import Link, tower_comparison_array, uav_comparison_array
+    from .replay.bench import path_search, random_scene, speed_against_error
+    from .units import wavelength_m
+
+    site, link, some = random_scene(poses)
+    names = list(link.tower_arrays)
+    mimo = Link(
+        carrier_hz=link.carrier_hz,
+        tower_arrays={name: tower_comparison_array() for name in names},
+        uav_array=uav_comparison_array(wavelength_m(link.carrier_hz)),
+        transmit_power_dbm=link.transmit_power_dbm,
+        uav_transmits=False,
+    )
+    rows = speed_against_error(site, mimo, some, samples=samples, progress=progress)
+    found: dict[str, Any] = {}
+    if ratios:
+        progress("path search against PathSolver at 1e6 samples")
+        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
+        progress("Kriging against PyKrige")
+        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
+        progress("ingest against pandas")
+        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    return {
+        "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
+        "replay": {"rows": [row.as_dict() for row in rows]},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "details": found,
+    }
+
+
+def run_site_import(
+    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None
+) -> list[str]:
+    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
+    from .site.footprints import import_site, write_site_yaml
+
+    model, actions = import_site(files, base=base, untagged=untagged)
+    write_site_yaml(model, out, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+    return actions
+
+
+def run_site_show(
+    site: str,
+    out: Path,
+    *,
+    flight: Path | None = None,
+    logs_root: Path | None = None,
+    pose: int | None = None,
+    export: bool = False,
+) -> list[Path]:
+    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths."""
+    from .report.site_view import write_site_view
+    from .site.siteyaml import load_site
+
+    place, track, paths = load_site(site), None, ()
+    if flight is not None:
+        from .comparison import track_of
+        from .config import load_flight
+        from .flight import gather, read_logs
+
+        settings = load_flight(flight)
+        data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+        track = track_of(data)
+        if pose is not None:
+            paths = _paths_of_pose(data, place, track, pose)
+    written = write_site_view(place, out, track=track, paths=paths)
+    if export:
+        from .site.export import export_scene
+
+        written += export_scene(place, out / "scene")
+    return written
+
+
+def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
+    """Propagation paths of all towers to one point of the track, as polylines."""
+    import numpy as np
+
+    from .replay.arrays import Poses
+    from .replay.replay import replay
+    from .report.site_view import PathLine
+
+    if track is None or not 0 <= pose < len(track.time):
+        raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
+    point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
+    link = data.settings.link.rss.build(list(site.towers), data.folder)
+    found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=data.settings.rt.max_depth).paths
+    towers = list(site.towers)
+    lines = []
+    for index in range(len(found)):
+        corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
+        source = site.towers[towers[found.tower[index]]].position_m
+        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections"
+        lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
+    return tuple(lines)
+
+
+def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int | None]:
+    """The rank that the image engine predicts at the present pose, for ``aerpaw-cmp tap --flight``.
+
+    ``telemetry`` is the growing log; without it, the first telemetry log of the flight file. The middle K counts.
+    """
+    import numpy as np
+
+    from .compare.rank import channel_rank
+    from .config import load_flight
+    from .flight import choose_site
+    from .live.follow import TelemetryFollower
+    from .readers import by_name
+    from .replay.arrays import Poses, rotation_from_aircraft
+    from .replay.replay import replay
+
+    settings = load_flight(flight)
+    site = choose_site(settings.site, flight.parent)
+    link = settings.link.rank.build([settings.rank.tower], flight.parent)
+    log = next((entry for entry in settings.logs if entry.reader in (None, "vehicle_out")), settings.logs[0])
+    follower = TelemetryFollower(
+        telemetry or flight.parent / log.path,
+        options=log.options(settings.timezone),
+        reader=by_name(log.reader or "vehicle_out"),
+    )
+    k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
+
+    def predict(utc_ns: int) -> int | None:
+        follower.poll()
+        sample = follower.at(utc_ns)
+        if sample is None or not np.isfinite(sample.latitude_deg):
+            return None
+        east, north = site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
+        up = max(sample.altitude_m + site.datum.takeoff_ground_m, 0.5)
+        rotation = np.eye(3)
+        if settings.rt.attitude != "ignored" and np.isfinite(sample.yaw_deg):
+            level = settings.rt.attitude == "level"
+            roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
+            rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
+        pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
+        result = replay(site, link, pose, engine="image", max_depth=settings.rt.max_depth)
+        rank = int(channel_rank(result.h[0, 0], k))
+        return rank or None
+
+    return predict

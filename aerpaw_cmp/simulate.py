@@ -97,14 +97,16 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
     return np.zeros(len(time_s)), -0.6 * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
 
 
-def telemetry_frame(trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame) -> pd.DataFrame:
+def telemetry_frame(
+    trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
+) -> pd.DataFrame:
     """Telemetry records of the trajectory; altitude counts from the first position."""
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
     position = trajectory.position_at(time_s)
     velocity = trajectory.velocity_at(time_s)
     roll, pitch, yaw = plan_attitude(trajectory, time_s)
     latitude, longitude = frame.to_geographic(position[:, 0], position[:, 1])
-    return pd.DataFrame(
+    records: pd.DataFrame = pd.DataFrame(
         {
             "time": times_after(start_utc, time_s),
             "latitude_deg": latitude,
@@ -120,11 +122,15 @@ def telemetry_frame(trajectory: Trajectory, start_utc: pd.Timestamp, interval_s:
             "satellites": 18,
         }
     )
+    return records
 
 
 def times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
     """UTC times, naive, rounded to the microsecond that the log formats hold."""
-    return pd.Series(start_utc + pd.to_timedelta(np.round(np.asarray(seconds) * 1e6).astype(np.int64), unit="us"))
+    stamps: pd.Series = pd.Series(
+        start_utc + pd.to_timedelta(np.round(np.asarray(seconds) * 1e6).astype(np.int64), unit="us")
+    )
+    return stamps
 
 
 def correlated_noise(
@@ -232,7 +238,9 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
         links = self.settings.link
         link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
-        result = replay(self.site, link, self._poses(time_s), engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth)
+        result = replay(
+            self.site, link, self._poses(time_s), engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth
+        )
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
         level = result.rss_dbm[:, 0] - offset
         level = level + correlated_noise(
@@ -298,7 +306,9 @@ class FlightSimulator:
         if count == 0 or len(lines) < 20:
             return data, []
         end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
-        places = sorted(self.generator.choice(np.arange(10, len(lines)), size=count, replace=False).tolist(), reverse=True)
+        places = sorted(
+            self.generator.choice(np.arange(10, len(lines)), size=count, replace=False).tolist(), reverse=True
+        )
         damage = []
         for number, place in enumerate(places):
             torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]

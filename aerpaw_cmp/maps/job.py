@@ -10,9 +10,10 @@ the result alone (RSS 8 bytes, rank 1 byte per tower, position and K).
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -292,45 +293,105 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
     """Maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
-    found = []
+    found = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
     for tower in (None, *(result.tower_names if towers_too else ())):
-        who, of = tower or "joint", f", {tower}" if tower else ", nearest tower"
-        for antennas in ("siso", "mimo"):
-            for row, height in enumerate(result.rss_altitudes_m):
-                values = result.rss("siso" if antennas == "siso" else "mimo", tower)[row]
-                found.append(
-                    Layer(
-                        f"rss_{antennas}_h{height:03.0f}m_{who}",
-                        values,
-                        "dBm",
-                        f"RSS {antennas.upper()}, {height:g} m{of}",
-                    )
-                )
-        for row, height in enumerate(result.rank_altitudes_m):
-            for column, k in enumerate(result.ks):
-                found.append(
-                    Layer(
-                        f"rank_k{k:g}_h{height:03.0f}m_{who}".replace("+", ""),
-                        result.ranks(tower)[row, column],
-                        "1",
-                        f"Rank, K = {k:g}, {height:g} m{of}",
-                        class_names(HIGHEST_RANK),
-                    )
-                )
-            for name, title, values in (
-                ("spread", "Singular-value spread s1/s2", result.spread_db),
-                ("condition", "Condition number s1/s4", result.condition_db),
-            ):
-                found.append(
-                    Layer(
-                        f"{name}_h{height:03.0f}m_{who}",
-                        result._of(values, tower)[row],
-                        "dB",
-                        f"{title}, {height:g} m{of}",
-                    )
-                )
-    serving = Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)
-    return [serving, *found]
+        found += _rss_layers(result, tower)
+        found += _rank_layers(result, tower)
+    return found
+
+
+def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
+    who, of = _label(tower)
+    found = []
+    kinds: tuple[Antennas, ...] = ("siso", "mimo")
+    for antennas in kinds:
+        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
+            name = f"rss_{antennas}_h{_in_name(height)}m_{who}"
+            found.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
+    return found
+
+
+def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
+    who, of = _label(tower)
+    ratios = (
+        ("spread", "Singular-value spread s1/s2", result._of(result.spread_db, tower)),
+        ("condition", "Condition number s1/s4", result._of(result.condition_db, tower)),
+    )
+    ranks, found = result.ranks(tower), []
+    for row, height in enumerate(result.rank_altitudes_m):
+        at = f"h{_in_name(height)}m_{who}"
+        for column, k in enumerate(result.ks):
+            title = f"Rank, K = {k:g}, {height:g} m{of}"
+            found.append(
+                Layer(f"rank_k{_in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
+            )
+        for name, title, values in ratios:
+            found.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
+    return found
+
+
+def _label(tower: str | None) -> tuple[str, str]:
+    """How a layer's name and title speak of a tower."""
+    return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
+
+
+def _in_name(number: float, digits: int = 3) -> str:
+    """030 for 30, 12p5 for 12.5."""
+    return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
+
+
+def summary_of(result: MapResult, study: Study | None = None, honest: HonestStudy | None = None) -> dict[str, Any]:
+    """Numbers of the maps for ``metrics.json`` and ``--json``; NaN becomes null in :mod:`~aerpaw_cmp.maps.export`."""
+    rows, columns = result.grid.shape
+    content: dict[str, Any] = {
+        "grid": {"positions": len(result.grid), "rows": rows, "columns": columns, "spacing_m": result.grid.spacing_m},
+        "towers": {
+            name: {"served": int((result.serving == i).sum()), "position_m": result.towers_m[i]}
+            for i, name in enumerate(result.tower_names)
+        },
+        "rss": {tower or "joint": _rss_summary(result, tower) for tower in (None, *result.tower_names)},
+        "rank": {tower or "joint": _rank_summary(result, tower) for tower in (None, *result.tower_names)},
+    }
+    if study is not None:
+        content["correlation"] = {**asdict(study.correlation)}
+        content["fit"] = asdict(study.fit)
+        content["leave_one_out"] = {
+            name: {"mae": s.mae, "rmse": s.rmse, "n": s.n, "unpredicted": s.unpredicted}
+            for name, s in study.scores.items()
+        }
+        content["intervals"] = asdict(study.intervals)
+        content["intervals_paper"] = asdict(study.intervals_paper)
+    if honest is not None:
+        content["honest"] = asdict(honest)
+    return content
+
+
+def _rss_summary(result: MapResult, tower: str | None) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    kinds: tuple[Antennas, ...] = ("siso", "mimo")
+    for antennas in kinds:
+        found[antennas] = []
+        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
+            covered = values[np.isfinite(values)]
+            low, middle, high = np.percentile(covered, [10, 50, 90]) if covered.size else [np.nan] * 3
+            row = {"altitude_m": height, "coverage": covered.size / max(values.size, 1)}
+            row |= {
+                "out_of_coverage": values.size - covered.size,
+                "p10_dbm": low,
+                "median_dbm": middle,
+                "p90_dbm": high,
+            }
+            found[antennas].append(row)
+    return found
+
+
+def _rank_summary(result: MapResult, tower: str | None) -> list[dict[str, Any]]:
+    shares = result.rank_shares(tower)
+    return [
+        {"altitude_m": height, "k": k, "shares": dict(zip(class_names(HIGHEST_RANK), shares[row, column], strict=True))}
+        for row, height in enumerate(result.rank_altitudes_m)
+        for column, k in enumerate(result.ks)
+    ]
 
 
 # --- correlation and interpolation of the maps ---------------------------------------------------------------------
@@ -497,6 +558,8 @@ def honest_study(
     seed: int = 0,
 ) -> HonestStudy:
     """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
+
+    What is held out is the values; the correlation curve is the one given, of the whole map.
 
     Parameters
     ----------

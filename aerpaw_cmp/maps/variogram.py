@@ -30,6 +30,8 @@ from ..units import BoolArray, FloatArray, IntArray
 BLOCK = 256
 """Positions per block of the pair products; bounds the memory to BLOCK x positions."""
 
+TINY = 1e-300
+
 PAPER_WIDTH_M = 30.0
 PAPER_MAXIMUM_M = 500.0
 
@@ -426,6 +428,7 @@ def fit_biexponential(
     *,
     weights: ArrayLike | None = None,
     amplitude_bounds: tuple[float, float] = (0.0, np.inf),
+    greatest_at_zero: float = 1.0,
     rate_bounds_per_m: tuple[float, float] | None = None,
     starts: int = 6,
 ) -> BiExponential:
@@ -443,6 +446,9 @@ def fit_biexponential(
         Such as the number of pairs of each bin; the paper's fit has none. ``rmse`` is weighted likewise.
     amplitude_bounds : (low, high)
         Of c1 and c3. Amplitudes of at least 0 keep the curve a valid covariance in any dimension.
+    greatest_at_zero : float
+        Bound of c1 + c3. A correlation is at most 1; without the bound, data that begin beyond distance 0 let the
+        fast exponential shoot up between 0 and the first point. Infinite for a free fit.
     rate_bounds_per_m : (slowest, fastest), optional
         Of -c2 and -c4 [1/m], positive. By default from 1e-6 over the largest distance (flat over the data) to 10 over
         the smallest positive one (gone at the first bin).
@@ -464,7 +470,7 @@ def fit_biexponential(
     ----------
     .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
     """
-    problem = _Projection.of(distance_m, correlation, weights, amplitude_bounds, rate_bounds_per_m)
+    problem = _Projection.of(distance_m, correlation, weights, (*amplitude_bounds, greatest_at_zero), rate_bounds_per_m)
     if len(problem.d) < 4:
         single = problem.single()
         return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
@@ -481,6 +487,7 @@ class _Projection:
     root_weight: FloatArray
     low: float
     high: float
+    total: float
     log_rates: tuple[float, float]
 
     @classmethod
@@ -489,7 +496,7 @@ class _Projection:
         distance_m: ArrayLike,
         correlation: ArrayLike,
         weights: ArrayLike | None,
-        amplitude_bounds: tuple[float, float],
+        bounds: tuple[float, float, float],
         rate_bounds_per_m: tuple[float, float] | None,
     ) -> _Projection:
         d = np.asarray(distance_m, dtype=np.float64).ravel()
@@ -502,16 +509,16 @@ class _Projection:
         if len(d) < 2 or not d.max() > 0:
             raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
         slow, fast = rate_bounds_per_m or (1e-6 / d.max(), 10.0 / d[d > 0].min())
-        low, high = amplitude_bounds
-        if not (0 < slow < fast and low < high):
-            raise UsageError(f"bounds {amplitude_bounds} and {rate_bounds_per_m}", expected="low < high, rates > 0")
-        return cls(d, y, np.sqrt(w / w.mean()), low, high, (float(np.log(slow)), float(np.log(fast))))
+        low, high, total = bounds
+        if not (0 < slow < fast and low < high and total > max(2 * low, low)):
+            raise UsageError(f"bounds {bounds} and {rate_bounds_per_m}", expected="bounds that leave room, rates > 0")
+        return cls(d, y, np.sqrt(w / w.mean()), low, high, total, (float(np.log(slow)), float(np.log(fast))))
 
     def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""
         basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None]) * self.root_weight[:, None]
         target = self.y * self.root_weight
-        candidates = _candidate_amplitudes(basis, target, self.low, self.high)
+        candidates = _candidate_amplitudes(basis, target, self.low, self.high, self.total)
         residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - target
         pick = np.argmin((residual**2).sum(axis=-1), axis=-1)[..., None, None]
         chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
@@ -550,8 +557,8 @@ class _Projection:
 
     def _single_amplitude(self, log_rate: float) -> float:
         basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
-        amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, 1e-300))
-        return min(max(amplitude, self.low), self.high)
+        amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, TINY))
+        return min(max(amplitude, self.low), self.high, self.total)
 
     def _single_cost(self, log_rate: float) -> float:
         curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
@@ -589,25 +596,37 @@ class _Projection:
         return BiExponential(c1, c2, c3, c4, rmse, bool(reasons), "; ".join(reasons))
 
 
-def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float) -> FloatArray:
-    """Solutions (..., candidates, 2) of the bounded two-column problem: inside, on each edge, at each corner."""
+def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float, total: float) -> FloatArray:
+    """Best points (..., candidates, 2) of a two-column least-squares problem inside its bounds and on each edge.
+
+    The bounds are ``low <= c <= high`` for both and ``c1 + c3 <= total``; the least cost among the candidates is the
+    bounded optimum, because a convex cost has it inside or on an edge.
+    """
     gram = np.swapaxes(basis, -1, -2) @ basis
     right = (np.swapaxes(basis, -1, -2) @ target[:, None])[..., 0]
     a, b, c = gram[..., 0, 0], gram[..., 0, 1], gram[..., 1, 1]
-    tiny = 1e-300
+    p, q = right[..., 0], right[..., 1]
+    edges = []
+    for edge in {low, min(high, total - low)}:
+        if np.isfinite(edge):
+            top = min(high, total - edge)
+            edges.append((np.full_like(p, edge), _clipped(q - b * edge, c, low, top)))
+            edges.append((_clipped(p - b * edge, a, low, top), np.full_like(p, edge)))
+    if total <= 2 * high and np.isfinite(total):
+        # c3 = total - c1
+        first = _clipped(p - q + (c - b) * total, a - 2 * b + c, max(low, total - high), min(high, total - low))
+        edges.append((first, total - first))
     determinant = a * c - b * b
-    regular = determinant > 1e-14 * a * c + tiny
+    regular = determinant > 1e-14 * a * c + TINY
     safe = np.where(regular, determinant, 1.0)
-    first = np.where(regular, (c * right[..., 0] - b * right[..., 1]) / safe, low if np.isfinite(low) else 0.0)
-    second = np.where(regular, (a * right[..., 1] - b * right[..., 0]) / safe, low if np.isfinite(low) else 0.0)
-    inside = (first >= low) & (first <= high) & (second >= low) & (second <= high)
-    edges = [edge for edge in (low, high) if np.isfinite(edge)] or [0.0]
-    held = []
-    for edge in edges:
-        # one amplitude on the edge, the other free within the bounds
-        other = np.clip((right[..., 1] - b * edge) / np.maximum(c, tiny), low, high)
-        held.append(np.stack([np.full_like(other, edge), other], axis=-1))
-        other = np.clip((right[..., 0] - b * edge) / np.maximum(a, tiny), low, high)
-        held.append(np.stack([other, np.full_like(other, edge)], axis=-1))
-    free = np.where(inside[..., None], np.stack([first, second], axis=-1), held[0])
-    return np.stack([free, *held], axis=-2)
+    first, second = (c * p - b * q) / safe, (a * q - b * p) / safe
+    inside = regular & (np.minimum(first, second) >= low) & (np.maximum(first, second) <= high)
+    inside &= first + second <= total
+    fallback = edges[0] if edges else (np.zeros_like(p), _clipped(q, c, low, high))
+    free = (np.where(inside, first, fallback[0]), np.where(inside, second, fallback[1]))
+    return np.stack([np.stack(pair, axis=-1) for pair in (free, fallback, *edges)], axis=-2)
+
+
+def _clipped(right: FloatArray, square: FloatArray, low: float, high: float) -> FloatArray:
+    """Minimum over [low, high] of square * x^2 - 2 * right * x."""
+    return np.asarray(np.clip(right / np.maximum(square, TINY), low, high))

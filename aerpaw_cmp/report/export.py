@@ -328,6 +328,19 @@ def write_atomic(path: Path, content: str | bytes) -> Path:
     return path
 
 
+_OWN_FIGURES = re.compile(
+    r"(trajectory|altitude|speed_against_error"
+    r"|(rss|rss_check|rss_residual|rss_angles|pair|rank_(map|histogram|time|confusion|k))_[A-Za-z0-9._-]+)\.(svg|png)"
+)
+
+
+def remove_stale(folder: Path, kept: set[str]) -> None:
+    """Remove figures of an earlier report that this one no longer has; other files are left alone."""
+    for path in folder.glob("*"):
+        if path.name not in kept and _OWN_FIGURES.fullmatch(path.name):
+            path.unlink()
+
+
 def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     """Write the whole report.
 
@@ -362,6 +375,7 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
         drawn.append(picture)
         written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
         written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    remove_stale(folder / "figures", {path.name for path in written})
     files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
     page = write_atomic(folder / "report.html", html.page(data, drawn, files))
     return [page, *written]

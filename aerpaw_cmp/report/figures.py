@@ -674,7 +674,7 @@ def seen_from_tower(panel: RssPanel) -> Figure:
         rasterized=True, label="not scored",
     )  # fmt: skip
     points = ax.scatter(
-        azimuth[good], elevation[good], c=residual[good], s=6, cmap="PuOr", vmin=-reach, vmax=reach, linewidths=0,
+        azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
         rasterized=True, label="sample (colour: residual)",
     )  # fmt: skip
     ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
@@ -794,32 +794,53 @@ def at_label(at: RankAtK) -> str:
 
 
 def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
-    """Measured rank and the rank of every K over time, one row each, and the singular values under them."""
+    """Measured rank and the rank of every K over time, one row each; SINR and singular values under them."""
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
     rows = 1 + len(panel.simulated)
-    values = panel.singular_ratio_db
-    fig = figure((9.2, 1.15 * rows + (2.4 if values is not None else 0.4)))
-    ratios = [1.0] * rows + ([2.2] if values is not None else [])
+    below = [1.3] * (panel.sinr_db is not None) + [2.2] * (panel.singular_ratio_db is not None)
+    ratios = [1.0] * rows + below
+    fig = figure((9.2, 1.1 * sum(ratios) + 0.5))
     axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
-    series = [("measured", panel.measured)]
-    series += [(f"K = {k_key(at.k)}", np.where(at.rank == 0, np.nan, at.rank)) for at in panel.simulated]
-    for number, (ax, (label, rank)) in enumerate(zip(axes, series, strict=False)):
+    draw_measured_rank(axes[0], seconds, panel)
+    for ax, at in zip(axes[1:], panel.simulated, strict=False):
+        rank = np.where(at.rank == 0, np.nan, at.rank)
         ax.plot(
-            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, label=label,
-            color="#0072B2" if number == 0 else SIMULATED,
+            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, color=SIMULATED,
+            label=f"K = {k_key(at.k)}",
         )  # fmt: skip
-        if number:
-            draw_out_of_coverage(ax, seconds, panel.simulated[number - 1].rank == 0, "Z: no path")
+        draw_out_of_coverage(ax, seconds, at.rank == 0, "Z: no path")
+    for number, ax in enumerate(axes[:rows]):
         draw_waypoints(ax, data, start, names=number == 0)
         ax.set_yticks(RANKS)
         ax.set_ylim(0.5, 4.5)
         ax.set_ylabel("Rank")
         ax.legend(*first_labels(ax, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
-    if values is not None:
-        draw_singular_values(axes[-1], seconds, values, panel)
+    if panel.sinr_db is not None:
+        axes[rows].plot(
+            seconds, panel.sinr_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
+            label="SINR",
+        )  # fmt: skip
+        axes[rows].set_ylabel("SINR [dB]")
+        axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+    if panel.singular_ratio_db is not None:
+        draw_singular_values(axes[-1], seconds, panel.singular_ratio_db, panel)
     axes[-1].set_xlabel(time_label(start))
     return fig
+
+
+def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
+    """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
+    held = np.zeros(len(seconds), dtype=bool) if panel.stale is None else panel.stale
+    for mask, label, colour, size in (
+        (~held, "measured", "#0072B2", 7),
+        (held, "measured, held over", "#9A9A9A", 4),
+    ):
+        if mask.any():
+            ax.plot(
+                seconds[mask], panel.measured[mask], linestyle="none", marker="|", markersize=size, color=colour,
+                rasterized=True, label=label,
+            )  # fmt: skip
 
 
 def first_labels(ax: Axes, count: int) -> tuple[list[Any], list[str]]:

@@ -165,7 +165,7 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
     if layers[0].difference:
         reach = max(abs(low), abs(high), 1e-9)
-        options = {"cmap": "PuOr", "vmin": -reach, "vmax": reach}
+        options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
     image = None
     for ax, one in zip(axes, layers, strict=True):
         image = draw_map(ax, data, one.values, **options)

@@ -14,6 +14,7 @@ from shapely.geometry import Polygon
 
 from ..geodesy import SiteFrame
 from ..units import FloatArray
+from .dem import Dem
 from .heights import VerticalDatum
 
 
@@ -138,6 +139,8 @@ class Site:
         For the report.
     datum : VerticalDatum
         What up = 0 is in other height references, and how high the take-off point lies.
+    dem : Dem or None
+        Ground heights; blocks lines of sight.
     """
 
     name: str
@@ -152,3 +155,4 @@ class Site:
     illustrative: bool = False
     notes: tuple[str, ...] = ()
     datum: VerticalDatum = field(default_factory=VerticalDatum)
+    dem: Dem | None = None

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from dataclasses import replace
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
+import numpy as np
 import shapely
 from pydantic import Field, model_validator
 from shapely.geometry import Point, Polygon
@@ -18,6 +20,7 @@ from shapely.geometry import Point, Polygon
 from ..errors import UsageError
 from ..geodesy import SiteFrame
 from ..yamlfile import StrictModel, load_yaml, nearest
+from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
 from .site import Building, Forest, Geofence, Site, Tower, Trees
@@ -26,6 +29,12 @@ from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, w
 PACKAGED = ("lake_wheeler",)
 """Sites that come with the package, by name."""
 
+FAR_TOWER_M = 10_000.0
+"""A tower farther from the origin and from the area is refused."""
+
+FAR_POLYGON_M = 100_000.0
+"""An outline that reaches farther from the origin is refused."""
+
 MAST_CLEARANCE_M = 8.0
 """No tree is placed at random closer to a tower: masts stand clear."""
 
@@ -33,6 +42,7 @@ Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Positive = Annotated[float, Field(gt=0)]
 NotNegative = Annotated[float, Field(ge=0)]
+Ground = Literal["flat", "offsets", "dem"]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
 
@@ -115,6 +125,8 @@ class PolygonModel(StrictModel):
             rings = [self.polygon_deg or [], *self.holes_deg]
             local = [_ring_from_degrees(ring, frame, self.name) for ring in rings]
             shape = Polygon(local[0], local[1:])
+        if len(set(shape.exterior.coords)) < 3:
+            raise UsageError(f"the polygon of '{self.name}' has fewer than 3 distinct points")
         if not shape.is_valid or shape.area < 1e-3:
             raise UsageError(
                 f"the polygon of '{self.name}' is not a simple outline ({shapely.is_valid_reason(shape)})",
@@ -173,6 +185,14 @@ class TreesModel(StrictModel):
         )
 
 
+class DemModel(StrictModel):
+    """An elevation model; relative paths start at the folder of site.yaml."""
+
+    path: str
+    crs: str | None = None
+    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
+
+
 class SiteModel(StrictModel):
     """The whole of site.yaml."""
 
@@ -180,7 +200,8 @@ class SiteModel(StrictModel):
     origin: OriginModel
     towers: Annotated[dict[str, TowerModel], Field(min_length=1)]
     coordinates: str | None = None
-    tower_ground: Literal["flat", "offsets"] = "flat"
+    tower_ground: Ground | None = None
+    dem: DemModel | None = None
     ground_material: str = "medium_dry_ground"
     area_m: tuple[float, float, float, float] | None = None
     buildings: list[BuildingModel] = Field(default_factory=list)
@@ -195,7 +216,7 @@ def load_site(
     name_or_path: str | Path,
     *,
     coordinates: str | None = None,
-    tower_ground: Literal["flat", "offsets"] | None = None,
+    tower_ground: Ground | None = None,
 ) -> Site:
     """A site by the name of a packaged one, or from a site.yaml.
 
@@ -205,9 +226,10 @@ def load_site(
         ``"lake_wheeler"`` or a file.
     coordinates : str, optional
         Which published positions to use where a tower has several; overrides the file.
-    tower_ground : {"flat", "offsets"}, optional
-        ``flat`` puts the ground of every tower at up = 0 (the paper), ``offsets`` at its own height; overrides
-        the file.
+    tower_ground : {"flat", "offsets", "dem"}, optional
+        ``flat`` puts the ground everywhere at up = 0 (the paper), ``offsets`` that of each tower at its stated
+        height, ``dem`` takes towers, buildings and trees from the elevation model. Overrides the file, where it is
+        ``dem`` when there is one, else ``flat``.
 
     Returns
     -------
@@ -222,7 +244,7 @@ def load_site(
     changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
     model = model.model_copy(update={key: value for key, value in changes.items() if value is not None})
     try:
-        return build_site(model)
+        return build_site(model, Path(path).parent)
     except UsageError as error:
         if error.path is not None:
             raise
@@ -250,15 +272,17 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
         return name, load_yaml(file, SiteModel)
 
 
-def build_site(model: SiteModel) -> Site:
-    """The site of a checked model; places the trees."""
+def build_site(model: SiteModel, folder: Path | None = None) -> Site:
+    """The site of a checked model; places the trees. ``folder`` is where relative paths start."""
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    ground = model.origin.ground.height() if model.origin.ground else None
-    datum = VerticalDatum(ground, model.origin.takeoff_ground_m)
+    dem = _dem(model, frame, folder or Path())
+    datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     material(model.ground_material)
     notes = list(model.notes)
-    towers = {name: _tower(name, tower, model, frame, datum, notes) for name, tower in model.towers.items()}
-    buildings = tuple(_building(item, frame) for item in model.buildings)
+    towers = {name: _tower(name, tower, model, frame, datum, dem, notes) for name, tower in model.towers.items()}
+    area = _area(model.area_m, towers)
+    _check_towers(towers, model.area_m)
+    buildings = tuple(_building(item, frame, dem) for item in model.buildings)
     forests = tuple(
         Forest(item.name, item.polygon(frame), item.trees_per_hectare, item.minimum_spacing_m, item.source)
         for item in model.forests
@@ -269,22 +293,76 @@ def build_site(model: SiteModel) -> Site:
         towers=towers,
         buildings=buildings,
         forests=forests,
-        trees=_trees(model.trees, forests, buildings, towers, frame, notes),
+        trees=_on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem),
         geofences=tuple(Geofence(item.name, item.polygon(frame)) for item in model.geofences),
         ground_material=model.ground_material,
-        area_m=_area(model.area_m, towers),
+        area_m=area,
         illustrative=model.illustrative,
         notes=tuple(notes),
         datum=datum,
+        dem=dem,
     )
 
 
+def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
+    if model.tower_ground == "dem" and model.dem is None:
+        raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
+    if model.dem is None or model.tower_ground not in (None, "dem"):
+        return None
+    return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
+
+
+def _origin_ground(model: SiteModel, dem: Dem | None) -> Height | None:
+    if model.origin.ground is not None:
+        return model.origin.ground.height()
+    if dem is not None and model.dem is not None:
+        return Height(float(dem.absolute_m(0.0, 0.0)), model.dem.reference)
+    return None
+
+
+def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
+    if dem is None or not len(trees):
+        return trees
+    return replace(trees, ground_m=np.nan_to_num(dem.ground_m(trees.east_m, trees.north_m)))
+
+
+def _check_towers(towers: Mapping[str, Tower], area: Area | None) -> None:
+    """A tower kilometres off is a slip of the pen, not a site."""
+    for tower in towers.values():
+        away = math.hypot(tower.east_m, tower.north_m)
+        if area is not None:
+            east, north = _outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])
+            away = min(away, math.hypot(east, north))
+        if away > FAR_TOWER_M:
+            raise UsageError(
+                f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
+                f"from its site",
+                expected=f"at most {FAR_TOWER_M / 1000:g} km",
+                cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
+            )
+
+
+def _outside(value: float, low: float, high: float) -> float:
+    return max(low - value, value - high, 0.0)
+
+
 def _tower(
-    name: str, model: TowerModel, site: SiteModel, frame: SiteFrame, datum: VerticalDatum, notes: list[str]
+    name: str,
+    model: TowerModel,
+    site: SiteModel,
+    frame: SiteFrame,
+    datum: VerticalDatum,
+    dem: Dem | None,
+    notes: list[str],
 ) -> Tower:
     chosen = _chosen_position(name, model, site.coordinates, frame, notes)
     what = f"tower '{name}'"
+    east, north = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
     ground = 0.0
+    if dem is not None:
+        ground = float(dem.ground_m(east, north))
+        if math.isnan(ground):
+            raise UsageError(f"{what} is not on the elevation model", cause="the grid is too small for the site")
     if site.tower_ground == "offsets":
         ground = model.ground_offset_m or 0.0
         if model.ground is not None:
@@ -296,7 +374,6 @@ def _tower(
         raise UsageError(
             f"{what}: the antenna lies {-height:g} m below the ground", cause="a height of another reference"
         )
-    east, north = frame.to_local(chosen.latitude_deg, chosen.longitude_deg)
     return Tower(
         name, chosen.latitude_deg, chosen.longitude_deg, float(east), float(north), height, ground, chosen.source
     )
@@ -320,9 +397,13 @@ def _chosen_position(
     return chosen
 
 
-def _building(model: BuildingModel, frame: SiteFrame) -> Building:
+def _building(model: BuildingModel, frame: SiteFrame, dem: Dem | None) -> Building:
     material(model.material)
-    return Building(model.name, model.polygon(frame), model.height_m, model.base_m, model.material, model.source)
+    footprint = model.polygon(frame)
+    base = model.base_m
+    if dem is not None:  # a floor is level: the ground under the middle
+        base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
+    return Building(model.name, footprint, model.height_m, base, model.material, model.source)
 
 
 def _trees(
@@ -373,7 +454,18 @@ def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: 
                 expected="latitude, longitude in degrees",
                 cause="the two are swapped" if abs(latitude) <= 180 and abs(longitude) <= 90 else None,
             )
-    east, north = frame.to_local([point[0] for point in ring], [point[1] for point in ring])
+    latitude, longitude = np.array(ring).T
+    east, north = frame.to_local(latitude, longitude)
+    away = float(np.hypot(east, north).max())
+    if away > FAR_POLYGON_M:
+        wraps = len(ring) > 1 and float(np.abs(np.diff(longitude)).max()) > 180
+        swapped = frame.to_local(longitude, latitude) if np.abs(longitude).max() <= 90 else (math.inf, math.inf)
+        cause = "a digit is wrong, or it belongs to another site"
+        if wraps:
+            cause = "it crosses the antimeridian (180 deg)"
+        elif float(np.hypot(*swapped).max()) < FAR_POLYGON_M:
+            cause = "latitude and longitude are swapped"
+        raise UsageError(f"'{name}' reaches {away / 1000:.0f} km from the site's origin", cause=cause)
     return list(zip(east.tolist(), north.tolist(), strict=True))
 
 

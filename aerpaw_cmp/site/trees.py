@@ -21,8 +21,8 @@ from ..errors import UsageError
 from ..units import BoolArray, FloatArray
 from .site import Forest, Trees
 
-SATURATION = 0.5472
-"""Covered share at which randomly thrown discs of one size fill a plane (random sequential addition)."""
+MAXIMUM_TREES = 2_000_000
+"""Of one forest."""
 
 _STALLED_ROUNDS = 12  # batches of darts in a row that add less than a thousandth: the forest is full
 
@@ -54,7 +54,7 @@ class Distribution:
 
     def draw(self, count: int, random: np.random.Generator) -> FloatArray:
         """``count`` values; rejected draws are repeated, so the limits do not pile up."""
-        values = np.full(count, self.mean)
+        values = np.full(count, float(self.mean))
         wrong = np.ones(count, dtype=bool) if self.deviation > 0 else np.zeros(count, dtype=bool)
         for _ in range(100):
             if not wrong.any():
@@ -165,6 +165,10 @@ def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.rando
     placed = np.zeros((0, 2))
     if wanted <= 0 or area.is_empty:
         return placed
+    if wanted > MAXIMUM_TREES:
+        raise UsageError(
+            f"a forest of {area.area / 1e6:.0f} km2 asks for {wanted} trees", expected=f"at most {MAXIMUM_TREES}"
+        )
     shapely.prepare(area)
     east_min, north_min, east_max, north_max = area.bounds
     low, span = np.array([east_min, north_min]), np.array([east_max - east_min, north_max - north_min])

@@ -178,6 +178,7 @@ def make_rank(site: Site, track: Track) -> RankPanel:
         histogram=Histogram(share=h, low=(h - 0.04).clip(0), high=h + 0.04), simulated=tuple(at),
         best_k=float(ks[agreement.argmax()]), best_k_ci95=(13.0, 21.0),
         curve=KCurve(k=ks, agreement=agreement, total_variation=variation), singular_ratio_db=ratio,
+        sinr_db=18 + slow, stale=np.arange(len(d)) % 50 > 45,
     )  # fmt: skip
 
 

@@ -1,12 +1,40 @@
 from __future__ import annotations
 
+import dataclasses
 import json
+import subprocess
+import sys
 
-from aerpaw_cmp.report.export import write_report
+from aerpaw_cmp.report import export
 
 
 def test_whole_report(small_report, tmp_path):
-    files = write_report(small_report, tmp_path)
+    figures = tmp_path / "figures"
+    figures.mkdir()
+    (figures / "rss_LW9_gone.svg").write_text("of an earlier report")
+    (figures / "notes.txt").write_text("mine")
+    (figures / "rss.svg.bak").write_text("mine")
+    files = export.write_report(small_report, tmp_path)
     assert files[0] == tmp_path / "report.html"
     assert all(f.stat().st_size > 0 for f in files)
     assert json.loads((tmp_path / "metrics.json").read_text())["rss"]["LW4"]["USRP1"]["n"] == small_report.rss[0].n
+    assert {p.name for p in tmp_path.iterdir()} == {"report.html", "metrics.json", "rss.csv", "rank.csv", "figures"}
+    assert {p.name for p in figures.iterdir()} - {f.name for f in files} == {"notes.txt", "rss.svg.bak"}
+    assert max(f.stat().st_size for f in files if f.suffix == ".svg") < 500_000
+
+
+def test_no_rss_leaves_no_rss_of_an_earlier_report(small_report, tmp_path):
+    (tmp_path / "rss.csv").write_text("old")
+    bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), speed=(), track=None, waypoints=())
+    export.write_report(bare, tmp_path)
+    assert (tmp_path / "rss.csv").read_text() == ",".join(export.RSS_COLUMNS) + "\n"
+
+
+def test_importing_the_room_draws_nothing():
+    code = (
+        "import sys, aerpaw_cmp.report.export, aerpaw_cmp.report.figures, aerpaw_cmp.report.html,"
+        " aerpaw_cmp.report.maps_html, aerpaw_cmp.report.site_view;"
+        "print([m for m in ('matplotlib', 'pandas', 'jinja2', 'sionna') if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "[]"

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from shapely.geometry import box
 
 from aerpaw_cmp.errors import InputError, UsageError
@@ -213,6 +214,24 @@ def test_duplicates_slivers_and_overlaps(tmp_path: Path) -> None:
     assert by_area == [(200, 7.5), (400, 7.5), (400, 20.0), (600, 7.5)]
     shapes = [b.footprint for b in found.buildings]
     assert all(a.intersection(b).area < 0.01 for i, a in enumerate(shapes) for b in shapes[:i])
+
+
+def test_rounding_for_the_file_breaks_no_outline(tmp_path: Path) -> None:
+    # rounding vertices one by one once made notched, cut-away outlines cross themselves
+    random = np.random.default_rng(1)
+    features: list[tuple[list[Ring], dict[str, object]]] = []
+    for _ in range(250):
+        turn, corner, size = random.uniform(0, np.pi), random.uniform(-150, 150, 2), random.uniform(8, 30, 2)
+        box_ = np.array([(0, 0), (1, 0), (1, 1), (0.5, 1), (0.5, 0.6), (0, 0.6)]) * size
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        ring = [(float(x), float(y)) for x, y in corner + box_ @ rotation.T]
+        features.append(([ring], {"building": "yes", "height": f"{random.uniform(4, 12):.1f}"}))
+    model, _ = import_site([geojson(tmp_path / "v.json", *features)])
+    write_site_yaml(model, tmp_path / "site.yaml")
+    site = load_site(tmp_path / "site.yaml")
+    assert len(site.buildings) > 200
+    drawn = shapely.union_all([shapely.Polygon(rings[0]) for rings, _ in features]).area
+    assert sum(b.footprint.area for b in site.buildings) == pytest.approx(drawn, rel=0.01)
 
 
 def test_overlapping_forests_do_not_double_the_trees(tmp_path: Path) -> None:

@@ -85,7 +85,8 @@ function solids() {
     parts.push([foot[2], () => {
       polyline([foot, crown], "#6B4A2B", 1);
       pen.beginPath(); pen.moveTo(top[0], top[1]); pen.lineTo(crown[0] - half, crown[1]);
-      pen.ellipse(crown[0], crown[1], Math.max(half, .1), Math.max(flat, .1), 0, Math.PI, 0, true); pen.closePath();
+      pen.lineTo(crown[0] + half, crown[1]); pen.closePath();
+      pen.moveTo(crown[0] + half, crown[1]); pen.ellipse(crown[0], crown[1], Math.max(half, .1), Math.max(flat, .1), 0, 0, 7);
       pen.fillStyle = "rgba(84,130,70,.85)"; pen.fill(); pen.strokeStyle = "#3F6136"; pen.lineWidth = 0.4; pen.stroke();
     }]);
   }

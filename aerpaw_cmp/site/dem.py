@@ -1,0 +1,244 @@
+"""Digital elevation model: ground heights, and which links the ground blocks.
+
+Reflections use a flat plane per tower: facets smaller than a Fresnel zone are no mirrors. The DEM only lifts what
+stands on it and cuts lines of sight.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import InputError, UsageError
+from ..geodesy import SiteFrame
+from ..units import BoolArray, FloatArray
+
+EARTH_RADIUS_M = 6_371_000.0
+MAX_BYTES = 512 * 1024 * 1024
+_SAMPLES_AT_ONCE = 1_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Dem:
+    """Heights on a regular grid, asked for in the site frame.
+
+    Parameters
+    ----------
+    height_m : (rows, columns)
+        Heights at cell centres, first row southernmost, NaN where unknown.
+    west, south : float
+        Centre of the first cell, in the units of ``crs``.
+    step_x, step_y : float
+        Cell size in the units of ``crs``, both positive.
+    crs : str
+        Any that pyproj knows, such as ``EPSG:4326`` (degrees), or ``local`` for metres of the site frame.
+    frame : SiteFrame
+        Of the site.
+    """
+
+    height_m: FloatArray
+    west: float
+    south: float
+    step_x: float
+    step_y: float
+    crs: str
+    frame: SiteFrame
+    _to_grid: Any = field(init=False, repr=False, compare=False, default=None)
+
+    def __post_init__(self) -> None:
+        if self.crs.lower() != "local":
+            from pyproj import Transformer
+            from pyproj.exceptions import CRSError
+
+            try:
+                transformer = Transformer.from_crs("EPSG:4326", self.crs, always_xy=True)
+            except CRSError:
+                raise UsageError(f"unknown crs '{self.crs}'", expected="such as EPSG:4326 or EPSG:26917") from None
+            object.__setattr__(self, "_to_grid", transformer)
+            end = self.west + self.step_x * self.height_m.shape[1], self.south + self.step_y * self.height_m.shape[0]
+            if transformer.target_crs.is_geographic and (max(abs(self.west), abs(end[0])) > 361 or abs(end[1]) > 91):
+                raise InputError(
+                    f"the grid runs to {end[0]:g}, {end[1]:g} degrees",
+                    expected=f"coordinates of {self.crs}",
+                    cause="they are metres or feet: another crs",
+                )
+        if np.isnan(self.absolute_m(0.0, 0.0)):
+            raise InputError(
+                "the elevation model has no height at the site's origin",
+                expected="a grid that covers the site",
+                cause="another place, another crs, or latitude and longitude swapped",
+            )
+
+    def absolute_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
+        """Height of the ground in the grid's own reference [m]; bilinear, NaN outside."""
+        x, y = np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64)
+        if self._to_grid is not None:
+            latitude, longitude = self.frame.to_geographic(x, y)
+            x, y = (np.asarray(value) for value in self._to_grid.transform(longitude, latitude))
+        rows, columns = self.height_m.shape
+        column, row = (x - self.west) / self.step_x, (y - self.south) / self.step_y
+        inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
+        column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
+        i = np.minimum(row.astype(np.int64), max(rows - 2, 0))
+        j = np.minimum(column.astype(np.int64), max(columns - 2, 0))
+        u, v = row - i, column - j
+        h = self.height_m
+        height = (h[i, j] * (1 - v) + h[i, j + 1] * v) * (1 - u) + (h[i + 1, j] * (1 - v) + h[i + 1, j + 1] * v) * u
+        return np.where(inside, height, np.nan)
+
+    def ground_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
+        """Up of the ground [m]: 0 at the origin of the site; NaN outside the grid."""
+        return self.absolute_m(east_m, north_m) - self.absolute_m(0.0, 0.0)
+
+    def clear(self, source_m: FloatArray, target_m: FloatArray, *, clearance_m: float = 0.0) -> BoolArray:
+        """Which straight lines stay above the ground.
+
+        Parameters
+        ----------
+        source_m, target_m : (links, 3)
+            East, north, up [m].
+        clearance_m : float
+            Height above the ground that must be free; the ends themselves are not tested.
+
+        Returns
+        -------
+        ndarray of bool, (links,)
+            True where no sample, one per half cell, lies lower than the ground. Unknown ground does not block. The
+            Earth's bulge (0.08 m half-way along 2 km) is counted, refraction is not.
+        """
+        source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
+        length = np.hypot(*(target - source)[:, :2].T)
+        count = np.maximum(np.ceil(length / (self._cell_m() / 2)).astype(np.int64), 2)
+        free = np.ones(len(source), dtype=bool)
+        order = np.argsort(count)  # links of like length share a batch
+        begin = 0
+        while begin < len(order):
+            stop = begin + 1
+            while stop < len(order) and count[order[stop]] * (stop + 1 - begin) <= _SAMPLES_AT_ONCE:
+                stop += 1
+            some = order[begin:stop]
+            # samples of a link do not depend on its batch: shorter links repeat their last one
+            step = np.arange(1, count[some].max())[:, None]
+            share = np.minimum(step, count[some] - 1) / count[some]
+            point = source[some] + share[..., None] * (target - source)[some]
+            bulge = share * (1 - share) * length[some] ** 2 / (2 * EARTH_RADIUS_M)
+            ground = self.ground_m(point[..., 0], point[..., 1])
+            free[some] = ~(ground + clearance_m > point[..., 2] - bulge).any(axis=0)
+            begin = stop
+        return free
+
+    def _cell_m(self) -> float:
+        if self.crs.lower() == "local":
+            return min(self.step_x, self.step_y)
+        x, y = self._to_grid.transform(self.frame.longitude_deg, self.frame.latitude_deg)
+        longitude, latitude = self._to_grid.transform([x + self.step_x, x], [y, y + self.step_y], direction="INVERSE")
+        east, north = self.frame.to_local(latitude, longitude)
+        return float(np.hypot(east, north).min())
+
+
+def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> Dem:
+    """An elevation model: ESRI ASCII grid (``.asc``), or GeoTIFF with the extra ``aerpaw-cmp[geo]``.
+
+    Parameters
+    ----------
+    path : str or Path
+        The grid, heights in metres.
+    frame : SiteFrame
+        Of the site.
+    crs : str, optional
+        Needed for ASCII grids, which name none; ``local`` means metres of the site frame.
+
+    Raises
+    ------
+    InputError
+        Not such a file, or the site is not on it.
+    UsageError
+        No crs for an ASCII grid; rasterio is missing for a GeoTIFF.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            start = file.read(4)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path=path) from None
+    if size > MAX_BYTES:
+        raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}; cut the site out", path=path)
+    if start[:2] in (b"II", b"MM"):
+        return _read_geotiff(path, frame)
+    if crs is None:
+        raise UsageError("an ASCII grid names no coordinate system", expected="crs, such as EPSG:4326", path=path)
+    return _read_ascii(path, frame, crs)
+
+
+def _read_ascii(path: Path, frame: SiteFrame, crs: str) -> Dem:
+    try:
+        lines = path.read_text(encoding="ascii").splitlines()
+    except UnicodeDecodeError:
+        raise InputError("not text", expected="an ESRI ASCII grid", path=path) from None
+    header: dict[str, float] = {}
+    while len(header) < len(lines) and (word := lines[len(header)].split()) and word[0][0].isalpha():
+        try:
+            header[word[0].lower()] = float(word[1])
+        except (IndexError, ValueError):
+            raise InputError(f"'{lines[len(header)][:40]}' is no header", path=path, line=len(header) + 1) from None
+    missing = {"ncols", "nrows", "cellsize"} - set(header)
+    if missing or not ({"xllcorner", "xllcenter"} & set(header) and {"yllcorner", "yllcenter"} & set(header)):
+        raise InputError(
+            "not an ESRI ASCII grid", expected="ncols, nrows, xllcorner, yllcorner, cellsize", path=path, line=1
+        )
+    rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
+    values: list[FloatArray] = []
+    for number, line in enumerate(lines[len(header) :], start=len(header) + 1):
+        if not line.strip():
+            continue
+        try:
+            row = np.array(line.split(), dtype=np.float64)
+        except ValueError:
+            raise InputError("a cell is not a number", path=path, line=number) from None
+        values.append(row)
+    flat = np.concatenate(values) if values else np.zeros(0)
+    if rows < 2 or columns < 2 or step <= 0 or flat.size != rows * columns:
+        raise InputError(
+            f"{flat.size} cells",
+            expected=f"{rows} x {columns}",
+            cause="the file was cut off",
+            path=path,
+            line=len(lines),
+        )
+    flat = np.where(flat == header.get("nodata_value", -9999.0), np.nan, flat)
+    west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
+    south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
+    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame)
+
+
+def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
+    try:
+        import rasterio
+    except ImportError:
+        raise UsageError(
+            "a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)", path=path
+        ) from None
+    try:
+        with rasterio.open(path) as image:
+            band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
+            transform, crs = image.transform, image.crs
+    except rasterio.errors.RasterioError as error:
+        raise InputError(f"not a GeoTIFF ({error})", path=path) from None
+    if crs is None or transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+        raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so", path=path)
+    west = transform.c + transform.a / 2
+    south = transform.f + transform.e * (band.shape[0] - 0.5)
+    return _placed(path, Dem, band[::-1], west, south, transform.a, -transform.e, crs.to_string(), frame)
+
+
+def _placed(path: Path, make: type[Dem], *arguments: Any) -> Dem:
+    """The model; errors of placing it name the file."""
+    try:
+        return make(*arguments)
+    except (InputError, UsageError) as error:
+        raise type(error)(error.found, expected=error.expected, cause=error.cause, path=path) from None

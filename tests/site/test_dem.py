@@ -1,0 +1,147 @@
+"""Planes are interpolated exactly; a ridge blocks what geometry says it blocks."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.site.dem import EARTH_RADIUS_M, Dem, read_dem
+from aerpaw_cmp.site.siteyaml import load_site
+
+FRAME = SiteFrame(35.7275, -78.696)
+
+
+def asc(path: Path, height: np.ndarray, west: float, south: float, cell: float, corner: bool = True) -> Path:
+    """Rows of ``height`` from the south; the file lists them from the north."""
+    word, shift = ("corner", 0.0) if corner else ("center", cell / 2)
+    head = f"ncols {height.shape[1]}\nnrows {height.shape[0]}\nxll{word} {west + shift:.12g}\nyll{word} {south + shift:.12g}\n"
+    body = "\n".join(" ".join(f"{v:.9g}" for v in row) for row in np.where(np.isnan(height), -9999, height)[::-1])
+    path.write_text(head + f"cellsize {cell:.12g}\nNODATA_value -9999\n{body}\n")
+    return path
+
+
+def plane(west: float, south: float, cell: float, shape: tuple[int, int]) -> np.ndarray:
+    y, x = np.meshgrid(
+        south + (np.arange(shape[0]) + 0.5) * cell, west + (np.arange(shape[1]) + 0.5) * cell, indexing="ij"
+    )
+    return 80 + 0.03 * x - 0.02 * y
+
+
+@pytest.mark.parametrize("corner", [True, False])
+def test_plane_in_site_metres(tmp_path: Path, corner: bool) -> None:
+    path = asc(tmp_path / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10, corner)
+    dem = read_dem(path, FRAME, crs="local")
+    east, north = np.random.default_rng(1).uniform(-290, 290, (2, 500))
+    np.testing.assert_allclose(dem.ground_m(east, north), 0.03 * east - 0.02 * north, atol=1e-6)
+    assert float(dem.absolute_m(0, 0)) == pytest.approx(80)
+    assert np.isnan(dem.ground_m(600.0, 0.0))
+
+
+@pytest.mark.parametrize("crs", ["EPSG:4326", "EPSG:32617"])
+def test_plane_in_other_systems(tmp_path: Path, crs: str) -> None:
+    from pyproj import Transformer
+
+    x0, y0 = Transformer.from_crs("EPSG:4326", crs, always_xy=True).transform(-78.696, 35.7275)
+    cell = 1e-4 if crs == "EPSG:4326" else 10.0
+    west, south = x0 - 30 * cell, y0 - 30 * cell
+    rows, columns = np.meshgrid(np.arange(60), np.arange(60), indexing="ij")
+    latitude_like = rows * 1.0 + 0 * columns
+    dem = read_dem(asc(tmp_path / "d.asc", latitude_like, west, south, cell), FRAME, crs=crs)
+    north_per_row = 11.09 if crs == "EPSG:4326" else 10.0
+    assert float(dem.ground_m(0.0, 100.0)) == pytest.approx(100 / north_per_row, rel=5e-3)
+    assert abs(float(dem.ground_m(100.0, 0.0))) < (0.01 if crs == "EPSG:4326" else 0.6)  # grid north is not true north
+
+
+def ridge(height_m: float) -> Dem:
+    dem = np.where(np.arange(201) == 100, height_m, 0.0) * np.ones((101, 1))
+    # a crest along east = 0, 10 m cells
+    return Dem(dem, -1000.0, -500.0, 10.0, 10.0, "local", FRAME)
+
+
+def test_ridge_blocks_what_passes_below_it() -> None:
+    dem = ridge(30.0)
+    top = 30.0  # heights count from the origin, which lies on the crest
+    source = np.tile([-400.0, 0, 10 - top], (3, 1))
+    target = np.array([[400.0, 0, 49 - top], [400, 0, 51.1 - top], [-100, 0, 11 - top]])
+    assert dem.clear(source, target).tolist() == [False, True, True]  # 29.5 m, 30.55 m over the crest; this side of it
+    assert dem.clear(target, source).tolist() == [False, True, True]
+    assert dem.clear(source[1:2], target[1:2], clearance_m=1.0).tolist() == [False]
+
+
+def test_earth_bulge_is_counted() -> None:
+    flat = Dem(np.zeros((3, 2001)), -10_000.0, -10.0, 10.0, 10.0, "local", FRAME)
+    bulge = 20_000.0**2 / (8 * EARTH_RADIUS_M)
+    up = np.array([0.0, 0.0, bulge])
+    source, target = np.array([[-9_995.0, 0, 0]]), np.array([[9_995.0, 0, 0]])
+    assert not flat.clear(source + 0.95 * up, target + 0.95 * up)[0]
+    assert flat.clear(source + 1.05 * up, target + 1.05 * up)[0]
+
+
+def test_batches_agree_with_single_links(monkeypatch: pytest.MonkeyPatch) -> None:
+    dem = ridge(12.0)
+    random = np.random.default_rng(2)
+    source = np.column_stack([random.uniform(-900, 900, (200, 2)) * [1, 0.5], random.uniform(-11, 5, 200)])
+    target = np.column_stack([random.uniform(-900, 900, (200, 2)) * [1, 0.5], random.uniform(-11, 5, 200)])
+    together = dem.clear(source, target)
+    assert 20 < together.sum() < 180
+    monkeypatch.setattr("aerpaw_cmp.site.dem._SAMPLES_AT_ONCE", 1)
+    np.testing.assert_array_equal(dem.clear(source, target), together)
+
+
+SITE = """\
+name: test
+origin: {latitude_deg: 35.7275, longitude_deg: -78.696}
+towers:
+  T: {latitude_deg: 35.7284, longitude_deg: -78.696}
+dem: {path: d.asc, crs: local}
+buildings: [{name: b, height_m: 5, polygon_m: [[100, 0], [120, 0], [120, 20], [100, 20]]}]
+trees: {points_m: [[-200, 50]]}
+"""
+
+
+def test_site_stands_on_its_ground(tmp_path: Path) -> None:
+    asc(tmp_path / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
+    (tmp_path / "site.yaml").write_text(SITE)
+    site = load_site(tmp_path / "site.yaml")
+    tower = site.towers["T"]
+    assert tower.ground_m == pytest.approx(-0.02 * tower.north_m, abs=1e-6)
+    assert site.buildings[0].base_m == pytest.approx(0.03 * 110 - 0.02 * 10, abs=1e-6)
+    assert site.trees.ground_m[0] == pytest.approx(-6 - 1, abs=1e-6)
+    assert site.dem is not None
+    assert load_site(tmp_path / "site.yaml", tower_ground="flat").towers["T"].ground_m == 0
+    (tmp_path / "site.yaml").write_text(
+        SITE.replace("-78.696}\ndem", "-78.696, antenna: {height_m: 90, reference: ellipsoidal}}\ndem")
+    )
+    with pytest.raises(UsageError, match="ellipsoidal height 90 m cannot be compared with orthometric height 80 m"):
+        load_site(tmp_path / "site.yaml")
+
+
+def test_bad_grids(tmp_path: Path) -> None:
+    path = asc(tmp_path / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
+    text = path.read_text()
+    with pytest.raises(UsageError, match="names no coordinate system"):
+        read_dem(path, FRAME)
+    with pytest.raises(UsageError, match="unknown crs 'EPSG:nonsense'"):
+        read_dem(path, FRAME, crs="EPSG:nonsense")
+    with pytest.raises(InputError, match="they are metres or feet"):
+        read_dem(path, FRAME, crs="EPSG:4326")
+    with pytest.raises(InputError, match="no height at the site's origin"):
+        read_dem(path, FRAME, crs="EPSG:32617")
+    path.write_text(text[: len(text) // 2])
+    with pytest.raises(
+        InputError, match=r"cells; expected 60 x 100. Likely cause: the file was cut off|expected 60 x 100"
+    ):
+        read_dem(path, FRAME, crs="local")
+    path.write_text(text.replace("ncols", "columns"))
+    with pytest.raises(InputError, match="not an ESRI ASCII grid"):
+        read_dem(path, FRAME, crs="local")
+    path.write_text(text.replace("-9999\n", "-9999\nx", 1))
+    with pytest.raises(InputError, match=r"line \d+"):
+        read_dem(path, FRAME, crs="local")
+    with pytest.raises(InputError, match="cannot be read"):
+        read_dem(tmp_path / "absent.asc", FRAME, crs="local")
+    path.write_bytes(b"II*\x00" + b"0" * 100)
+    with pytest.raises((UsageError, InputError), match=r"needs rasterio|not a GeoTIFF"):
+        read_dem(path, FRAME)

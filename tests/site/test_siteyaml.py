@@ -1,0 +1,214 @@
+"""The packaged site, the loader's refusals, and heights that do not mix."""
+
+import itertools
+import math
+from pathlib import Path
+
+import numpy as np
+import pytest
+from pyproj import Geod
+
+from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
+from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SiteModel, build_site, load_site
+from aerpaw_cmp.yamlfile import parse_yaml
+
+MINIMAL = """\
+name: test
+origin: {latitude_deg: 35.7275, longitude_deg: -78.696}
+towers:
+  T: {latitude_deg: 35.7275, longitude_deg: -78.696}
+"""
+
+
+def site_file(tmp_path: Path, text: str) -> Path:
+    path = tmp_path / "site.yaml"
+    path.write_text(text)
+    return path
+
+
+def test_lake_wheeler_towers_are_where_the_sources_say() -> None:
+    site = load_site("lake_wheeler")
+    assert list(site.towers) == ["LW1", "LW2", "LW3", "LW4", "LW5"]
+    pairs = itertools.combinations(site.towers.values(), 2)
+    geodesic = [454, 466, 893, 666, 598, 1088, 1745, 1639, 2119, 1089]  # of source A, by pair
+    found = {(a.name, b.name): math.hypot(a.east_m - b.east_m, a.north_m - b.north_m) for a, b in pairs}
+    assert sorted(round(v) for v in found.values()) == pytest.approx(sorted(geodesic), abs=1)
+    assert [round(t.position_m[2], 6) for t in site.towers.values()] == [10.0] * 5
+
+
+def test_sources_differ_by_what_the_site_says() -> None:
+    a, b = load_site("lake_wheeler"), load_site("lake_wheeler", coordinates="B")
+    for name, stated in zip(a.towers, (6.6, 2.0, 2.6, 2.7, 2.5), strict=True):
+        one, other = a.towers[name], b.towers[name]
+        apart = Geod(ellps="WGS84").inv(one.longitude_deg, one.latitude_deg, other.longitude_deg, other.latitude_deg)[2]
+        assert apart == pytest.approx(stated, abs=0.06)
+        assert f"{name}: source B lies {apart:.1f} m from source A, which is used" in a.notes
+        assert f"{name}: source A lies {apart:.1f} m from source B, which is used" in b.notes
+    with pytest.raises(UsageError, match="no position 'C'; expected one of A, B"):
+        load_site("lake_wheeler", coordinates="C")
+
+
+def test_lake_wheeler_area_is_the_papers() -> None:
+    site = load_site("lake_wheeler")
+    west, east, south, north = site.area_m
+    assert (east - west, north - south) == (1080, 2130)
+    assert all(west < t.east_m < east and south < t.north_m < north for t in site.towers.values())
+    assert site.ground_material == "medium_dry_ground"
+    assert {b.material for b in site.buildings} == {"concrete"}
+
+
+def test_illustrative_things_are_marked() -> None:
+    site = load_site("lake_wheeler")
+    assert site.illustrative
+    assert {b.source for b in site.buildings} == {"illustrative"} == {f.source for f in site.forests}
+    assert any("illustrative" in note for note in site.notes)
+    near = [b for b in site.buildings if b.footprint.centroid.x < 0 < b.footprint.centroid.y]
+    assert any(math.hypot(b.footprint.centroid.x, b.footprint.centroid.y) < 150 for b in near)  # north-west of LW1
+
+
+def test_ground_is_flat_unless_offsets_are_asked_for() -> None:
+    flat, lifted = load_site("lake_wheeler"), load_site("lake_wheeler", tower_ground="offsets")
+    assert [t.ground_m for t in flat.towers.values()] == [0.0] * 5
+    assert [t.ground_m for t in lifted.towers.values()] == [0.0, -4.45, -10.23, 6.53, 15.03]
+    assert lifted.towers["LW5"].position_m[2] == pytest.approx(25.03)
+
+
+def test_trees_stand_in_forests_and_clear_of_masts() -> None:
+    import shapely
+
+    site = load_site("lake_wheeler")
+    woods = shapely.union_all([f.area for f in site.forests])
+    assert shapely.contains_xy(woods, site.trees.east_m, site.trees.north_m).all()
+    for tower in site.towers.values():
+        away = np.hypot(site.trees.east_m - tower.east_m, site.trees.north_m - tower.north_m)
+        assert away.min() >= MAST_CLEARANCE_M * 0.98  # the buffer is a polygon
+    again = load_site("lake_wheeler")
+    np.testing.assert_array_equal(again.trees.east_m, site.trees.east_m)
+
+
+@pytest.mark.parametrize(
+    ("addition", "words"),
+    [
+        ("sead: 1", "line 5: unknown key 'sead'. Likely cause: did you mean 'area_m'|line 5: unknown key 'sead'"),
+        ("trees: {sead: 1}", "line 5: unknown key 'trees.sead'. Likely cause: did you mean 'seed'"),
+        ("name: again", r"line 5: the key 'name' stands twice \(first on line 1\)"),
+        ("ground_material: medium_dry_grund", "did you mean 'medium_dry_ground'"),
+        ("buildings:\n- {name: a, height_m: -1, polygon_m: [[0,0],[1,0],[1,1]]}", "line 6: .*height_m: found -1"),
+        ("buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[0,0],[0,0]]}", "'a' has fewer than 3 distinct"),
+        ("buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[9,9],[9,0],[0,9]]}", "'a' is not a simple outline"),
+        ("buildings:\n- {name: a, height_m: 1}", "give polygon_m .* or polygon_deg"),
+        (
+            "forests:\n- {name: w, polygon_deg: [[-78.7, 35.7], [-78.6, 35.7], [-78.6, 35.8]]}",
+            "latitude and longitude are swapped",
+        ),
+        ("forests:\n- {name: w, polygon_deg: [[35.7, 179], [35.7, -179], [35.8, 179]]}", "antimeridian"),
+        ("forests:\n- {name: w, polygon_deg: [[48.7, 2.1], [48.7, 2.2], [48.8, 2.1]]}", "km from the site's origin"),
+        ("area_m: [5, -5, 0, 1]", r"area_m is \[5.0, -5.0, 0.0, 1.0\]"),
+        ("tower_ground: dem", "no elevation model"),
+    ],
+)
+def test_mistakes_in_site_yaml(tmp_path: Path, addition: str, words: str) -> None:
+    with pytest.raises(UsageError, match=words) as caught:
+        load_site(site_file(tmp_path, MINIMAL + addition))
+    assert caught.value.path == str(tmp_path / "site.yaml")
+
+
+@pytest.mark.parametrize(
+    ("tower", "words"),
+    [
+        ("{latitude_deg: 36.7275, longitude_deg: -78.696}", "tower 'T' .* lies 111.0 km from its site"),
+        ("{latitude_deg: -78.696, longitude_deg: 35.7275}", "latitude and longitude are swapped"),
+        ("{latitude_deg: 135.7, longitude_deg: -78.696}", "line 4: .*latitude_deg: found 135.7"),
+        ("{latitude_deg: 35.7275}", "give latitude_deg and longitude_deg, or positions"),
+        (
+            "{latitude_deg: 35.7, longitude_deg: -78.6, antenna_height_m: 3, antenna: {height_m: 3, reference: ellipsoidal}}",
+            "not both",
+        ),
+    ],
+)
+def test_towers_in_the_wrong_place(tmp_path: Path, tower: str, words: str) -> None:
+    text = MINIMAL.replace("{latitude_deg: 35.7275, longitude_deg: -78.696}\n", tower + "\n").replace(
+        f"origin: {tower}", "origin: {latitude_deg: 35.7275, longitude_deg: -78.696}"
+    )
+    with pytest.raises(UsageError, match=words):
+        load_site(site_file(tmp_path, text))
+
+
+def test_no_such_site(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match=r"no site 'lake_weeler'.*did you mean 'lake_wheeler'"):
+        load_site("lake_weeler")
+    with pytest.raises(UsageError, match="no such file"):
+        load_site(tmp_path / "absent.yaml")
+
+
+# ---------------------------------------------------------------- heights
+
+
+def heights(tmp_path: Path, origin_ground: str, tower: str, ground: str = "offsets") -> tuple[float, float]:
+    text = MINIMAL.replace("-78.696}\ntowers", f"-78.696, takeoff_ground_m: 1.5{origin_ground}}}\ntowers")
+    text = text.replace("-78.696}\n", f"-78.696, {tower}}}\n") + f"tower_ground: {ground}\n"
+    found = load_site(site_file(tmp_path, text)).towers["T"]
+    return float(found.position_m[2]), found.ground_m
+
+
+def test_each_reference_gives_the_same_antenna(tmp_path: Path) -> None:
+    # ground at the origin 112 m above the ellipsoid and 79 m above the geoid; the antenna 12 m above a 3 m knoll
+    hae, msl = ", ground: {height_m: 112, reference: ellipsoidal}", ", ground: {height_m: 79, reference: orthometric}"
+    assert heights(tmp_path, "", "antenna_height_m: 12, ground_offset_m: 3") == (15, 3)
+    assert heights(tmp_path, hae, "antenna: {height_m: 127, reference: ellipsoidal}, ground_offset_m: 3") == (15, 3)
+    assert heights(
+        tmp_path, msl, "antenna: {height_m: 94, reference: orthometric}, ground: {height_m: 82, reference: orthometric}"
+    ) == (15, 3)
+    assert heights(tmp_path, "", "antenna: {height_m: 13.5, reference: above_takeoff}, ground_offset_m: 3") == (15, 3)
+    assert heights(tmp_path, "", "antenna: {height_m: 12, reference: above_ground}, ground_offset_m: 3") == (15, 3)
+
+
+def test_mixing_is_refused(tmp_path: Path) -> None:
+    msl = ", ground: {height_m: 79, reference: orthometric}"
+    with pytest.raises(
+        UsageError, match=r"tower 'T', antenna: ellipsoidal height 127 m .* orthometric height 79 m.*geoid"
+    ):
+        heights(tmp_path, msl, "antenna: {height_m: 127, reference: ellipsoidal}")
+    with pytest.raises(UsageError, match="does not say how high its origin is"):
+        heights(tmp_path, "", "antenna: {height_m: 127, reference: ellipsoidal}")
+    with pytest.raises(UsageError, match="not both"):
+        heights(tmp_path, msl, "ground_offset_m: 3, ground: {height_m: 80, reference: orthometric}")
+    with pytest.raises(UsageError, match="the antenna lies 64 m below the ground"):
+        heights(tmp_path, msl, "antenna: {height_m: 15, reference: orthometric}")
+    with pytest.raises(UsageError, match="reference: found 'sea_level'"):
+        heights(tmp_path, msl, "antenna: {height_m: 15, reference: sea_level}")
+
+
+@pytest.mark.parametrize("one", list(HeightReference))
+@pytest.mark.parametrize("other", list(HeightReference))
+def test_only_like_heights_subtract(one: HeightReference, other: HeightReference) -> None:
+    if one is other:
+        assert Height(5, one).minus(Height(2, other), "x") == 3
+    else:
+        with pytest.raises(UsageError, match=f"{one.value} height 5 m cannot be compared with {other.value}"):
+            Height(5, one).minus(Height(2, other), "x")
+
+
+def test_altitude_above_takeoff_of_a_flight() -> None:
+    datum = VerticalDatum(takeoff_ground_m=-2.0)
+    assert datum.up_m(Height(30, HeightReference.ABOVE_TAKEOFF), "UAV") == 28
+    assert datum.up_m(Height(30, HeightReference.ABOVE_GROUND), "UAV", ground_m=4) == 34
+
+
+def test_the_documented_site_is_valid() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
+    model = parse_yaml(text.split("```yaml\n")[1].split("```")[0], SiteModel)
+    assert model.dem is not None
+    assert set(type(model).model_fields) == model.model_fields_set  # the page shows every key
+    site = build_site(model)
+    assert site.towers["LW2"].position_m[2] == pytest.approx(10.0)
+    assert len(site.trees) > 10
+
+
+def test_the_documented_differences_are_the_computed_ones() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
+    for note in load_site("lake_wheeler").notes[2:]:
+        tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
+        row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
+        assert f"| {metres} |" in row

@@ -5,7 +5,7 @@ The replay engine is handed in as a function, so that nothing here knows an engi
     evaluate(position_m (n, 3), tower_names) -> Evaluation
 
 It is called for one altitude and at most ``chunk`` positions at a time; what grows with the number of altitudes is
-the result alone (RSS 8 bytes, rank 1 byte per tower, position and K).
+the result alone: per tower and position 16 bytes of RSS, 16 bytes of singular-value ratios, 1 byte of rank per K.
 """
 
 from __future__ import annotations

@@ -13,17 +13,20 @@ from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
-    altitude_variance,
     empirical_cdf,
     foliage_difference,
-    honest_study,
-    interpolation_study,
     layers_of,
     map_job,
-    rank_fields,
     rank_of_singular_values,
-    rank_study,
     summary_of,
+)
+from aerpaw_cmp.maps.study import (
+    altitude_variance,
+    honest_study,
+    interpolation_study,
+    rank_fields,
+    rank_study,
+    summary_of_study,
 )
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
@@ -178,7 +181,7 @@ def test_summary_is_json_and_adds_up(result, tmp_path):
     heights, rank = rank_fields(result)
     study = rank_study(result)
     honest = honest_study(GRID, heights, rank, study.fit, learning_sizes=(50,), block_m=300.0)
-    summary = summary_of(result, study, honest)
+    summary = summary_of(result) | summary_of_study(study, honest)
     path = export.write_json(tmp_path / "m.json", GRID, SiteFrame(35.7, -78.7), [], summary)
     read = json.loads(path.read_text())["summary"]
     assert sum(t["served"] for t in read["towers"].values()) == len(GRID)

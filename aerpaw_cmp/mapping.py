@@ -14,7 +14,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -32,16 +32,12 @@ from .maps.job import (
     Antennas,
     Evaluate,
     Evaluation,
-    HonestStudy,
     MapResult,
-    Study,
     foliage_difference,
-    honest_study,
     layers_of,
     map_job,
-    rank_fields,
-    rank_study,
 )
+from .maps.study import HonestStudy, Study, honest_study, rank_fields, rank_study
 from .maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from .replay.arrays import Link, Poses, linear_array, single_element
 from .replay.field import channel_matrices, rss_dbm

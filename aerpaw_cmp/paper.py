@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .maps.job import Antennas, Study, rank_fields
+from .maps.job import Antennas
+from .maps.study import Study, rank_fields
 from .maps.variogram import PAPER_BIEXPONENTIAL
 from .report.export import k_key, safe_name
 from .report.maps_data import PaperRow

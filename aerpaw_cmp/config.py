@@ -1,4 +1,4 @@
-"""flight.yaml and campaign.yaml -> checked settings.
+"""flight.yaml -> checked settings.
 
 Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
 are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.

@@ -7,7 +7,7 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -412,6 +412,9 @@ _RIVAL = 10.83
 _SCANNED = 6000
 """The search runs on at most this many samples; the refinement on all."""
 
+_INDEPENDENT = 0.7
+"""Share of the evidence of several channels that counts: one airframe and one path make their residuals alike."""
+
 _NEAR_EDGE = 0.86
 """A best lag beyond this share of the window may be the slope of a valley outside it."""
 
@@ -447,6 +450,8 @@ class LagFit:
         Lags searched on either side [s].
     curve_lag_s, curve_rmse_db : (m,)
         Residual against lag (without drift).
+    evidence : (m,)
+        Log-likelihood ratio by which every lag of the curve is worse than the best one.
     """
 
     lag_s: float
@@ -462,6 +467,7 @@ class LagFit:
     window_s: float
     curve_lag_s: FloatArray = field(repr=False)
     curve_rmse_db: FloatArray = field(repr=False)
+    evidence: FloatArray = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None, the curve is left out."""
@@ -508,8 +514,17 @@ class _Prediction:
     def terms_at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """The free terms at t, a constant first (n, 1 + terms); NaN as for :meth:`at`."""
         source = self.terms if values is None else values
-        columns = [self.at(t, source[:, i]) for i in range(source.shape[1])]
-        return np.column_stack([np.ones(len(t)) if values is None else np.zeros(len(t)), *columns])
+        place = (t - self.first) / self.step
+        left = np.floor(place).astype(np.int64)
+        inside = (left >= 0) & (left < len(source) - 1)
+        left = np.where(inside, left, 0)
+        result = np.empty((len(t), 1 + source.shape[1]))
+        result[:, 0] = 1.0 if values is None else 0.0
+        if source.shape[1]:
+            weight = (place - left)[:, None]
+            result[:, 1:] = source[left] * (1.0 - weight) + source[left + 1] * weight
+            result[~inside, 1:] = np.nan
+        return result
 
     def at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """Linear interpolation at t; NaN outside and next to NaN."""
@@ -641,6 +656,7 @@ def _no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
         window_s,
         lags,
         np.full(len(lags), nan),
+        np.zeros(len(lags)),
     )
 
 
@@ -669,9 +685,17 @@ def _explained(y: FloatArray, terms: FloatArray, phi: float) -> FloatArray:
     ok = np.isfinite(y) & np.isfinite(terms).all(axis=1)
     a, b = terms[ok], y[ok]
     a, b = a[1:] - phi * a[:-1], b[1:] - phi * b[:-1]
-    # the few terms are of order one: normal equations, with a floor under the rank
-    coefficients = np.linalg.lstsq(a.T @ a, a.T @ b, rcond=1e-10)[0]
-    return np.asarray(terms @ coefficients)
+    return np.asarray(np.einsum("ni,i->n", terms, _on_terms(a, b[None])[0]))
+
+
+def _on_terms(terms: FloatArray, rows: FloatArray) -> FloatArray:
+    """Least-squares coefficients (k, q) of each row (k, n) on terms (n, q).
+
+    Normal equations, as the few terms are of order one, with a floor under the rank. By einsum: for products this
+    small, BLAS wakes threads and waits for them, which on a busy machine took hundred times longer.
+    """
+    normal, right = np.einsum("ni,nj->ij", terms, terms), np.einsum("ni,kn->ik", terms, rows)
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0].T)
 
 
 def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_deg: ArrayLike) -> FloatArray:
@@ -720,9 +744,14 @@ def _fit_lag(
     if not np.isfinite(plain).any():
         return _no_lag("no prediction at the radio samples: the two logs do not overlap", 0, float(lags[-1]), lags)
     phi = _phi(residual(lags[_best(plain, lags)], 0.0))
-    rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if drifting else np.zeros(1)
+    # free terms bend towards a drift before a scan can tell; the refinement fits it from zero then
+    scanned = drifting and not prediction.terms.shape[1]
+    rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if scanned else np.zeros(1)
     table = np.stack([scan(phi, rate) for rate in rates])
-    row, column = np.unravel_index(_best(table, np.broadcast_to(lags, table.shape)), table.shape)
+    row, column = divmod(_best(table, np.broadcast_to(lags, table.shape)), len(lags))
+    still = len(rates) // 2
+    if len(ts) * np.log(table[still].min() / table[row, column]) <= _RIVAL:  # no drift where none shows
+        row, column = still, _best(table[still], lags)
     near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row]), phi), phi, least))
     start = np.array([near, rates[row]])[: 2 if drifting else 1]
     (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
@@ -735,7 +764,7 @@ def _fit_lag(
     nan = float("nan")
     return LagFit(
         lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
-        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain),
+        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain), ratio[:-1],
     )  # fmt: skip
 
 
@@ -776,20 +805,20 @@ def _refine(
         ok = np.isfinite(y) & np.isfinite(slope) & np.isfinite(terms).all(axis=1)
         y, slope, terms, along = y[ok], slope[ok], terms[ok], relative[:, ok]
         base, b = terms[1:] - phi * terms[:-1], y[1:] - phi * y[:-1]
-        coefficients = np.linalg.lstsq(base, b, rcond=None)[0]
+        coefficients = _on_terms(base, b[None])[0]
         if terms.shape[1] > 1:  # the free terms move with the lag too
-            slope = slope + prediction.terms_at(at, prediction.term_slopes)[ok] @ coefficients
+            moved = prediction.terms_at(at, prediction.term_slopes)[ok]
+            slope = slope + np.einsum("ni,i->n", moved, coefficients)
         jacobian = -slope * along
         columns = np.vstack([b, jacobian[:, 1:] - phi * jacobian[:, :-1]])
-        basis = np.linalg.qr(base)[0]
-        columns = columns - (columns @ basis) @ basis.T
-        return y - terms @ coefficients, columns[0], columns[1:]
+        columns = columns - np.einsum("ki,ni->kn", _on_terms(base, columns), base)
+        return y - np.einsum("ni,i->n", terms, coefficients), columns[0], columns[1:]
 
     shift = start * scale
     phi = _phi(evaluate(shift, 0.0)[0])
     for _ in range(20):
         _, rw, jw = evaluate(shift, phi)
-        step = -np.linalg.lstsq(jw.T, rw, rcond=None)[0]
+        step = -_on_terms(jw.T, rw[None])[0]
         size = float(np.abs(step).max())
         shift = shift + step * min(1.0, 0.3 / max(size, 1e-12))  # the valley is no wider than fractions of a second
         if size < 1e-5:
@@ -860,6 +889,54 @@ def _judge(
     if abs(lag) > _NEAR_EDGE * float(lags[-1]):
         return "failed", "the best lag lies near the edge of the window: widen it, or look at the clocks", interval
     return "ok", "", interval
+
+
+def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> LagFit:
+    """One lag for channels that share a clock, from the evidence of all of them.
+
+    Parameters
+    ----------
+    fits : sequence of LagFit
+        Of the same window, such as the channels of one receiver. Failed ones take no part.
+    limit_s : float
+        As in :func:`estimate_lag`.
+
+    Returns
+    -------
+    LagFit
+        Log-likelihood ratios add up; RMSE is pooled, the drift is that of the channel with the narrowest interval.
+
+    Raises
+    ------
+    ValueError
+        If there is no fit, or windows differ.
+    """
+    if not fits or any(len(fit.curve_lag_s) != len(fits[0].curve_lag_s) for fit in fits):
+        raise ValueError("lags to combine must be at least one, and searched over the same window")
+    heard = [fit for fit in fits if np.isfinite(fit.lag_s)]
+    if len(heard) < 2:
+        return heard[0] if heard else fits[0]
+    lags = heard[0].curve_lag_s
+    total = np.sum([np.minimum(fit.evidence, 1e6) for fit in heard], axis=0) * _INDEPENDENT
+    total = total - total.min()
+    sharp = min(heard, key=lambda fit: fit.interval_s[1] - fit.interval_s[0])
+    best = float(lags[_best(np.where(total > 0, total, 0.0) + 1.0, lags)])
+    near = abs(sharp.lag_s - best) <= lags[1] - lags[0]  # the sharpest fit is finer than the grid
+    lag = sharp.lag_s if near else best
+    width = 0.5 * float(lags[1] - lags[0])
+    if near and sharp.verdict == "ok":
+        width = 0.5 * (sharp.interval_s[1] - sharp.interval_s[0])
+    verdict, reason, interval = _judge(lag, width, total, lags, limit_s)
+    count = sum(fit.n for fit in heard)
+
+    def pooled(name: str) -> float:
+        return float(np.sqrt(sum(fit.n * getattr(fit, name) ** 2 for fit in heard) / count))
+
+    curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in heard], axis=0) / count)
+    return LagFit(
+        lag, interval, sharp.drift_s_per_s, sharp.drift_interval_s_per_s, verdict, reason, sharp.reference, count,
+        pooled("rmse_db"), pooled("rmse_unshifted_db"), heard[0].window_s, lags, curve, total,
+    )  # fmt: skip
 
 
 # --- whole hours ---------------------------------------------------------------------------------------------------

@@ -169,7 +169,7 @@ class OrdinaryKriging:
         if np.isinf(fields).any():
             raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
         self._one_field = fields.ndim == 1
-        fields = fields.reshape(len(points), -1)
+        fields = fields[:, None] if self._one_field else fields
         self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
         self.sill_ = self._sill_of(self.values_)
         return self
@@ -231,7 +231,7 @@ class OrdinaryKriging:
         """Estimate and variance (targets, fields); ``own`` is the place that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
-        for kept, columns in _coverage_patterns(self.values_):
+        for kept, columns in coverage_patterns(self.values_):
             skip = None
             if own is not None:
                 new_number = np.full(len(self.points_m_), -1, dtype=np.int64)
@@ -399,8 +399,10 @@ def _reference(values: FloatArray) -> FloatArray:
     return np.asarray(np.where(finite.any(axis=0), first, 0.0))
 
 
-def _coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
+def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
     """Fields grouped by where they have values: (kept places, field numbers)."""
+    if not values.size:
+        return
     patterns, group = np.unique(np.isfinite(values), axis=1, return_inverse=True)
     for number in range(patterns.shape[1]):
         yield patterns[:, number], np.flatnonzero(group.ravel() == number)

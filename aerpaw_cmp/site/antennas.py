@@ -29,6 +29,9 @@ HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 MAXIMUM_EFFICIENCY = 1.12
 """Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration."""
 
+HIGHEST_DBI = 60.0
+"""No element has more gain; a file that says so holds something else."""
+
 Azimuth = Literal["clockwise", "counter-clockwise"]
 
 
@@ -303,7 +306,8 @@ def _check_units(rows: _Rows, path: Path) -> None:
     values = rows.values
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
-        if (worst := int(largest.argmax())) is not None and largest[worst] > 2 * np.pi + 0.1:
+        worst = int(largest.argmax())
+        if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
                 expected=f"{what} in radians",
@@ -311,6 +315,14 @@ def _check_units(rows: _Rows, path: Path) -> None:
                 path=path,
                 line=rows.lines[worst],
             )
+    if values[:, 2:5].max() > HIGHEST_DBI:
+        worst = int(values[:, 2:5].max(axis=1).argmax())
+        raise InputError(
+            f"a gain of {values[worst, 2:5].max():g}",
+            expected=f"dBi, at most {HIGHEST_DBI:g}",
+            path=path,
+            line=rows.lines[worst],
+        )
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
     wrong = np.flatnonzero(np.abs(total - values[:, 2]) > 0.05)
     if len(wrong):
@@ -457,6 +469,8 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     gain = np.asarray(content[variable], dtype=float)
     if not np.isfinite(gain).all():
         raise InputError(f"'{variable}' has {int((~np.isfinite(gain)).sum())} values that are no numbers", path=path)
+    if gain.max() > HIGHEST_DBI:
+        raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(name or variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)

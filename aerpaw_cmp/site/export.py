@@ -20,7 +20,7 @@ HALF_SPACE_THICKNESS_M = 1.0
 CROWN_PERMITTIVITY = 1.1
 
 
-def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = 0.5) -> Path:
+def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = 0.5) -> list[Path]:
     """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
 
     Parameters
@@ -37,26 +37,28 @@ def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db
 
     Returns
     -------
-    Path
-        The XML file.
+    list of Path
+        The files written, the XML file first.
     """
     folder = Path(folder)
     meshes = site_meshes(site, trees=trees)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
     lines += [_bsdf(name, gamma_db_per_m) for name in meshes]
+    written = [folder / "scene.xml"]
     try:
         (folder / "meshes").mkdir(parents=True, exist_ok=True)
         for name, mesh in meshes.items():
-            write_ply(mesh, folder / "meshes" / f"{name}.ply")
+            written.append(folder / "meshes" / f"{name}.ply")
+            write_ply(mesh, written[-1])
             lines.append(
-                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}><string name="filename" value="meshes/{name}.ply"/>'
+                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}>'
+                f'<string name="filename" value="meshes/{name}.ply"/>'
                 f'<boolean name="face_normals" value="true"/><ref id={quoteattr(_bsdf_id(name))} name="bsdf"/></shape>'
             )
-        path = folder / "scene.xml"
-        path.write_text("\n".join([*lines, "</scene>", ""]), encoding="utf-8")
+        written[0].write_text("\n".join([*lines, "</scene>", ""]), encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot be written ({error.strerror})", path=error.filename or folder) from None
-    return path
+    return written
 
 
 def _comment(site: Site) -> str:

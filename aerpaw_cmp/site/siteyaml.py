@@ -283,6 +283,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     area = _area(model.area_m, towers)
     _check_towers(towers, model.area_m)
     buildings = tuple(_building(item, frame, dem) for item in model.buildings)
+    notes += _buried(towers, buildings)
     forests = tuple(
         Forest(item.name, item.polygon(frame), item.trees_per_hectare, item.minimum_spacing_m, item.source)
         for item in model.forests
@@ -340,6 +341,17 @@ def _check_towers(towers: Mapping[str, Tower], area: Area | None) -> None:
                 expected=f"at most {FAR_TOWER_M / 1000:g} km",
                 cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
             )
+
+
+def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
+    """Warnings of antennas inside buildings, which no path reaches."""
+    return [
+        f"warning: the antenna of tower '{tower.name}' lies inside building '{building.name}'; no path will reach it"
+        for tower in towers.values()
+        for building in buildings
+        if tower.position_m[2] < building.base_m + building.height_m
+        and building.footprint.contains(Point(tower.east_m, tower.north_m))
+    ]
 
 
 def _outside(value: float, low: float, high: float) -> float:

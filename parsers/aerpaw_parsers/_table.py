@@ -65,7 +65,7 @@ def numbers(
     rows : int array, shape (n,)
         0-based lines of ``count`` fields each, see :func:`fields`.
     wanted : sequence of int, optional
-        Columns to read; all by default.
+        Columns to read, ascending; all by default.
     strip : bytes
         Characters taken out before reading; the caller has checked where they stand.
     also : bytes

@@ -147,6 +147,9 @@ def _tuples_in_place(lines: _lines.Lines, starts: IntArray, ends: IntArray) -> b
         opening, closing = starts[:, first], ends[:, last]
         right &= (ends[:, first] - opening > 2) & (closing - starts[:, last] > 2)
         right &= (at[opening] == 34) & (at[opening + 1] == 40) & (at[closing - 1] == 34) & (at[closing - 2] == 41)
+    for sign, number in ((34, 4), (40, 2), (41, 2)):
+        places = np.flatnonzero(at == sign)
+        right &= np.searchsorted(places, ends[:, -1]) - np.searchsorted(places, starts[:, 0]) == number
     return bool(right.all())
 
 

@@ -258,6 +258,25 @@ def test_fewer_than_m_one_and_none_within_the_radius():
     assert anyway == expected
 
 
+def test_no_sample_at_all():
+    model = OrdinaryKriging(PAPER).fit(np.zeros((0, 2)), np.zeros(0))
+    assert np.isnan(model.predict([[0.0, 0.0]])[0]).all()
+    assert OrdinaryKriging(PAPER).fit([[0.0, 0.0]], np.zeros((1, 0))).predict([[0.0, 0.0]])[0].shape == (1, 0)
+
+
+def test_memory_of_a_prediction_is_bounded():
+    """What grows with the targets is neighbours and weights (a few hundred bytes), not the systems (7 kB)."""
+    import tracemalloc
+
+    model = OrdinaryKriging(PAPER, 20, np.inf).fit(scattered(60, 40), np.zeros(60))
+    targets = scattered(30_000, 41)
+    tracemalloc.start()
+    model.predict(targets)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 30_000 * 1000 + 60e6
+
+
 def test_radius_is_inclusive():
     """150 m / 30 m: the fifth cell counts, although 5 * 30.000000000000001 might not."""
     model = OrdinaryKriging(exponential, 1, 0.3).fit([[0.1 * 3, 0.0]], [5.0])

@@ -6,7 +6,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.maps import variogram
+from aerpaw_cmp.maps import biexponential, variogram
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.variogram import (
     PAPER_BIEXPONENTIAL,
@@ -287,7 +287,7 @@ def test_bounded_amplitudes_equal_a_quadratic_programme(seed, total):
 
     rng = np.random.default_rng(seed)
     basis, target = rng.uniform(0, 1, (9, 2)), rng.normal(0.5, 1, 9)
-    found = variogram._candidate_amplitudes(basis, target, 0.0, 0.8, total)
+    found = biexponential._candidate_amplitudes(basis, target, 0.0, 0.8, total)
     cost = ((found @ basis.T - target) ** 2).sum(axis=-1)
     assert (found >= -1e-12).all()
     assert (found <= 0.8 + 1e-12).all()

@@ -13,7 +13,7 @@ from aerpaw_cmp.records import ReadResult
 from aerpaw_parsers import _table, vehicle_out
 from tests.parsers.samples import OPTIONS, SAMPLES
 
-CASES = [(reader, name) for reader in ("vehicle_out", "nemo_csv") for name in SAMPLES[reader]]
+CASES = [(reader, name) for reader in ("vehicle_out", "nemo_csv", "quectel_csv") for name in SAMPLES[reader]]
 
 
 def by_the_slow_way(reader: str, data: bytes) -> ReadResult:
@@ -42,12 +42,40 @@ def test_samples(reader: str, sample: str) -> None:
     assert_same(by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data))
 
 
+@pytest.mark.parametrize(
+    ("reader", "sample", "old", "new"),
+    [
+        ("vehicle_out", "ten_fields", b"35.7300002", b"35.73(00002"),
+        ("vehicle_out", "ten_fields", b"35.7300002", b'35.73"00002'),
+        ("vehicle_out", "ten_fields", b'-0.05)","(1.0', b'-0.05,"(1.0'),
+        ("vehicle_out", "ten_fields", b"35.7300002", b""),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35.73.0002"),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35 7300002"),
+        ("nemo_csv", "table", b",4.0,,,", b",NA,,,"),
+        ("nemo_csv", "table", b",4.0,,,", b",4.0,--1,,"),
+        ("nemo_csv", "table", b"1000.0", b""),
+        ("nemo_csv", "table", b",4.0,,,", b",4\r.0,,,"),
+        ("quectel_csv", "csi", b"24,4,12,5", b"24,4.,12,NA"),
+    ],
+)
+def test_what_is_wrong_is_rejected_by_both(reader: str, sample: str, old: bytes, new: bytes) -> None:
+    data = SAMPLES[reader][sample][0].replace(old, new, 1)
+    good = by_name(reader).read(SAMPLES[reader][sample][0], OPTIONS)
+    fast, slow = by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data)
+    assert fast.accepted == good.accepted - 1
+    assert_same(fast, slow)
+
+
 def test_the_fast_way_is_taken() -> None:
-    from aerpaw_parsers import _lines, nemo_csv
+    from aerpaw_parsers import _lines, nemo_csv, quectel_csv
 
     for name, rows in (("ten_fields", 3), ("nine_fields", 2), ("eight_fields", 2)):
         assert len(vehicle_out._at_once(_lines.split(SAMPLES["vehicle_out"][name][0])).line) == rows
     assert len(nemo_csv._plain(_lines.split(SAMPLES["nemo_csv"]["table"][0]))[0]) == 3
+    whole = b"".join(
+        line for line in SAMPLES["quectel_csv"]["csi"][0].splitlines(keepends=True) if not line.endswith(b",\r\n")
+    )
+    assert len(quectel_csv._launched(_lines.split(whole))[0]) == 3
 
 
 @given(st.sampled_from(CASES), st.data())
@@ -66,8 +94,10 @@ def test_damaged_samples(case: tuple[str, str], data: st.DataObject) -> None:
     slow_lines = {line for stream in slow.streams for line in stream.frame["line"]}
     for one in fast.streams:
         frame = one.frame.set_index("line")
-        both = sorted(slow_lines & set(frame.index))
-        other = next(s for s in slow.streams).frame.set_index("line")
+        both = sorted({line for s in slow.streams if s.name == one.name for line in s.frame["line"]} & set(frame.index))
+        if not both:
+            continue
+        other = next(s for s in slow.streams if s.name == one.name).frame.set_index("line")
         left, right = frame.loc[both], other.loc[both]
         assert (left["time"] == right["time"]).all()
         numbers = left.select_dtypes("number").columns

@@ -77,7 +77,8 @@ def test_conductivity_gives_gamma() -> None:
 
 
 def test_export_is_well_formed(tmp_path: Path) -> None:
-    path = export_scene(load_site("lake_wheeler"), tmp_path / "scene")
+    path, *parts = export_scene(load_site("lake_wheeler"), tmp_path / "scene")
+    assert {part.stem for part in parts} == {"medium_dry_ground", "concrete", "wood", "vegetation"}
     root = ElementTree.parse(path).getroot()
     ids = {bsdf.get("id") for bsdf in root.iter("bsdf")}
     assert {ref.get("id") for ref in root.iter("ref")} == ids
@@ -94,7 +95,7 @@ def test_export_is_well_formed(tmp_path: Path) -> None:
 
 @pytest.mark.sionna
 def test_sionna_opens_the_scene(tmp_path: Path) -> None:
-    path = export_scene(load_site("lake_wheeler"), tmp_path)
+    path = export_scene(load_site("lake_wheeler"), tmp_path)[0]
     script = (
         "import sys, mitsuba as mi; mi.set_variant('llvm_ad_mono_polarized')\n"
         "from sionna.rt import load_scene\n"

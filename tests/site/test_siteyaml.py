@@ -10,7 +10,8 @@ from pyproj import Geod
 
 from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
-from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, load_site
+from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SiteModel, build_site, load_site
+from aerpaw_cmp.yamlfile import parse_yaml
 
 MINIMAL = """\
 name: test
@@ -134,6 +135,12 @@ def test_towers_in_the_wrong_place(tmp_path: Path, tower: str, words: str) -> No
         load_site(site_file(tmp_path, text))
 
 
+def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
+    hall = "buildings:\n- {name: hall, height_m: %g, polygon_m: [[-9, -9], [9, -9], [9, 9], [-9, 9]]}"
+    assert any("inside building 'hall'" in n for n in load_site(site_file(tmp_path, MINIMAL + hall % 12)).notes)
+    assert not load_site(site_file(tmp_path, MINIMAL + hall % 9)).notes  # on the roof
+
+
 def test_no_such_site(tmp_path: Path) -> None:
     with pytest.raises(UsageError, match=r"no site 'lake_weeler'.*did you mean 'lake_wheeler'"):
         load_site("lake_weeler")
@@ -193,3 +200,21 @@ def test_altitude_above_takeoff_of_a_flight() -> None:
     datum = VerticalDatum(takeoff_ground_m=-2.0)
     assert datum.up_m(Height(30, HeightReference.ABOVE_TAKEOFF), "UAV") == 28
     assert datum.up_m(Height(30, HeightReference.ABOVE_GROUND), "UAV", ground_m=4) == 34
+
+
+def test_the_documented_site_is_valid() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
+    model = parse_yaml(text.split("```yaml\n")[1].split("```")[0], SiteModel)
+    assert model.dem is not None
+    assert set(type(model).model_fields) == model.model_fields_set  # the page shows every key
+    site = build_site(model)
+    assert site.towers["LW2"].position_m[2] == pytest.approx(10.0)
+    assert len(site.trees) > 10
+
+
+def test_the_documented_differences_are_the_computed_ones() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
+    for note in load_site("lake_wheeler").notes[2:]:
+        tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
+        row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
+        assert f"| {metres} |" in row

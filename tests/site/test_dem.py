@@ -171,3 +171,17 @@ def test_geotiff_equals_the_ascii_grid(tmp_path: Path) -> None:
         image.write(height, 1)
     with pytest.raises(InputError, match="not georeferenced"):
         read_dem(path, FRAME)
+
+
+def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
+    from aerpaw_cmp.site.footprints import import_site, write_site_yaml
+
+    (tmp_path / "base").mkdir()
+    asc(tmp_path / "base" / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
+    (tmp_path / "base" / "site.yaml").write_text(SITE)
+    tree = tmp_path / "tree.osm"
+    tree.write_text('<osm><node id="1" lat="35.728" lon="-78.6962"><tag k="natural" v="tree"/></node></osm>')
+    model, _ = import_site([tree], base=tmp_path / "base" / "site.yaml")
+    write_site_yaml(model, tmp_path / "new.yaml")
+    site = load_site(tmp_path / "new.yaml")
+    assert site.trees.ground_m[0] == pytest.approx(0.03 * site.trees.east_m[0] - 0.02 * site.trees.north_m[0], abs=1e-6)

@@ -64,11 +64,10 @@ def speed_rows(data: FlightData, replayed: Replayed, progress: Callable[[str], N
 
 def _key(data: FlightData, replayed: Replayed, poses: Poses) -> str:
     link = data.settings.link.model_dump_json()
-    content = json.dumps(
-        [platform.node(), platform.processor(), os.cpu_count(), versions(), data.settings.site.model_dump(), link]
-        + [data.settings.rt.max_depth, list(data.settings.rank.k), list(replayed.link.tower_arrays), SAMPLES]
-        + [[b.footprint.wkt + repr((b.height_m, b.base_m, b.material)) for b in data.site.buildings]]
-    )
+    buildings = [b.footprint.wkt + repr((b.height_m, b.base_m, b.material)) for b in data.site.buildings]
+    machine = [platform.node(), platform.processor(), os.cpu_count(), versions()]
+    settings = [data.settings.site.model_dump(), link, data.settings.rt.max_depth, list(data.settings.rank.k)]
+    content = json.dumps([machine, settings, list(replayed.link.tower_arrays), SAMPLES, buildings])
     return sha256(content.encode() + poses.position_m.tobytes() + poses.rotation.tobytes()).hexdigest()[:32]
 
 

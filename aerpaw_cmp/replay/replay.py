@@ -123,6 +123,7 @@ def replay(
     started = time.perf_counter()
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
+    left_out += _buried_towers(site, link)
     settings = Settings(engine, max_depth, samples, batch, variant)
     if relevance_db is None:
         paths = _search(scene, link, poses, settings, _cache(engine, cache_dir), progress)
@@ -191,6 +192,16 @@ class Scene:
         buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
         excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         return cls(faces, sources, usable, excluded)
+
+
+def _buried_towers(site: Site, link: Link) -> list[str]:
+    """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
+    lines = []
+    for name in link.tower_arrays:
+        for building in site.buildings:
+            if inside_solids(replace(site, buildings=(building,)), site.towers[name].position_m[None]).any():
+                lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
+    return lines
 
 
 def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:

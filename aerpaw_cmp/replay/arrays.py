@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..site.antennas import Isotropic
+from ..site.antennas import Isotropic as Isotropic  # noqa: PLC0414  re-exported
 from ..units import ComplexArray, FloatArray
 
 

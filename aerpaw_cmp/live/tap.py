@@ -28,6 +28,7 @@ from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
+from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
@@ -75,7 +76,7 @@ class Tap:
         self._session = uuid.uuid4().hex
         self._framer = Framer()
         self._redactor = Redactor()
-        self._log = SegmentLog(settings.folder, self._header, settings.log, self._clock, self._say)
+        self._log = LogWriter(SegmentLog(settings.folder, self._header, settings.log, self._clock))
         periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
             periods |= {name: int(1e9 / settings.other_hz) for name in settings.queries}
@@ -203,10 +204,12 @@ class Tap:
         if self._log_open:
             self._log.append(record)
             self._log.close()
+            for text in self._log.messages():
+                self._say(text)
         return TapSummary(
             reason=record["reason"],
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
-            segments=tuple(self._log.paths),
+            segments=self._log.paths,
             answers=answers,
             rates_hz=rates,
             missed=record["missed"],
@@ -466,7 +469,7 @@ class Tap:
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(middle, record.get("n", -1), decoded.values.get("rank"))
+                    self._worker.ask(middle, record["sent_utc_ns"], decoded.values.get("rank"))
             elif answer.status in ("error", "cme"):
                 self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":
@@ -517,7 +520,8 @@ class Tap:
         """Regular duties: clock, disk, alarm, status, end of the set time."""
         now = self._clock.mono_ns()
         if self._log_open:
-            self._log.tick()
+            for text in self._log.messages():
+                self._say(text)
             self._log_predictions()
         offset = self._clock.utc_ns() - now
         if abs(offset - self._offset_ns) > CLOCK_STEP_NS:
@@ -552,7 +556,7 @@ class Tap:
     def _flush_noise(self) -> None:
         if self._noise["not_kept"]:
             self._record(
-                {"kind": "noise", "lines": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
+                {"kind": "noise", "count": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
             )
         self._noise.clear()
 
@@ -592,7 +596,7 @@ class Tap:
             gaps=self._gaps,
             records=self._log.records,
             bytes_written=self._log.bytes_written,
-            disk_free_bytes=self._log.free_bytes(),
+            disk_free_bytes=self._log.free_bytes,
             missed=sum(self._schedule.missed.values()),
             predicted_rank=self._last["predicted"],
             predicts=self._worker is not None,

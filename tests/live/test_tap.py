@@ -306,12 +306,12 @@ def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):
     session.wait(lambda: len(served_and_read(sim, CSI)) >= 12)
     session.end()
     records, _ = tools.records_of(tmp_path / "log")
-    answers = {r["n"]: r for r in records if r["kind"] == "exchange"}
+    answers = {r["sent_utc_ns"]: r for r in records if r["kind"] == "exchange"}
     predictions = [r for r in records if r["kind"] == "prediction"]
     assert len(predictions) >= 5
     assert threads == {"tap-prediction"}
     for r in predictions:
-        assert answers[r["for_n"]]["decoded"]["rank"] == r["measured"] == 3
+        assert answers[r["for_sent_utc_ns"]]["decoded"]["rank"] == r["measured"] == 3
         assert r.get("residual") == (None if r["predicted"] is None else 1)
     assert "predicted" in format_status(session.statuses[-1])
 

@@ -23,7 +23,7 @@ from ..errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
-from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
+from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
@@ -121,6 +121,8 @@ class Tap:
                 self._early.clear()
                 if clock_synchronised() is False:
                     self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
+                if modem_manager() and self._info is not None and self._info.how != "given":
+                    self._say("ModemManager runs and may take the port when the modem comes back; see docs/tap.md")
                 self._poll_until_stopped()
         finally:
             summary = self._finish()

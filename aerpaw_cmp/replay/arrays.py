@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..site.antennas import Isotropic as Isotropic  # noqa: PLC0414  re-exported
+from ..site.antennas import Isotropic as Isotropic
 from ..units import ComplexArray, FloatArray
 
 

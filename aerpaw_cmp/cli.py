@@ -439,6 +439,10 @@ def map_(
         typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
     ] = None,
     logs_root: LogsRoot = None,
+    threshold_dbm: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="A level below it is out of coverage. Default: only no path is."),
+    ] = None,
     study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
     as_json: Json = False,
 ) -> None:
@@ -463,6 +467,7 @@ def map_(
         carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
         engine=engine,
         max_depth=max_depth,
+        threshold_dbm=threshold_dbm,
         study=study,
     )
     if as_json:

@@ -117,11 +117,17 @@ def run_report(
         ]
     with stages("audit"):
         engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    speed: tuple[Any, ...] = ()
+    if settings.report.speed_table and settings.rt.audit_links:
+        with stages("speed"):
+            from .speed import speed_rows
+
+            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
     with stages("report"):
         from .report.export import metrics as metrics_of
         from .report.export import write_report
 
-        record = _report_data(data, rss, rank, engine_record, stages)
+        record = _report_data(data, rss, rank, engine_record, speed, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -143,7 +149,9 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
     return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
 
 
-def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any, stages: Stages) -> Any:
+def _report_data(
+    data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
+) -> Any:
     from .comparison import inputs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
 
@@ -162,6 +170,7 @@ def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any,
         rss=tuple(r.panel for r in rss),
         rank=tuple(r.panel for r in rank),
         engine=engine,
+        speed=speed,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*settings.flight.notes, *data.site.notes),
@@ -366,6 +375,7 @@ def run_map(
     """
     from . import mapping
     from .comparison import versions
+    from .paper import paper_markdown
     from .report.maps_html import maps_metrics, write_maps
     from .site.siteyaml import load_site
 
@@ -385,6 +395,8 @@ def run_map(
     progress("page")
     record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
     written = write_maps(record, folder)
+    written.append(folder / "paper.md")
+    written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     return MapsOutcome(folder, (*written, *files), maps_metrics(record))
 
 

@@ -165,11 +165,21 @@ def holders(path: Path) -> list[Holder]:
     return sorted(found.values(), key=lambda h: h.pid)
 
 
+def modem_manager() -> Holder | None:
+    """ModemManager if it runs; its name can be seen even where its open files cannot."""
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):
+                if (process / "comm").read_text().strip() == "ModemManager":
+                    return Holder(int(process.name), "ModemManager")
+    return None
+
+
 def _busy(path: Path, others: list[Holder]) -> InputError:
     who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process that we may not look at"
     if len(others) > 4:
         who += f" and {len(others) - 4} more"
-    if any(h.name.startswith("ModemManager") for h in others):
+    if any(h.name == "ModemManager" for h in others) or (not others and modem_manager()):
         cause = (
             "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
             'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'

@@ -1,8 +1,8 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
-One thread, one command in flight. A record is in the kernel's hands before the next command goes out. The port may
-vanish and come back under another number, the disk may fill, the clock may step, signals may come: each leaves its
-own record, and the polling goes on.
+One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
+the disk stalls (:mod:`~aerpaw_cmp.live.writer`). The port may vanish and come back under another number, the disk may
+fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
 from __future__ import annotations
@@ -23,11 +23,12 @@ from ..errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
-from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
+from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
+from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
@@ -75,7 +76,7 @@ class Tap:
         self._session = uuid.uuid4().hex
         self._framer = Framer()
         self._redactor = Redactor()
-        self._log = SegmentLog(settings.folder, self._header, settings.log, self._clock, self._say)
+        self._log = LogWriter(SegmentLog(settings.folder, self._header, settings.log, self._clock))
         periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
             periods |= {name: int(1e9 / settings.other_hz) for name in settings.queries}
@@ -120,6 +121,8 @@ class Tap:
                 self._early.clear()
                 if clock_synchronised() is False:
                     self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
+                if modem_manager() and self._info is not None and self._info.how != "given":
+                    self._say("ModemManager runs and may take the port when the modem comes back; see docs/tap.md")
                 self._poll_until_stopped()
         finally:
             summary = self._finish()
@@ -203,10 +206,12 @@ class Tap:
         if self._log_open:
             self._log.append(record)
             self._log.close()
+            for text in self._log.messages():
+                self._say(text)
         return TapSummary(
             reason=record["reason"],
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
-            segments=tuple(self._log.paths),
+            segments=self._log.paths,
             answers=answers,
             rates_hz=rates,
             missed=record["missed"],
@@ -466,7 +471,7 @@ class Tap:
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(middle, record.get("n", -1), decoded.values.get("rank"))
+                    self._worker.ask(middle, record["sent_utc_ns"], decoded.values.get("rank"))
             elif answer.status in ("error", "cme"):
                 self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":
@@ -517,7 +522,8 @@ class Tap:
         """Regular duties: clock, disk, alarm, status, end of the set time."""
         now = self._clock.mono_ns()
         if self._log_open:
-            self._log.tick()
+            for text in self._log.messages():
+                self._say(text)
             self._log_predictions()
         offset = self._clock.utc_ns() - now
         if abs(offset - self._offset_ns) > CLOCK_STEP_NS:
@@ -552,7 +558,7 @@ class Tap:
     def _flush_noise(self) -> None:
         if self._noise["not_kept"]:
             self._record(
-                {"kind": "noise", "lines": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
+                {"kind": "noise", "count": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
             )
         self._noise.clear()
 
@@ -592,7 +598,7 @@ class Tap:
             gaps=self._gaps,
             records=self._log.records,
             bytes_written=self._log.bytes_written,
-            disk_free_bytes=self._log.free_bytes(),
+            disk_free_bytes=self._log.free_bytes,
             missed=sum(self._schedule.missed.values()),
             predicted_rank=self._last["predicted"],
             predicts=self._worker is not None,

@@ -137,6 +137,8 @@ def replay(
     else:
         cache = _cache(engine, cache_dir)
         paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+    paths, blocked = _above_terrain(site, scene, poses, paths)
+    left_out += blocked
     result = _evaluate(scene, link, poses, paths, engine, loss)
     return replace(
         result,
@@ -325,6 +327,34 @@ def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
             return None
         cache_dir = os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp"
     return PathCache(Path(cache_dir)) if str(cache_dir) else None
+
+
+def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tuple[PathSet, list[str]]:
+    """Paths that the site's elevation model lets through.
+
+    The traced ground is a plane per tower; the terrain only blocks. It is asked on the direct line between the ends,
+    whose shadow a ground reflection shares; a path over walls alone is asked on each of its segments.
+    """
+    if site.dem is None or len(paths) == 0:
+        return paths, []
+    source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
+    ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
+    over_ground = ground[paths.faces].any(axis=1)
+    straight = (paths.depth == 0) | over_ground
+    clear = np.ones(len(paths), dtype=np.bool_)
+    clear[straight] = site.dem.clear(source[straight], target[straight])
+    rows = np.flatnonzero(~straight)
+    start = source[rows]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        last = step == paths.vertices_m.shape[1]
+        corner = target[rows] if last else paths.vertices_m[rows, step]
+        end = np.where(np.isfinite(corner), corner, target[rows])
+        clear[rows] &= site.dem.clear(start, end)
+        start = end
+    lost = int((~clear).sum())
+    return paths.select(clear), [
+        f"{lost} of {len(paths)} paths end at the terrain of the elevation model"
+    ] if lost else []
 
 
 def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None) -> Replay:

@@ -148,6 +148,27 @@ def test_unplug_and_back_under_another_number(modem, tap, tools, tmp_path):
     assert {s.lines for s in sim.journal if s.command == CSI and s.read} <= logged
 
 
+def test_the_end_inside_a_gap(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) > 8)
+    sim.unplug()
+    session.wait(lambda: any("lost" in text for text in session.said))
+    summary = session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    assert [r["kind"] for r in records[-2:]] == ["gap", "end"]
+    assert records[-2]["state"] == "closed"
+    assert summary.gap_s > 0
+    assert not session.statuses[-1].connected
+
+
+def test_the_end_before_a_port_came(tap, tmp_path):
+    session = tap(tmp_path / "nothing", wait_for_port_s=60.0)
+    time.sleep(0.3)
+    summary = session.end()
+    assert (summary.exit_code, summary.segments, summary.records) == (0, (), 0)
+
+
 def test_a_reset_modem_is_set_up_again(modem, tap, tools, tmp_path):
     sim = modem(csi_on=False, faults=Faults(latency_s=0.0))
     session = tap(sim.port, enable_csi=True)
@@ -306,12 +327,12 @@ def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):
     session.wait(lambda: len(served_and_read(sim, CSI)) >= 12)
     session.end()
     records, _ = tools.records_of(tmp_path / "log")
-    answers = {r["n"]: r for r in records if r["kind"] == "exchange"}
+    answers = {r["sent_utc_ns"]: r for r in records if r["kind"] == "exchange"}
     predictions = [r for r in records if r["kind"] == "prediction"]
     assert len(predictions) >= 5
     assert threads == {"tap-prediction"}
     for r in predictions:
-        assert answers[r["for_n"]]["decoded"]["rank"] == r["measured"] == 3
+        assert answers[r["for_sent_utc_ns"]]["decoded"]["rank"] == r["measured"] == 3
         assert r.get("residual") == (None if r["predicted"] is None else 1)
     assert "predicted" in format_status(session.statuses[-1])
 

@@ -1,0 +1,134 @@
+"""Whole reports on real logs; skipped, saying so, where AERPAW_CMP_FIELD_DATA names none."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.ingest import Ingested, ingest
+from aerpaw_cmp.readers import ReadOptions
+
+ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
+pytestmark = [
+    pytest.mark.field,
+    pytest.mark.skipif(not ROOT or not Path(ROOT).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"),
+]
+FLIGHTS = {path.stem: path for path in sorted((Path(__file__).parent / "field").glob("*.yaml"))}
+RANK = ("nr_rank_flight1", "nr_rank_flight3")
+
+Metrics = dict[str, Any]
+Report = Callable[..., Metrics]
+
+
+@pytest.fixture(scope="module")
+def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
+    """Metrics of a flight file, through the command line; ``change`` alters a copy of the file, few replicates."""
+
+    @cache
+    def run(name: str, variant: str = "") -> Metrics:
+        folder = tmp_path_factory.mktemp(name + variant)
+        settings = yaml.safe_load(FLIGHTS[name].read_text(encoding="utf-8"))
+        settings.setdefault("rss", {})["bootstrap"] = 100
+        settings.setdefault("rank", {})["bootstrap"] = 100
+        settings["report"] = {"figure_formats": ["svg"], "speed_table": False}
+        if variant == "vertical":
+            settings["link"]["rank"]["tower"]["slant_deg"] = 0
+            settings["link"]["rank"]["uav"]["slant_deg"] = 0
+        flight = folder / "flight.yaml"
+        flight.write_text(yaml.safe_dump(settings), encoding="utf-8")
+        audit = "none" if variant else "20"
+        arguments = ["report", str(flight), "--logs-root", ROOT, "-o", str(folder / "out"), "--audit", audit]
+        assert main(arguments) == 0
+        page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+        assert "</html>" in page
+        metrics: Metrics = json.loads((folder / "out" / "metrics.json").read_text(encoding="utf-8"))
+        return metrics
+
+    return run
+
+
+@pytest.fixture(scope="module")
+def everything() -> Ingested:
+    return ingest(ROOT, options=ReadOptions(timezone="America/New_York"))
+
+
+@pytest.mark.parametrize("name", FLIGHTS)
+def test_report_completes_with_baselines_and_audit(report: Report, name: str) -> None:
+    metrics = report(name)
+    for tower in metrics["rss"].values():
+        for channel in tower.values():
+            assert channel["n"] > 3000
+            assert channel["rmse_ci95_db"][0] < channel["rmse_db"] < channel["rmse_ci95_db"][1]
+            assert set(channel["baselines"]) == {"free_space", "two_ray"}
+            assert not channel["at_search_edge"]
+    for tower in metrics["rank"].values():
+        assert set(tower["simulated"]) == {"10", "100", "1000"}
+    assert bool(metrics["rss"]) != bool(metrics["rank"])
+    audit = metrics["rt"]["audit"]
+    assert audit["links"] >= 20
+    assert audit["missing_paths"] == 0
+    assert audit["rss_max_error_db"] < 0.01
+    for file in metrics["inputs"]:
+        assert file["lines"] == file["accepted"] + file["rejected"] + file["blank"]
+
+
+@pytest.mark.parametrize("name", ["dataset12_40m", "dataset12_70m"])
+def test_free_space_leaves_what_an_independent_trial_left(report: Report, name: str) -> None:
+    expected = {"dataset12_40m": {"USRP1": 6.56, "USRP2": 5.47}, "dataset12_70m": {"USRP1": 7.14, "USRP2": 6.30}}[name]
+    found = {channel: m["baselines"]["free_space"]["rmse_db"] for channel, m in report(name)["rss"]["LW1"].items()}
+    assert found == pytest.approx(expected, abs=0.05)
+
+
+@pytest.mark.parametrize(("name", "limit"), [("nr_rank_flight1", 0.07), ("nr_rank_flight3", 0.10)])
+def test_slanted_ports_reproduce_the_histogram_of_measured_rank(report: Report, name: str, limit: float) -> None:
+    """The order of the slants was chosen on flight 1; flight 3 had no say."""
+    assert report(name)["rank"]["LW1"]["simulated"]["10"]["total_variation"] <= limit
+
+
+@pytest.mark.parametrize("name", RANK)
+def test_vertical_elements_do_not(report: Report, name: str) -> None:
+    assert report(name, "vertical")["rank"]["LW1"]["simulated"]["10"]["total_variation"] > 0.7
+
+
+@pytest.mark.parametrize("name", RANK)
+def test_histograms_agree_but_poses_hardly_do(report: Report, name: str) -> None:
+    """Which rank when is not predicted: agreement by pose stays near what independent draws would give."""
+    at_10 = report(name)["rank"]["LW1"]["simulated"]["10"]
+    assert 0.5 < at_10["agreement"] < 0.8
+    assert abs(at_10["kappa"]) < 0.25
+
+
+def test_every_folder_is_read_and_accounted_for(everything: Ingested) -> None:
+    assert len(everything) > 15
+    for file in everything:
+        result = file.result
+        assert result.lines == result.accepted + len(result.rejected) + result.blank, file.path
+        assert sum(len(s.frame) for s in result.streams if s.kind == "telemetry") <= result.accepted
+        assert all(line.reason and line.number >= 1 for line in result.rejected), file.path
+
+
+def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> None:
+    read = {Path(file.path).resolve() for file in everything}
+    skipped = {Path(file.path).resolve(): file.reason for file in everything.skipped}
+    there = {path.resolve() for path in Path(ROOT).rglob("*") if path.is_file() and not path.name.startswith(".")}
+    assert read | set(skipped) == there
+    assert not read & set(skipped)
+    assert all(skipped.values())
+
+
+def test_ingest_of_the_whole_folder_through_the_command_line(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    assert main(["ingest", ROOT, "--timezone", "America/New_York", "-o", str(tmp_path / "all.h5"), "--json"]) == 0
+    files = json.loads(capsys.readouterr().out)["files"]
+    assert len(files) > 15
+    assert all(f["lines"] == f["accepted"] + f["rejected"] + f["blank"] for f in files)
+    assert (tmp_path / "all.h5").stat().st_size > 1_000_000

@@ -28,6 +28,7 @@ from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
+from .teller import Teller
 from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
@@ -69,7 +70,7 @@ class Tap:
         clock: Clock | None = None,
     ) -> None:
         self._settings = settings
-        self._on_status = on_status
+        self._teller = None if on_status is None else Teller(on_status)
         self._stop = stop
         self._clock = clock or Clock()
         self._worker = None if predict is None else PredictionWorker(predict)
@@ -109,8 +110,7 @@ class Tap:
         try:
             self._first_connection()
         except BaseException:
-            if self._worker is not None:
-                self._worker.close()
+            self._close_helpers()
             raise
         try:
             if not self._stop.count:
@@ -127,6 +127,12 @@ class Tap:
         finally:
             summary = self._finish()
         return summary
+
+    def _close_helpers(self) -> None:
+        if self._worker is not None:
+            self._worker.close()
+        if self._teller is not None:
+            self._teller.close()
 
     def _first_connection(self) -> None:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
@@ -178,9 +184,7 @@ class Tap:
             self._advise(decoded)
 
     def _finish(self) -> TapSummary:
-        if self._port is not None and self._csi_changed and self._csi_before is not None and self._stop.count < 2:
-            with contextlib.suppress(PortGoneError):
-                self._exchange("csi_ctrl", csi_write(*self._csi_before))
+        restored = self._restore_csi()
         self._close_port()
         if self._gap_open is not None:
             self._close_gap("the session ended in the gap")
@@ -201,6 +205,7 @@ class Tap:
             "gap_s": self._gap_ns / 1e9,
             "duration_s": duration_s,
             "redacted": self._redactor.count,
+            "csi_restored": restored,
             **self._now(),
         }
         if self._log_open:
@@ -208,6 +213,8 @@ class Tap:
             self._log.close()
             for text in self._log.messages():
                 self._say(text)
+        if self._teller is not None:
+            self._teller.close()
         return TapSummary(
             reason=record["reason"],
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
@@ -223,6 +230,19 @@ class Tap:
             redacted=self._redactor.count,
             alarms=self._alarms,
         )
+
+    def _restore_csi(self) -> bool | None:
+        """Put CSI reporting back as it was; None if it was not changed."""
+        if not self._csi_changed:
+            return None
+        answer = None
+        if self._port is not None and self._csi_before is not None and self._stop.count < 2:
+            with contextlib.suppress(PortGoneError):
+                answer, _ = self._exchange("csi_ctrl", csi_write(*self._csi_before))
+        if answer is not None and answer.status == "ok":
+            return True
+        self._say("CSI reporting stays on: the modem could not be asked to switch it back")
+        return False
 
     # the port ---------------------------------------------------------------------------------------------
 
@@ -582,7 +602,7 @@ class Tap:
         self._show(self._redactor.clean(text))
 
     def _show(self, message: str) -> None:
-        if self._on_status is None:
+        if self._teller is None:
             return
         now = self._clock.mono_ns()
         while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
@@ -605,10 +625,7 @@ class Tap:
             alarm=self._alarm,
             message=message,
         )
-        try:
-            self._on_status(status)
-        except Exception:
-            self._on_status = None  # a broken terminal must not end the log
+        self._teller.tell(status)
 
     def _record(self, record: Record) -> None:
         if self._log_open:

@@ -43,6 +43,15 @@ class AntennaSettings(Settings):
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
+    installed_db: list[float] = []
+    """Gain that mast or airframe adds: cosine and sine of 1, 2, ... times the azimuth [dB], fitted on other flights."""
+
+    @field_validator("installed_db")
+    @classmethod
+    def _pairs(cls, value: list[float]) -> list[float]:
+        if len(value) % 2:
+            raise ValueError("installed_db must hold pairs: cosine and sine of 1, 2, ... times the azimuth")
+        return value
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -115,6 +124,13 @@ class ArraySettings(Settings):
 
 def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``."""
+    from .site.installed import InstalledPattern
+
+    alone = _pattern_alone(settings, folder)
+    return InstalledPattern(alone, tuple(settings.installed_db)) if settings.installed_db else alone
+
+
+def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
     from .site import antennas
 
     if settings.model == "dipole":

@@ -407,3 +407,69 @@ def site_show(
 
     for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
         print(path)
+
+
+@app.command("map", help=COMMANDS["map"])
+def map_(
+    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    out: Out = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
+    foliage: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="none, attenuating, opaque or all; may be repeated. Default: all."),
+    ] = None,
+    spacing: Annotated[Optional[float], typer.Option(help="Between positions [m]. Default: 30.")] = None,  # noqa: UP045
+    rss_altitude: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of RSS maps [m]; may be repeated. Default: 30, 70, 110."),
+    ] = None,
+    rank_altitude: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of rank maps [m]; may be repeated. Default: 3 and 30 to 110 by 10."),
+    ] = None,
+    k: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option("-k", "--k", help="Singular-value ratio; may be repeated. Default: 10, 100, 1000."),
+    ] = None,
+    carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
+    engine: Annotated[Optional[str], typer.Option(help="image or sionna.")] = None,  # noqa: UP045
+    max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
+    flight: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
+    ] = None,
+    logs_root: LogsRoot = None,
+    study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    as_json: Json = False,
+) -> None:
+    """Coverage and rank maps of a site, Kriging of rank."""
+    from . import run
+
+    if engine not in (None, "image", "sionna"):
+        raise UsageError(f"--engine {engine!r}", expected="image or sionna")
+    modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
+    outcome = run.run_map(
+        site,
+        out=out,
+        quick=quick,
+        flight=flight,
+        logs_root=logs_root,
+        progress=_say,
+        foliage=modes,
+        spacing_m=spacing,
+        rss_altitudes_m=tuple(sorted(set(rss_altitude))) if rss_altitude else None,
+        rank_altitudes_m=tuple(sorted(set(rank_altitude))) if rank_altitude else None,
+        ks=tuple(sorted(set(k))) if k else None,
+        carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
+        engine=engine,
+        max_depth=max_depth,
+        study=study,
+    )
+    if as_json:
+        _print_json(outcome.metrics)
+        return
+    rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
+    _table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
+    for path in outcome.files:
+        if path.parent == outcome.folder:
+            print(path)

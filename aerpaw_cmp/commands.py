@@ -11,7 +11,6 @@ COMMANDS: dict[str, str] = {
     "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
     "site": "Import a site from map data (import) or look at one (show).",
-    "campaign": "Many flights and settings, on this machine or on a Dask cluster.",
     "bench": "Speed against error of the replay on this machine.",
     "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
 }

@@ -1,4 +1,4 @@
-"""flight.yaml and campaign.yaml -> checked settings.
+"""flight.yaml -> checked settings.
 
 Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
 are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.
@@ -43,6 +43,8 @@ class AntennaSettings(Settings):
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
+    polarised: bool = True
+    """Use both field components of a text pattern; false: its total gain on the element's slant."""
     installed_db: list[float] = []
     """Gain that mast or airframe adds: cosine and sine of 1, 2, ... times the azimuth [dB], fitted on other flights."""
 
@@ -138,7 +140,7 @@ def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        return antennas.read_pattern_text(folder / str(settings.file))
+        return antennas.read_pattern_text(folder / str(settings.file), polarised=settings.polarised)
     if settings.model == "gain_grid":
         if settings.variable is None:
             raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")

@@ -13,8 +13,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import InputError
-from .readers import Reader, ReadOptions, by_name, identify
+from .errors import InputError, UsageError
+from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
 from .store import IngestedFile
 
 if TYPE_CHECKING:
@@ -54,24 +54,31 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
     InputError
         If the file is missing, not readable, no file, too large, or a damaged gzip file.
     """
-    place = Path(path)
-    try:
-        if place.is_dir():
-            raise InputError("a folder stands where a log is expected", path=path)
-        if not place.is_file() and place.exists():
-            raise InputError("not a regular file", expected="a log", path=path)
-        size = place.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=path)
-        raw = place.read_bytes()
-    except FileNotFoundError as error:
-        raise InputError("the file does not exist", cause="a misspelt path", path=path) from error
-    except PermissionError as error:
-        raise InputError("no permission to read", cause="the file belongs to another user", path=path) from error
-    except (OSError, ValueError) as error:
-        raise InputError(f"cannot be read ({error})", path=path) from error
+    raw = _raw(Path(path))
     digest = hashlib.sha256(raw).hexdigest()
     return (_gunzip(raw, path) if raw.startswith(_GZIP) else raw), digest
+
+
+def _raw(place: Path, limit: int | None = None) -> bytes:
+    """Bytes on disk, all or the first ``limit``."""
+    try:
+        if place.is_dir():
+            raise InputError("a folder stands where a log is expected", path=place)
+        if not place.is_file() and place.exists():
+            raise InputError("not a regular file", expected="a log", path=place)
+        size = place.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=place)
+        if limit is None:
+            return place.read_bytes()
+        with place.open("rb") as file:
+            return file.read(limit)
+    except FileNotFoundError as error:
+        raise InputError("the file does not exist", cause="a misspelt path", path=place) from error
+    except PermissionError as error:
+        raise InputError("no permission to read", cause="the file belongs to another user", path=place) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", path=place) from error
 
 
 def _gunzip(raw: bytes, path: str | Path) -> bytes:
@@ -150,20 +157,23 @@ def _is_folder(place: Path) -> bool:
 
 def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
     """Read one file; see :func:`ingest`."""
-    data, digest = read_bytes(path)
-    chosen = reader or identify(data, path=str(path))
-    if reader is not None and (not data.strip() or data.startswith(b"version https://git-lfs")):
+    place = Path(path)
+    head = _raw(place, HEAD_BYTES)
+    if reader is None and not head.startswith(_GZIP):
+        reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
+    data, digest = read_bytes(place)
+    if not data.strip() or data.startswith(b"version https://git-lfs"):
         identify(data, path=str(path))  # raises the message for an empty file or a pointer
-    return _read(Path(path), data, digest, chosen, options)
+    return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 
 
 def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
     given = options(path) if callable(options) else options or ReadOptions()
     try:
         result = reader.read(data, given)
-    except InputError as error:
-        if error.path is None:
-            raise InputError(
+    except (InputError, UsageError) as error:
+        if error.path is None:  # readers know bytes only
+            raise type(error)(
                 error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
             ) from error
         raise

@@ -117,11 +117,17 @@ def run_report(
         ]
     with stages("audit"):
         engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    speed: tuple[Any, ...] = ()
+    if settings.report.speed_table and settings.rt.audit_links:
+        with stages("speed"):
+            from .speed import speed_rows
+
+            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
     with stages("report"):
         from .report.export import metrics as metrics_of
         from .report.export import write_report
 
-        record = _report_data(data, rss, rank, engine_record, stages)
+        record = _report_data(data, rss, rank, engine_record, speed, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -143,15 +149,14 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
     return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
 
 
-def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any, stages: Stages) -> Any:
+def _report_data(
+    data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
+) -> Any:
     from .comparison import inputs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
 
     settings = data.settings
-    site_note = "Buildings and forests of this site are illustrative: they were not surveyed."
     warnings = list(data.warnings)
-    if data.site.illustrative and (data.site.buildings or settings.rt.foliage != "none"):
-        warnings.append(site_note)
     warnings += [w for result in (*rss, *rank) for w in result.warnings]
     return ReportData(
         title=settings.report.title or settings.flight.title or settings.flight.name,
@@ -165,6 +170,7 @@ def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any,
         rss=tuple(r.panel for r in rss),
         rank=tuple(r.panel for r in rank),
         engine=engine,
+        speed=speed,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*settings.flight.notes, *data.site.notes),
@@ -337,3 +343,71 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
         return rank or None
 
     return predict
+
+
+@dataclass(frozen=True, slots=True)
+class MapsOutcome:
+    """What ``aerpaw-cmp map`` made: the folder, its files (the page first) and metrics.json as a dict."""
+
+    folder: Path
+    files: tuple[Path, ...]
+    metrics: dict[str, Any]
+
+
+def run_map(
+    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
+    logs_root: Path | None = None, progress: Progress = _silent, **options: Any,
+) -> MapsOutcome:  # fmt: skip
+    """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
+
+    Parameters
+    ----------
+    site : str
+        site.yaml, or the name of a packaged site.
+    out : Path, optional
+        Folder of the results.
+    quick : bool
+        A coarse map; what ``options`` state still counts.
+    flight : Path, optional
+        flight.yaml whose track trains the test "along a flight".
+    options
+        Fields of :class:`aerpaw_cmp.mapping.MapSettings`; None leaves the default.
+    """
+    from . import mapping
+    from .comparison import versions
+    from .report.maps_html import maps_metrics, write_maps
+    from .site.siteyaml import load_site
+
+    given = {name: value for name, value in options.items() if value is not None}
+    settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+    place = load_site(site)
+    name = Path(site).stem
+    folder = out or Path("reports") / f"map-{name}"
+    outcome = mapping.make_maps(place, settings, progress)
+    if settings.study:
+        if flight is not None:
+            outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
+        mapping.study_maps(outcome, progress)
+    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    with outcome.stage("export", progress):
+        files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
+    progress("page")
+    record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
+    written = write_maps(record, folder)
+    return MapsOutcome(folder, (*written, *files), maps_metrics(record))
+
+
+def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
+    """East and north (n, 2) [m] of a flight, and its name."""
+    import numpy as np
+
+    from .comparison import track_of
+    from .config import load_flight
+    from .flight import gather, read_logs
+
+    settings = load_flight(flight)
+    track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
+    if track is None:
+        raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
+    line = np.column_stack([track.east_m, track.north_m])
+    return line[np.isfinite(line).all(axis=1)], settings.flight.name

@@ -7,7 +7,7 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -412,6 +412,9 @@ _RIVAL = 10.83
 _SCANNED = 6000
 """The search runs on at most this many samples; the refinement on all."""
 
+_INDEPENDENT = 0.7
+"""Share of the evidence of several channels that counts: one airframe and one path make their residuals alike."""
+
 _NEAR_EDGE = 0.86
 """A best lag beyond this share of the window may be the slope of a valley outside it."""
 
@@ -447,6 +450,8 @@ class LagFit:
         Lags searched on either side [s].
     curve_lag_s, curve_rmse_db : (m,)
         Residual against lag (without drift).
+    evidence : (m,)
+        Log-likelihood ratio by which every lag of the curve is worse than the best one.
     """
 
     lag_s: float
@@ -462,6 +467,7 @@ class LagFit:
     window_s: float
     curve_lag_s: FloatArray = field(repr=False)
     curve_rmse_db: FloatArray = field(repr=False)
+    evidence: FloatArray = field(repr=False)
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None, the curve is left out."""
@@ -499,9 +505,26 @@ class LagFit:
 class _Prediction:
     """A predicted level over the flight, sampled once and shifted as often as needed."""
 
-    def __init__(self, first: float, step: float, level: FloatArray) -> None:
-        self.first, self.step, self.level = first, step, level
-        self.slope = np.gradient(level, step)
+    def __init__(self, first: float, step: float, columns: FloatArray) -> None:
+        self.first, self.step, self.level = first, step, columns[:, 0]
+        self.slope = np.gradient(self.level, step)
+        self.terms = columns[:, 1:]
+        self.term_slopes = np.gradient(self.terms, step, axis=0) if self.terms.shape[1] else self.terms
+
+    def terms_at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
+        """The free terms at t, a constant first (n, 1 + terms); NaN as for :meth:`at`."""
+        source = self.terms if values is None else values
+        place = (t - self.first) / self.step
+        left = np.floor(place).astype(np.int64)
+        inside = (left >= 0) & (left < len(source) - 1)
+        left = np.where(inside, left, 0)
+        result = np.empty((len(t), 1 + source.shape[1]))
+        result[:, 0] = 1.0 if values is None else 0.0
+        if source.shape[1]:
+            weight = (place - left)[:, None]
+            result[:, 1:] = source[left] * (1.0 - weight) + source[left + 1] * weight
+            result[~inside, 1:] = np.nan
+        return result
 
     def at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """Linear interpolation at t; NaN outside and next to NaN."""
@@ -556,7 +579,9 @@ def estimate_lag(
         Levels [dB]; NaN does not count.
     predictor : callable
         ``predictor(times) -> level_db``: what should be measured at instants of the **telemetry** clock (free space,
-        two-ray or a replay), in the kind of ``times``; NaN where there is no pose or no path. Called once.
+        two-ray or a replay), in the kind of ``times``; NaN where there is no pose or no path. Called once. It may
+        give columns (n, 1 + terms): the level, and terms whose coefficients are fitted anew at every lag, such as
+        :func:`direction_terms` for antenna patterns that are not known.
     window_s : float
         Lags from ``-window_s`` to ``window_s`` are searched [s].
     resolution_s : float
@@ -594,9 +619,12 @@ def estimate_lag(
     as_time = np.asarray(times).dtype.kind != "f" and np.asarray(times).dtype.kind not in "iu"
     nanoseconds = np.round(grid * 1e9).astype(np.int64) + origin
     asked = nanoseconds.astype("datetime64[ns]") if as_time else nanoseconds * 1e-9
-    prediction = _Prediction(float(grid[0]), resolution_s, np.asarray(predictor(asked), dtype=np.float64).ravel())
-    if len(prediction.level) != len(grid):
-        raise ValueError(f"the predictor gave {len(prediction.level)} levels for {len(grid)} instants")
+    columns = np.asarray(predictor(asked), dtype=np.float64)
+    columns = columns[:, None] if columns.ndim == 1 else columns
+    if len(columns) != len(grid):
+        raise ValueError(f"the predictor gave {len(columns)} levels for {len(grid)} instants")
+    columns = np.where(np.isfinite(columns).all(axis=1, keepdims=True), columns, np.nan)
+    prediction = _Prediction(float(grid[0]), resolution_s, columns)
     keep = prediction.common(t, window_s + resolution_s)
     if keep.sum() < max(_FEWEST, 0.3 * len(t)):  # a short or gappy flight: let the samples vary with the lag
         keep = np.isfinite(prediction.at(t))
@@ -628,6 +656,7 @@ def _no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
         window_s,
         lags,
         np.full(len(lags), nan),
+        np.zeros(len(lags)),
     )
 
 
@@ -651,6 +680,49 @@ def _phi(residual: FloatArray) -> float:
     return float(np.clip(r[1:] @ r[:-1] / power, 0.0, 0.99)) if power > 0 else 0.0
 
 
+def _explained(y: FloatArray, terms: FloatArray, phi: float) -> FloatArray:
+    """What free terms (n, q) explain of y (n,), by least squares on values whitened with ``phi``."""
+    ok = np.isfinite(y) & np.isfinite(terms).all(axis=1)
+    a, b = terms[ok], y[ok]
+    a, b = a[1:] - phi * a[:-1], b[1:] - phi * b[:-1]
+    return np.asarray(np.einsum("ni,i->n", terms, _on_terms(a, b[None])[0]))
+
+
+def _on_terms(terms: FloatArray, rows: FloatArray) -> FloatArray:
+    """Least-squares coefficients (k, q) of each row (k, n) on terms (n, q).
+
+    Normal equations, as the few terms are of order one, with a floor under the rank. By einsum: for products this
+    small, BLAS wakes threads and waits for them, which on a busy machine took hundred times longer.
+    """
+    normal, right = np.einsum("ni,nj->ij", terms, terms), np.einsum("ni,kn->ik", terms, rows)
+    return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0].T)
+
+
+def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_deg: ArrayLike) -> FloatArray:
+    """Smooth terms that stand in for unknown antenna patterns when a lag is estimated.
+
+    Parameters
+    ----------
+    azimuth_deg, elevation_deg : array_like, (n,)
+        Direction of the UAV from the tower (clockwise from north; above the horizon).
+    relative_deg : array_like, (n,)
+        Direction of the tower relative to the UAV's nose; it turns when the UAV does, which is what ties a level to
+        the telemetry clock.
+
+    Returns
+    -------
+    ndarray, (n, 12)
+        Two harmonics of either azimuth, elevation and its square, and the first harmonic of the relative direction
+        times elevation.
+    """
+    azimuth, elevation, relative = (
+        np.radians(np.asarray(a, dtype=np.float64)) for a in (azimuth_deg, elevation_deg, relative_deg)
+    )
+    waves = [f(k * angle) for angle in (azimuth, relative) for k in (1, 2) for f in (np.cos, np.sin)]
+    tilted = [f(relative) * elevation for f in (np.cos, np.sin)]
+    return np.column_stack([elevation, elevation**2, *waves, *tilted])
+
+
 def _fit_lag(
     t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
 ) -> LagFit:
@@ -660,32 +732,39 @@ def _fit_lag(
     ts, ms = t[few], m[few]
     least = max(_FEWEST, len(ts) // 2)
 
-    def residual(lag: float, rate: float) -> FloatArray:
-        return ms - prediction.at(ts + lag + rate * (ts - middle))
+    def residual(lag: float, rate: float, phi: float = 0.0) -> FloatArray:
+        at = ts + lag + rate * (ts - middle)
+        y = ms - prediction.at(at)
+        return y - _explained(y, prediction.terms_at(at), phi) if prediction.terms.shape[1] else y
 
     def scan(phi: float, rate: float) -> FloatArray:
-        return np.array([_cost(residual(lag, rate), phi, least) for lag in lags])
+        return np.array([_cost(residual(lag, rate, phi), phi, least) for lag in lags])
 
     plain = scan(0.0, 0.0)
     if not np.isfinite(plain).any():
         return _no_lag("no prediction at the radio samples: the two logs do not overlap", 0, float(lags[-1]), lags)
     phi = _phi(residual(lags[_best(plain, lags)], 0.0))
-    rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if drifting else np.zeros(1)
+    # free terms bend towards a drift before a scan can tell; the refinement fits it from zero then
+    scanned = drifting and not prediction.terms.shape[1]
+    rates = _rates(float(t[-1] - t[0]), float(lags[1] - lags[0])) if scanned else np.zeros(1)
     table = np.stack([scan(phi, rate) for rate in rates])
-    row, column = np.unravel_index(_best(table, np.broadcast_to(lags, table.shape)), table.shape)
-    near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row])), phi, least))
+    row, column = divmod(_best(table, np.broadcast_to(lags, table.shape)), len(lags))
+    still = len(rates) // 2
+    if len(ts) * np.log(table[still].min() / table[row, column]) <= _RIVAL:  # no drift where none shows
+        row, column = still, _best(table[still], lags)
+    near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row]), phi), phi, least))
     start = np.array([near, rates[row]])[: 2 if drifting else 1]
     (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
     # last entry: a constant instead of the prediction
     cost = np.append(table.min(axis=0), _cost(np.where(np.isfinite(residual(lag, rate)), ms, np.nan), phi, least))
-    ratio = _likelihood_ratios(cost, _whitened(residual(float(lags[column]), float(rates[row])), phi))
+    ratio = _likelihood_ratios(cost, _whitened(residual(float(lags[column]), float(rates[row]), phi), phi))
     verdict, reason, interval = _judge(lag, width, ratio[:-1], lags, limit_s)
     if verdict == "ok" and ratio[-1] <= _RIVAL:
         verdict, reason = "ambiguous", "at its best lag the prediction explains no more than a constant"
     nan = float("nan")
     return LagFit(
         lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
-        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain),
+        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain), ratio[:-1],
     )  # fmt: skip
 
 
@@ -712,31 +791,42 @@ def _best(cost: FloatArray, lags: FloatArray) -> int:
 def _refine(
     t: FloatArray, m: FloatArray, prediction: _Prediction, middle: float, start: FloatArray
 ) -> tuple[tuple[float, float], tuple[float, float], float]:
-    """Gauss-Newton from the scan's optimum: (lag, drift), half widths of their 95 % intervals, RMSE [dB]."""
+    """Gauss-Newton from the scan's optimum: (lag, drift), half widths of their 95 % intervals, RMSE [dB].
+
+    Variable projection: constant and free terms are solved for at every step, so only lag and drift iterate.
+    """
     scale = np.array([1.0, max(1.0, 0.5 * float(t[-1] - t[0]))])[: len(start)]
     relative = np.stack([np.ones(len(t)), (t - middle) / scale[-1]])[: len(start)]
 
-    def evaluate(shift: FloatArray) -> tuple[FloatArray, FloatArray]:
+    def evaluate(shift: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Residual (n,); residual and Jacobian whitened, without what a constant and the free terms explain."""
         at = t + shift @ relative
-        r, slope = m - prediction.smooth_at(at), prediction.at(at, prediction.slope)
-        ok = np.isfinite(r) & np.isfinite(slope)
-        columns = np.vstack([r, -slope * relative])[:, ok]
-        return columns[0] - columns[0].mean(), columns[1:] - columns[1:].mean(axis=1, keepdims=True)
+        y, slope, terms = m - prediction.smooth_at(at), prediction.at(at, prediction.slope), prediction.terms_at(at)
+        ok = np.isfinite(y) & np.isfinite(slope) & np.isfinite(terms).all(axis=1)
+        y, slope, terms, along = y[ok], slope[ok], terms[ok], relative[:, ok]
+        base, b = terms[1:] - phi * terms[:-1], y[1:] - phi * y[:-1]
+        coefficients = _on_terms(base, b[None])[0]
+        if terms.shape[1] > 1:  # the free terms move with the lag too
+            moved = prediction.terms_at(at, prediction.term_slopes)[ok]
+            slope = slope + np.einsum("ni,i->n", moved, coefficients)
+        jacobian = -slope * along
+        columns = np.vstack([b, jacobian[:, 1:] - phi * jacobian[:, :-1]])
+        columns = columns - np.einsum("ki,ni->kn", _on_terms(base, columns), base)
+        return y - np.einsum("ni,i->n", terms, coefficients), columns[0], columns[1:]
 
     shift = start * scale
-    phi = _phi(evaluate(shift)[0])
+    phi = _phi(evaluate(shift, 0.0)[0])
     for _ in range(20):
-        r, jacobian = evaluate(shift)
-        rw, jw = r[1:] - phi * r[:-1], jacobian[:, 1:] - phi * jacobian[:, :-1]
-        step = -np.linalg.lstsq(jw.T, rw, rcond=None)[0]
+        _, rw, jw = evaluate(shift, phi)
+        step = -_on_terms(jw.T, rw[None])[0]
         size = float(np.abs(step).max())
         shift = shift + step * min(1.0, 0.3 / max(size, 1e-12))  # the valley is no wider than fractions of a second
         if size < 1e-5:
             break
-    if np.abs(shift - start * scale).max() > 0.5:  # no valley here: keep what the scan found
+    beyond = len(shift) > 1 and abs(shift[1] / scale[1]) > 1.2 * DRIFT_LIMIT
+    if beyond or np.abs(shift - start * scale).max() > 0.5:  # no valley here: keep what the scan found
         shift = start * scale
-    r, jacobian = evaluate(shift)
-    rw, jw = r[1:] - phi * r[:-1], jacobian[:, 1:] - phi * jacobian[:, :-1]
+    r, rw, jw = evaluate(shift, phi)
     width = _sandwich(rw, jw) / scale
     found = np.zeros(2)
     found[: len(start)] = shift / scale
@@ -799,6 +889,54 @@ def _judge(
     if abs(lag) > _NEAR_EDGE * float(lags[-1]):
         return "failed", "the best lag lies near the edge of the window: widen it, or look at the clocks", interval
     return "ok", "", interval
+
+
+def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> LagFit:
+    """One lag for channels that share a clock, from the evidence of all of them.
+
+    Parameters
+    ----------
+    fits : sequence of LagFit
+        Of the same window, such as the channels of one receiver. Failed ones take no part.
+    limit_s : float
+        As in :func:`estimate_lag`.
+
+    Returns
+    -------
+    LagFit
+        Log-likelihood ratios add up; RMSE is pooled, the drift is that of the channel with the narrowest interval.
+
+    Raises
+    ------
+    ValueError
+        If there is no fit, or windows differ.
+    """
+    if not fits or any(len(fit.curve_lag_s) != len(fits[0].curve_lag_s) for fit in fits):
+        raise ValueError("lags to combine must be at least one, and searched over the same window")
+    heard = [fit for fit in fits if np.isfinite(fit.lag_s)]
+    if len(heard) < 2:
+        return heard[0] if heard else fits[0]
+    lags = heard[0].curve_lag_s
+    total = np.sum([np.minimum(fit.evidence, 1e6) for fit in heard], axis=0) * _INDEPENDENT
+    total = total - total.min()
+    sharp = min(heard, key=lambda fit: fit.interval_s[1] - fit.interval_s[0])
+    best = float(lags[_best(np.where(total > 0, total, 0.0) + 1.0, lags)])
+    near = abs(sharp.lag_s - best) <= lags[1] - lags[0]  # the sharpest fit is finer than the grid
+    lag = sharp.lag_s if near else best
+    width = 0.5 * float(lags[1] - lags[0])
+    if near and sharp.verdict == "ok":
+        width = 0.5 * (sharp.interval_s[1] - sharp.interval_s[0])
+    verdict, reason, interval = _judge(lag, width, total, lags, limit_s)
+    count = sum(fit.n for fit in heard)
+
+    def pooled(name: str) -> float:
+        return float(np.sqrt(sum(fit.n * getattr(fit, name) ** 2 for fit in heard) / count))
+
+    curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in heard], axis=0) / count)
+    return LagFit(
+        lag, interval, sharp.drift_s_per_s, sharp.drift_interval_s_per_s, verdict, reason, sharp.reference, count,
+        pooled("rmse_db"), pooled("rmse_unshifted_db"), heard[0].window_s, lags, curve, total,
+    )  # fmt: skip
 
 
 # --- whole hours ---------------------------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def test_the_unchanged_flight_passes(run: Run, tmp_path: Path) -> None:
         ("lfs", {"power_log": "version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 5\n"}, 3, "Git-LFS"),
         ("other_kind", {"power_log": GOOD_TELEMETRY}, 3, "vehicle_out"),
         ("no_overlap", {"power_log": GOOD_POWER.replace("2025-06-01", "2025-06-03")}, 3, "no overlap"),
-        ("hours_off", {"power_log": GOOD_POWER.replace(" 10:", " 14:")}, 3, "-4 h"),
+        ("hours_off", {"power_log": GOOD_POWER.replace(" 10:", " 14:")}, 3, "stored as if they were UTC"),
         ("minus_999", {"vehicleOut": GOOD_TELEMETRY.replace("35.7274,", "-999,").replace("-78.69", "-999.69")}, 3, ""),
     ],
 )
@@ -87,6 +87,8 @@ def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], cod
         (("reader: sounder_log", "reader: sounder_lug"), "sounder_log"),
         (("channel: USRP1", "chanel: USRP1"), "'channel'"),
         (("audit_links: 0", "audit_links: many"), "audit_links"),
+        (("  - {path: power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}\n", ""), "RSS or rank"),
+        (("  - {path: vehicleOut.txt, reader: vehicle_out}\n", ""), "no telemetry"),
         (("rt: {audit_links: 0}", "rt: {audit_links: 0, max_depth: 9}"), "max_depth"),
     ],
 )

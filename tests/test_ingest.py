@@ -172,8 +172,24 @@ def test_wrong_reader_named(tmp_path: Path) -> None:
 
 
 def test_missing_zone_is_a_usage_error_even_in_a_folder(folder: Path) -> None:
-    with pytest.raises(UsageError, match="timezone:"):
+    with pytest.raises(UsageError, match="timezone:") as caught:
         ingest(folder)
+    assert str(folder / "a_power.txt") in str(caught.value)
+
+
+def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "samples.iq").write_bytes(b"\x01\x00" * 500_000)
+    (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
+    whole = Path.read_bytes
+
+    def watch(self: Path) -> bytes:
+        assert self.name != "samples.iq"
+        return whole(self)
+
+    monkeypatch.setattr(Path, "read_bytes", watch)
+    assert [skipped.reason for skipped in ingest(tmp_path, options=OPTIONS).skipped] == [
+        "binary content that no reader knows"
+    ]
 
 
 def test_reader_errors_name_the_file(tmp_path: Path) -> None:

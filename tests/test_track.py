@@ -12,7 +12,7 @@ import pytest
 
 from aerpaw_cmp.geodesy import SiteFrame
 from aerpaw_cmp.replay.arrays import rotation_from_aircraft
-from aerpaw_cmp.track import Track, body_rotation, clock_trap, estimate_lag
+from aerpaw_cmp.track import Track, body_rotation, clock_trap, combine_lags, direction_terms, estimate_lag
 
 FRAME = SiteFrame(35.7275, -78.6960)
 START = np.datetime64("2024-07-15T15:48:16", "ns")
@@ -364,6 +364,79 @@ def test_too_little_data_fails():
         estimate_lag(t, level(t), lambda x: x[:5])
 
 
+def patterned_flight(seed, pattern_db=6.0):
+    """A flight with sharp turns and a UAV pattern that the prediction does not know: (level, terms) of true time."""
+    knots = np.arange(-50.0, 700.0, 25.0)
+    heading = np.random.default_rng(seed).uniform(0, 360, len(knots))
+
+    def route(x):
+        leg = np.clip(np.searchsorted(knots, x, side="right") - 1, 0, len(knots) - 1)
+        turned = np.clip((x - knots[leg]) / 2.0, 0, 1)  # two seconds for a turn
+        before = heading[np.maximum(leg - 1, 0)]
+        yaw = before + turned * ((heading[leg] - before + 180) % 360 - 180)
+        angle = x / 120.0
+        east, north = 150 * np.cos(angle) + 30, 150 * np.sin(2 * angle)
+        azimuth = np.degrees(np.arctan2(east, north))
+        distance = np.sqrt(east**2 + north**2 + 30**2)
+        return -20 * np.log10(distance), azimuth, np.degrees(np.arcsin(30 / distance)), azimuth + 180 - yaw
+
+    def level(x):
+        free_space, _, _, relative = route(x)
+        return free_space + pattern_db * np.cos(np.radians(relative - 40))
+
+    def predictor(x):
+        free_space, azimuth, elevation, relative = route(x)
+        return np.column_stack([free_space, direction_terms(azimuth, elevation, relative)])
+
+    return level, predictor, lambda x: route(x)[0]
+
+
+def test_unknown_patterns_are_fitted_while_the_lag_is_found():
+    level, predictor, free_space = patterned_flight(1)
+    t = np.arange(0, 600, 0.25)
+    measured = level(t + 1.7) - 30 + np.random.default_rng(2).normal(0, 3, len(t))
+    fit = estimate_lag(t, measured, predictor)
+    assert fit.verdict == "ok", fit.reason
+    assert abs(fit.lag_s - 1.7) < 0.1
+    assert fit.interval_s[0] <= 1.7 <= fit.interval_s[1]
+    assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
+    # without the terms, the pattern that turns with the UAV hides the lag
+    assert estimate_lag(t, measured, free_space).verdict != "ok"
+
+
+def test_channels_that_share_a_clock_add_their_evidence():
+    t = np.arange(0, 300, 0.25)
+    fits = []
+    for seed in (3, 4):
+        level, predictor, _ = patterned_flight(1, pattern_db=1.2)
+        measured = level(t - 2.2) + np.random.default_rng(seed).normal(0, 3, len(t))
+        fits.append(estimate_lag(t, measured, predictor))
+    both = combine_lags(fits)
+    assert abs(both.lag_s + 2.2) < 0.5
+    assert both.n == sum(fit.n for fit in fits)
+    assert np.ptp(both.interval_s) <= max(np.ptp(fit.interval_s) for fit in fits)
+    assert both.interval_s[0] <= -2.2 <= both.interval_s[1]
+    assert combine_lags(fits[:1]) is fits[0]
+    failed = estimate_lag(t[:5], t[:5], predictor)
+    assert combine_lags([failed, fits[0]]) is fits[0]
+    assert combine_lags([failed, failed]) is failed
+    with pytest.raises(ValueError, match="same window"):
+        combine_lags([fits[0], estimate_lag(t, t, predictor, window_s=5.0)])
+    with pytest.raises(ValueError, match="at least one"):
+        combine_lags([])
+
+
+def test_no_drift_where_none_shows():
+    level = two_ray_flight(900)
+    t = np.arange(0, 900, 0.25)
+    noise = np.random.default_rng(9).normal(0, 3, len(t))
+    fit = estimate_lag(t, level(t + 1.0) + noise, level)
+    low, high = fit.drift_interval_s_per_s
+    assert low <= 0 <= high
+    flat = estimate_lag(t, noise, lambda x: np.zeros(len(x)))
+    assert flat.drift_s_per_s == 0.0
+
+
 def test_predictor_gaps_and_missing_levels_do_not_matter():
     level = two_ray_flight(300)
     t = np.arange(0, 300, 0.1)
@@ -394,30 +467,59 @@ def test_whole_hours_are_recognised():
     assert clock_trap(tuple(s - np.timedelta64(330, "m") for s in span), span).hours == 5.5
 
 
-@pytest.mark.field
-def test_track_of_a_real_flight():
+def real_flight(name):
+    """Track, epoch seconds and channels of a real flight, or skip."""
     folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
     if not folder:
         pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
     from scipy.io import loadmat
 
-    data = {
-        k: np.ravel(v)
-        for k, v in loadmat(Path(folder) / "dataset12" / "40m_fs10MHz.mat").items()
-        if k[0] == "m" or "power" in k
-    }
-    longitude, latitude = data["mX"].astype(float), data["mY"].astype(float)
-    if np.abs(longitude).mean() < np.abs(latitude).mean():
-        longitude, latitude = latitude, longitude
-    frame = telemetry(np.zeros(len(longitude)), 0, 0, 0)
-    epoch = data["timestamp_power"].astype(float)
+    found = loadmat(Path(folder) / "dataset12" / f"{name}.mat")
+    data = {k: np.ravel(v).astype(float) for k, v in found.items() if k[0] == "m" or k == "timestamp_power"}
+    epoch = data["timestamp_power"]
+    frame = telemetry(np.zeros(len(epoch)), 0, 0, 0)
     frame["time"] = pd.to_datetime(epoch, unit="s")
-    frame["latitude_deg"], frame["longitude_deg"], frame["altitude_m"] = latitude, longitude, data["mZ"].astype(float)
-    for name, key in (("roll_deg", "mRoll"), ("pitch_deg", "mPitch"), ("yaw_deg", "mYaw")):
-        frame[name] = data[key].astype(float)
-    track = Track(frame, FRAME)
+    # the authors' x and y are not the same axis in all their files: longitudes of Lake Wheeler are the negative ones
+    east, north = ("mX", "mY") if data["mX"].mean() < 0 else ("mY", "mX")
+    columns = {"longitude_deg": east, "latitude_deg": north, "altitude_m": "mZ"}
+    columns |= {"roll_deg": "mRoll", "pitch_deg": "mPitch", "yaw_deg": "mYaw"}
+    for ours, theirs in columns.items():
+        frame[ours] = data[theirs]
+    return Track(frame, SiteFrame(35.72750947, -78.69595819)), epoch, [data["mpower1"], data["mpower2"]]
+
+
+@pytest.mark.field
+@pytest.mark.parametrize(("name", "height"), [("40m_fs10MHz", 40), ("70m_fs20MHz", 70)])
+def test_track_of_a_real_flight(name, height):
+    track, epoch, _ = real_flight(name)
     poses = track.pose_at(epoch)
     assert poses.valid.mean() > 0.99
-    assert poses.position_m[:, 2].max() == pytest.approx(40, abs=3)
+    assert np.nanmax(poses.position_m[:, 2]) == pytest.approx(height, abs=3)
     speed = np.linalg.norm(poses.velocity_mps[:, :2], axis=1)
     assert 3 < np.nanmax(speed) < 25
+    assert poses.attitude_known.mean() > 0.99
+
+
+@pytest.mark.field
+@pytest.mark.parametrize("name", ["40m_fs10MHz", "70m_fs20MHz"])
+def test_real_clocks_agree_as_far_as_the_data_can_tell(name):
+    """Free space alone says nothing about the lag; with direction terms the interval shrinks to a few seconds."""
+    track, epoch, channels = real_flight(name)
+
+    def predictor(times):
+        poses = track.pose_at(times)
+        line = poses.position_m - np.array([0.0, 0.0, 10.0])
+        distance = np.linalg.norm(line, axis=1)
+        azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+        level = np.where(poses.position_m[:, 2] > 15, -20 * np.log10(distance), np.nan)
+        elevation = np.degrees(np.arcsin(line[:, 2] / distance))
+        return np.column_stack([level, direction_terms(azimuth, elevation, azimuth + 180 - poses.heading_deg)])
+
+    alone = estimate_lag(epoch, channels[0], lambda times: predictor(times)[:, 0], resolution_s=0.1)
+    assert alone.verdict == "ambiguous"
+    both = combine_lags([estimate_lag(epoch, level, predictor, resolution_s=0.1) for level in channels])
+    assert both.verdict != "failed"
+    assert abs(both.lag_s) < 1.5
+    assert both.interval_s[0] < 1.0
+    assert np.ptp(both.interval_s) < 0.6 * np.ptp(alone.interval_s)
+    assert both.rmse_db < 3.7

@@ -364,7 +364,8 @@ def share_interval(share: float, spread: float, known: Memory) -> Interval:
     z2 = 1.959964**2
     centre = (share + z2 / (2 * size)) / (1 + z2 / size)
     reach = np.sqrt(z2 * (share * (1 - share) / size + z2 / (4 * size**2))) / (1 + z2 / size)
-    return max(0.0, float(centre - reach)), min(1.0, float(centre + reach))
+    low, high = float(centre - reach), float(centre + reach)
+    return (0.0 if share == 0.0 else max(0.0, low)), (1.0 if share == 1.0 else min(1.0, high))
 
 
 @dataclass(frozen=True, slots=True)

@@ -31,6 +31,10 @@ class ExportSummary:
     rows: int
     bad_lines: tuple[BadLine, ...]
 
+    def __str__(self) -> str:
+        bad = f", {len(self.bad_lines)} damaged lines left out" if self.bad_lines else ""
+        return f"{self.path}: {self.rows} rows{bad}"
+
 
 def _word(value: object) -> str:
     """A word that no spreadsheet takes for a formula."""

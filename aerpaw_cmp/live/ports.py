@@ -166,14 +166,16 @@ def holders(path: Path) -> list[Holder]:
 
 
 def _busy(path: Path, others: list[Holder]) -> InputError:
-    who = ", ".join(f"{h.name} (process {h.pid})" for h in others) or "a process that we may not look at"
+    who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process that we may not look at"
+    if len(others) > 4:
+        who += f" and {len(others) - 4} more"
     if any(h.name.startswith("ModemManager") for h in others):
         cause = (
             "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
             'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'
         )
     elif others:
-        cause = f"another program or another tap reads it; end it with 'kill {others[0].pid}'"
+        cause = f"another program or another tap reads it; to end it: 'kill {others[0].pid}'"
     else:
         cause = f"see 'sudo fuser -v {path}'"
     return InputError(f"the port is held by {who}", expected="a port for the tap alone", cause=cause, path=path)
@@ -215,13 +217,15 @@ class SerialPort:
             If we may not open it, another process holds it, or it is no serial port.
         """
         try:
-            others = holders(path)
-            if others:
-                raise _busy(path, others)
             fd = os.open(path, os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK | os.O_CLOEXEC)
         except OSError as error:
             raise cls._open_error(path, error) from None
         try:
+            if not os.isatty(fd):
+                raise OSError(errno.ENOTTY, os.strerror(errno.ENOTTY))
+            others = holders(path)  # before anything is changed on a port that another one uses
+            if others:
+                raise _busy(path, others)
             fcntl.flock(fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
             fcntl.ioctl(fd, termios.TIOCEXCL)
             make_raw(fd, baud)

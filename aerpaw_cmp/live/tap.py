@@ -568,7 +568,7 @@ class Tap:
     # telling ----------------------------------------------------------------------------------------------
 
     def _say_once(self, text: str) -> None:
-        if text not in self._said:
+        if text not in self._said and len(self._said) < 100:  # texts of others may differ every time
             self._said.add(text)
             self._say(text)
 

@@ -27,6 +27,7 @@ from ..errors import UsageError
 from ..units import FloatArray, IntArray
 from . import neighbours as choose
 from .grid import Grid, serving_tower
+from .kriging import coverage_patterns
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -197,7 +198,7 @@ class _Local:
         if len(fields) != len(self.points_m_):
             raise UsageError(f"{len(fields)} values for {len(self.points_m_)} points")
         self._one_field = fields.ndim == 1
-        self.values_ = fields.reshape(len(fields), -1)
+        self.values_ = fields[:, None] if self._one_field else fields
         return self
 
     def predict(self, targets_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
@@ -210,9 +211,7 @@ class _Local:
 
     def _estimate(self, targets: FloatArray, *, leave_out: bool) -> tuple[FloatArray, FloatArray]:
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
-        patterns, group = np.unique(np.isfinite(self.values_), axis=1, return_inverse=True)
-        for number in range(patterns.shape[1]):
-            kept, columns = patterns[:, number], np.flatnonzero(group.ravel() == number)
+        for kept, columns in coverage_patterns(self.values_):
             samples, values = self.points_m_[kept], self.values_[np.ix_(kept, columns)]
             skip = None
             if leave_out:
@@ -324,7 +323,7 @@ class ServingTowerMean:
         """Sum the samples (n, dims) with values (n,) or (n, fields) by tower; NaN does not count."""
         fields = np.asarray(values, dtype=np.float64)
         self._one_field = fields.ndim == 1
-        self.values_ = fields.reshape(len(fields), -1)
+        self.values_ = fields[:, None] if self._one_field else fields
         self.tower_ = serving_tower(points_m, self.towers_m)
         finite = np.isfinite(self.values_)
         towers = len(np.asarray(self.towers_m))

@@ -5,32 +5,21 @@ The replay engine is handed in as a function, so that nothing here knows an engi
     evaluate(position_m (n, 3), tower_names) -> Evaluation
 
 It is called for one altitude and at most ``chunk`` positions at a time; what grows with the number of altitudes is
-the result alone (RSS 8 bytes, rank 1 byte per tower, position and K).
+the result alone: per tower and position 16 bytes of RSS, 16 bytes of singular-value ratios, 1 byte of rank per K.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
-from typing import Literal
+from dataclasses import dataclass
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from ..errors import UsageError
 from ..units import BoolArray, FloatArray, IntArray, db_from_power
-from .evaluate import (
-    IntervalCoverage,
-    Predictor,
-    Score,
-    along_trajectory,
-    altitude_held_out,
-    blocked,
-    interval_coverage,
-    learning_curve,
-    leave_one_out_estimate,
-    score,
-)
 from .grid import (
     Border,
     Grid,
@@ -39,19 +28,6 @@ from .grid import (
     class_shares,
     serving_tower,
     voronoi_borders,
-    without_coverage_as_nan,
-)
-from .interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
-from .kriging import OrdinaryKriging
-from .variogram import (
-    PAPER_BIEXPONENTIAL,
-    BiExponential,
-    BinnedCorrelation,
-    field_correlation,
-    fit_biexponential,
-    fit_vertical_scale,
-    vector_correlation,
-    vertical_correlation,
 )
 
 PAPER_RSS_ALTITUDES_M = (30.0, 70.0, 110.0)
@@ -292,241 +268,91 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
     """Maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
-    found = []
+    found = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
     for tower in (None, *(result.tower_names if towers_too else ())):
-        who, of = tower or "joint", f", {tower}" if tower else ", nearest tower"
-        for antennas in ("siso", "mimo"):
-            for row, height in enumerate(result.rss_altitudes_m):
-                values = result.rss("siso" if antennas == "siso" else "mimo", tower)[row]
-                found.append(
-                    Layer(
-                        f"rss_{antennas}_h{height:03.0f}m_{who}",
-                        values,
-                        "dBm",
-                        f"RSS {antennas.upper()}, {height:g} m{of}",
-                    )
-                )
-        for row, height in enumerate(result.rank_altitudes_m):
-            for column, k in enumerate(result.ks):
-                found.append(
-                    Layer(
-                        f"rank_k{k:g}_h{height:03.0f}m_{who}".replace("+", ""),
-                        result.ranks(tower)[row, column],
-                        "1",
-                        f"Rank, K = {k:g}, {height:g} m{of}",
-                        class_names(HIGHEST_RANK),
-                    )
-                )
-            for name, title, values in (
-                ("spread", "Singular-value spread s1/s2", result.spread_db),
-                ("condition", "Condition number s1/s4", result.condition_db),
-            ):
-                found.append(
-                    Layer(
-                        f"{name}_h{height:03.0f}m_{who}",
-                        result._of(values, tower)[row],
-                        "dB",
-                        f"{title}, {height:g} m{of}",
-                    )
-                )
-    serving = Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)
-    return [serving, *found]
+        found += _rss_layers(result, tower)
+        found += _rank_layers(result, tower)
+    return found
 
 
-# --- correlation and interpolation of the maps ---------------------------------------------------------------------
+def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
+    who, of = _label(tower)
+    found = []
+    kinds: tuple[Antennas, ...] = ("siso", "mimo")
+    for antennas in kinds:
+        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
+            name = f"rss_{antennas}_h{_in_name(height)}m_{who}"
+            found.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
+    return found
 
 
-@dataclass(frozen=True, slots=True)
-class Study:
-    """The paper's section VII-C on maps: correlation, curve, and leave-one-out errors of each interpolator.
-
-    Parameters
-    ----------
-    correlation : BinnedCorrelation
-        Of the positions' vectors.
-    fit : BiExponential
-        The curve through it.
-    scores : mapping of str to Score
-        "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
-        shape (altitudes, K).
-    intervals : IntervalCoverage
-        Of the Kriging variance with one v^2 per map: its sample variance.
-    intervals_paper : IntervalCoverage
-        With the paper's v^2, the variance over the altitudes at each position; positions with v^2 = 0 do not count.
-    """
-
-    correlation: BinnedCorrelation
-    fit: BiExponential
-    scores: Mapping[str, Score]
-    intervals: IntervalCoverage
-    intervals_paper: IntervalCoverage
-
-
-def rank_fields(
-    result: MapResult, lowest_altitude_m: float = 30.0, out_of_coverage: Literal["missing", "zero"] = "missing"
-) -> tuple[tuple[float, ...], FloatArray]:
-    """Altitudes and joint ranks (n, altitudes, K) to interpolate; the paper leaves 3 m out.
-
-    ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
-    """
-    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= lowest_altitude_m]
-    rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
-    heights = tuple(result.rank_altitudes_m[i] for i in rows)
-    return heights, without_coverage_as_nan(rank) if out_of_coverage == "missing" else rank
-
-
-def rank_study(
-    result: MapResult,
-    *,
-    lowest_altitude_m: float = 30.0,
-    out_of_coverage: Literal["missing", "zero"] = "missing",
-    neighbours: int = 20,
-    radius_m: float = 150.0,
-    selection: Literal["nearest", "random"] = "nearest",
-    seed: int = 0,
-) -> Study:
-    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`."""
-    _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
-    return interpolation_study(
-        result.grid, rank, result.towers_m, neighbours=neighbours, radius_m=radius_m, selection=selection, seed=seed
+def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
+    who, of = _label(tower)
+    ratios = (
+        ("spread", "Singular-value spread s1/s2", result._of(result.spread_db, tower)),
+        ("condition", "Condition number s1/s4", result._of(result.condition_db, tower)),
     )
+    ranks, found = result.ranks(tower), []
+    for row, height in enumerate(result.rank_altitudes_m):
+        at = f"h{_in_name(height)}m_{who}"
+        for column, k in enumerate(result.ks):
+            title = f"Rank, K = {k:g}, {height:g} m{of}"
+            found.append(
+                Layer(f"rank_k{_in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
+            )
+        for name, title, values in ratios:
+            found.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
+    return found
 
 
-def interpolation_study(
-    grid: Grid,
-    values: FloatArray,
-    towers_m: FloatArray,
-    *,
-    neighbours: int = 20,
-    radius_m: float = 150.0,
-    selection: Literal["nearest", "random"] = "nearest",
-    seed: int = 0,
-) -> Study:
-    """Correlation and leave-one-out interpolation of maps.
+def _label(tower: str | None) -> tuple[str, str]:
+    """How a layer's name and title speak of a tower."""
+    return (re.sub(r"\W", "_", tower), f", {tower}") if tower else ("joint", ", nearest tower")
 
-    Parameters
-    ----------
-    grid : Grid
-        Positions.
-    values : (n, altitudes, K)
-        Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
-    towers_m : (towers, 2+)
-        For the serving-tower mean.
-    neighbours, radius_m, selection, seed
-        M, r0 and the choice of samples, the same for every local interpolator.
-    """
-    points = grid.points_m
-    correlation = vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
-    fit = _curve(correlation)
-    kriging = OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed)
-    estimate, variance = leave_one_out_estimate(kriging, points, values)
-    peers: dict[str, Predictor] = {
-        "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
-        "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
-        "nearest": Nearest(radius_m),
-        "inverse distance": InverseDistance(neighbours, radius_m),
-        "serving-tower mean": ServingTowerMean(towers_m),
+
+def _in_name(number: float, digits: int = 3) -> str:
+    """030 for 30, 12p5 for 12.5."""
+    return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
+
+
+def summary_of(result: MapResult) -> dict[str, Any]:
+    """Numbers of the maps for ``metrics.json`` and ``--json``; NaN becomes null in :mod:`~aerpaw_cmp.maps.export`."""
+    rows, columns = result.grid.shape
+    content: dict[str, Any] = {
+        "grid": {"positions": len(result.grid), "rows": rows, "columns": columns, "spacing_m": result.grid.spacing_m},
+        "towers": {
+            name: {"served": int((result.serving == i).sum()), "position_m": result.towers_m[i]}
+            for i, name in enumerate(result.tower_names)
+        },
+        "rss": {tower or "joint": _rss_summary(result, tower) for tower in (None, *result.tower_names)},
+        "rank": {tower or "joint": _rank_summary(result, tower) for tower in (None, *result.tower_names)},
     }
-    scores = {"Kriging": score(values, estimate)}
-    scores |= {name: score(values, leave_one_out_estimate(peer, points, values)[0]) for name, peer in peers.items()}
-    sill = kriging.sill_.reshape(values.shape[1:])
-    relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
-    return Study(
-        correlation,
-        fit,
-        scores,
-        interval_coverage(values, estimate, variance),
-        interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
-    )
+    return content
 
 
-def altitude_variance(values: FloatArray) -> FloatArray:
-    """The paper's v^2 (n, K): sample variance over the altitudes of (n, altitudes, K); NaN below two values."""
-    known = np.isfinite(values)
-    count = known.sum(axis=1)
-    mean = np.where(known, values, 0.0).sum(axis=1) / np.maximum(count, 1)
-    squares = np.where(known, values - mean[:, None], 0.0) ** 2
-    return np.asarray(np.where(count > 1, squares.sum(axis=1) / np.maximum(count - 1, 1), np.nan))
+def _rss_summary(result: MapResult, tower: str | None) -> dict[str, Any]:
+    found: dict[str, Any] = {}
+    kinds: tuple[Antennas, ...] = ("siso", "mimo")
+    for antennas in kinds:
+        found[antennas] = []
+        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
+            covered = values[np.isfinite(values)]
+            low, middle, high = np.percentile(covered, [10, 50, 90]) if covered.size else [np.nan] * 3
+            row = {"altitude_m": height, "coverage": covered.size / max(values.size, 1)}
+            row |= {
+                "out_of_coverage": values.size - covered.size,
+                "p10_dbm": low,
+                "median_dbm": middle,
+                "p90_dbm": high,
+            }
+            found[antennas].append(row)
+    return found
 
 
-def _curve(correlation: BinnedCorrelation) -> BiExponential:
-    if np.isfinite(correlation.correlation[1:]).any():
-        return fit_biexponential(correlation.distance_m, correlation.correlation)
-    reason = "no two positions have varying rank vectors: the paper's curve stands in"
-    return replace(PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
-
-
-@dataclass(frozen=True, slots=True)
-class HonestStudy:
-    """Kriging where no near neighbour gives the answer away. Scores have the shape (altitudes, K).
-
-    Parameters
-    ----------
-    blocked : Score
-        One square block of the area left out at a time.
-    altitude_held_out : Score
-        One altitude left out at a time, predicted in 3-D.
-    vertical_scale : float
-        Anisotropy used for it, fitted to the correlation of the altitudes' maps.
-    trajectory : Score or None
-        Trained on the cells of a flight only.
-    learning_sizes : tuple of int
-        Numbers of random samples.
-    learning_mae : (sizes, altitudes, K)
-        MAE at the other positions.
-    """
-
-    blocked: Score
-    altitude_held_out: Score
-    vertical_scale: float
-    trajectory: Score | None
-    learning_sizes: tuple[int, ...]
-    learning_mae: FloatArray
-
-
-def honest_study(
-    grid: Grid,
-    altitudes_m: Sequence[float],
-    values: FloatArray,
-    fit: BiExponential,
-    *,
-    trajectory_m: ArrayLike | None = None,
-    block_m: float = 300.0,
-    learning_sizes: Sequence[int] = (25, 50, 100, 200, 400, 800, 1600),
-    neighbours: int = 20,
-    seed: int = 0,
-) -> HonestStudy:
-    """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
-
-    Parameters
-    ----------
-    grid, altitudes_m, values
-        Maps (n, altitudes, K), as in :func:`interpolation_study`.
-    fit : BiExponential
-        Of :class:`Study`.
-    trajectory_m : (samples, 2+), optional
-        A flight [m].
-    block_m : float
-        Side of the blocks.
-    learning_sizes : sequence of int
-        Those not below the number of positions are left out.
-    neighbours, seed
-        M; seed of the learning curve.
-    """
-    points = grid.points_m
-    wide = OrdinaryKriging(fit, neighbours, outside="nearest")
-    horizontal = field_correlation(points, values, width_m=grid.spacing_m)
-    across = vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
-    in_space = _curve(horizontal)
-    varies = np.isfinite(across.correlation[1:]).any()
-    scale = fit_vertical_scale(in_space, across) if varies else 1.0
-    space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
-    sizes = tuple(size for size in learning_sizes if size < len(grid))
-    return HonestStudy(
-        blocked(wide, points, values, block_m),
-        altitude_held_out(space, points, altitudes_m, values),
-        scale,
-        None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
-        sizes,
-        learning_curve(wide, points, values, sizes, seed=seed),
-    )
+def _rank_summary(result: MapResult, tower: str | None) -> list[dict[str, Any]]:
+    shares = result.rank_shares(tower)
+    return [
+        {"altitude_m": height, "k": k, "shares": dict(zip(class_names(HIGHEST_RANK), shares[row, column], strict=True))}
+        for row, height in enumerate(result.rank_altitudes_m)
+        for column, k in enumerate(result.ks)
+    ]

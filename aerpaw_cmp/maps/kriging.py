@@ -16,9 +16,10 @@ nugget
 places
     Samples at the same place (to a micrometre) become one, their mean; leaving one out leaves out the place.
 near-singular systems
-    A system whose condition number (1-norm) exceeds 1e10 is solved in the space of weights that sum to 1 by an
-    eigenvalue decomposition; directions with less than 1e-10 of the largest variance, and those that an invalid
-    correlation makes negative, are dropped. In dropped directions the weights stay equal.
+    A system whose condition number (1-norm) exceeds 1e10, or whose variances are not all positive (a correlation
+    that is no covariance), is solved in the space of weights that sum to 1 by an eigenvalue decomposition.
+    Directions with less than 1e-10 of the largest variance, or less than the most negative one, are dropped. In
+    dropped directions the weights stay equal.
 out of coverage
     NaN values take no part, field by field.
 too few samples
@@ -168,7 +169,7 @@ class OrdinaryKriging:
         if np.isinf(fields).any():
             raise UsageError("an infinite sample value", expected="finite values, NaN where out of coverage")
         self._one_field = fields.ndim == 1
-        fields = fields.reshape(len(points), -1)
+        fields = fields[:, None] if self._one_field else fields
         self.points_m_, self.values_, self.place_ = _merge_places(points, fields)
         self.sill_ = self._sill_of(self.values_)
         return self
@@ -230,7 +231,7 @@ class OrdinaryKriging:
         """Estimate and variance (targets, fields); ``own`` is the place that each target must not use."""
         estimate = np.full((len(targets), self.values_.shape[1]), np.nan)
         variance = np.full_like(estimate, np.nan)
-        for kept, columns in _coverage_patterns(self.values_):
+        for kept, columns in coverage_patterns(self.values_):
             skip = None
             if own is not None:
                 new_number = np.full(len(self.points_m_), -1, dtype=np.int64)
@@ -298,7 +299,7 @@ class OrdinaryKriging:
             to_target = np.where(here, 0.0, to_target)
         weight, lagrange, fine = _solve_bordered(gamma, to_target)
         variance = (weight * to_target).sum(axis=1) + lagrange
-        fine &= variance >= -1e-9
+        fine &= (variance >= -1e-9) & _is_definite(gamma)
         if not fine.all():
             weight[~fine] = _solve_reduced(gamma[~fine], to_target[~fine])
             variance[~fine] = _variance_of(weight[~fine], gamma[~fine], to_target[~fine])
@@ -338,14 +339,34 @@ def _solve_reduced(gamma: FloatArray, to_target: FloatArray) -> FloatArray:
     m = to_target.shape[1]
     if m == 1:
         return np.ones((len(to_target), 1))
-    basis = helmert(m)  # (m - 1, m): orthonormal, each row sums to 0
-    spread = -basis @ gamma @ basis.T
+    basis = helmert(m)
+    spread = _contrasts(gamma)
     right = basis @ (gamma.mean(axis=2) - to_target)[:, :, None]
     level, direction = np.linalg.eigh((spread + spread.transpose(0, 2, 1)) / 2)
-    kept = level > np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT
+    kept = level > np.maximum(np.maximum(level[:, -1:], 1e-300) / CONDITION_LIMIT, -level[:, :1])
     along = (direction.transpose(0, 2, 1) @ right)[:, :, 0]
     along = np.where(kept, along / np.where(kept, level, 1.0), 0.0)
     return np.asarray(1.0 / m + (direction @ along[:, :, None])[:, :, 0] @ basis)
+
+
+def _contrasts(gamma: FloatArray) -> FloatArray:
+    """Covariance (t, m - 1, m - 1) of orthonormal contrasts of the samples: positive definite for a covariance."""
+    from scipy.linalg import helmert
+
+    basis = helmert(gamma.shape[1])  # (m - 1, m): orthonormal, each row sums to 0
+    return np.asarray(-basis @ gamma @ basis.T)
+
+
+def _is_definite(gamma: FloatArray) -> BoolArray:
+    """Whether all variances of each system are positive (t,)."""
+    if gamma.shape[1] < 2:
+        return np.ones(len(gamma), dtype=bool)
+    covariance = _contrasts(gamma)
+    try:
+        np.linalg.cholesky(covariance)
+    except np.linalg.LinAlgError:  # at least one is not; the slower way tells which
+        return np.asarray(np.linalg.eigvalsh(covariance)[:, 0] > 0)
+    return np.ones(len(gamma), dtype=bool)
 
 
 def _variance_of(weight: FloatArray, gamma: FloatArray, to_target: FloatArray) -> FloatArray:
@@ -378,8 +399,10 @@ def _reference(values: FloatArray) -> FloatArray:
     return np.asarray(np.where(finite.any(axis=0), first, 0.0))
 
 
-def _coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
+def coverage_patterns(values: FloatArray) -> Iterator[tuple[BoolArray, IntArray]]:
     """Fields grouped by where they have values: (kept places, field numbers)."""
+    if not values.size:
+        return
     patterns, group = np.unique(np.isfinite(values), axis=1, return_inverse=True)
     for number in range(patterns.shape[1]):
         yield patterns[:, number], np.flatnonzero(group.ravel() == number)

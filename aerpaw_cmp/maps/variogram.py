@@ -1,4 +1,4 @@
-"""How alike the channel is at two positions: correlation against distance, and the curve through it.
+"""How alike the channel is at two positions: correlation against distance.
 
 Three correlations, all averaged over pairs of positions in bins of distance:
 
@@ -10,6 +10,8 @@ Three correlations, all averaged over pairs of positions in bins of distance:
 
 All three serve RSS as well as rank. NaN is out of coverage; whether a rank of 0 is a number or NaN is the caller's
 choice (:func:`aerpaw_cmp.maps.grid.without_coverage_as_nan`).
+
+The curve through it, :func:`fit_biexponential`, lives in :mod:`~aerpaw_cmp.maps.biexponential`.
 
 Bins follow the paper: bin ``n`` holds the pairs whose distance is nearest to ``n`` times the width (half-way goes
 up); bin 0 holds each position with itself, where the correlation is 1 by definition.
@@ -26,6 +28,19 @@ from numpy.typing import ArrayLike
 
 from ..errors import UsageError
 from ..units import BoolArray, FloatArray, IntArray
+from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
+
+__all__ = [
+    "PAPER_BIEXPONENTIAL",
+    "BiExponential",
+    "BinnedCorrelation",
+    "field_correlation",
+    "fit_biexponential",
+    "fit_vertical_scale",
+    "semivariance",
+    "vector_correlation",
+    "vertical_correlation",
+]
 
 BLOCK = 256
 """Positions per block of the pair products; bounds the memory to BLOCK x positions."""
@@ -369,245 +384,3 @@ def _points_and_vectors(points_m: ArrayLike, vectors: ArrayLike) -> tuple[FloatA
             f"points of shape {points.shape}, values of shape {data.shape}", expected="(n, 2+) and (n, ...)"
         )
     return points[:, :2], data.reshape(len(data), -1)
-
-
-# --- the curve ------------------------------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class BiExponential:
-    """``c1 exp(c2 d) + c3 exp(c4 d)``, d in metres; the faster decay first.
-
-    Parameters
-    ----------
-    c1, c2, c3, c4 : float
-        Amplitudes c1, c3 and rates c2 <= c4 <= 0 [1/m].
-    rmse : float
-        Root of the mean squared residual of the fit.
-    degenerate : bool
-        True when the data do not hold two exponentials; the curve is still the best found, the four numbers are
-        then no property of the data.
-    message : str
-        Why, as a sentence; empty when not degenerate.
-
-    Examples
-    --------
-    >>> paper = BiExponential(0.2932, -0.0508, 0.7057, -0.001, rmse=0.0153)
-    >>> round(float(paper(0.0)), 4), round(paper.nugget, 4)
-    (0.9989, 0.0011)
-    """
-
-    c1: float
-    c2: float
-    c3: float
-    c4: float
-    rmse: float
-    degenerate: bool = False
-    message: str = ""
-
-    def __call__(self, distance_m: ArrayLike) -> FloatArray:
-        """Correlation at distances [m]."""
-        d = np.asarray(distance_m, dtype=np.float64)
-        return np.asarray(self.c1 * np.exp(self.c2 * d) + self.c3 * np.exp(self.c4 * d))
-
-    @property
-    def nugget(self) -> float:
-        """1 - Phi(0+)."""
-        return 1.0 - self.c1 - self.c3
-
-
-PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
-"""The paper's fit (section VII-C)."""
-
-
-def fit_biexponential(
-    distance_m: ArrayLike,
-    correlation: ArrayLike,
-    *,
-    weights: ArrayLike | None = None,
-    amplitude_bounds: tuple[float, float] = (0.0, np.inf),
-    rate_bounds_per_m: tuple[float, float] | None = None,
-    starts: int = 6,
-) -> BiExponential:
-    """Least-squares bi-exponential by variable projection.
-
-    For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form, so only the
-    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its ``starts``
-    best cells.
-
-    Parameters
-    ----------
-    distance_m, correlation : (n,)
-        The points; NaN pairs do not count.
-    weights : (n,), optional
-        Such as the number of pairs of each bin; the paper's fit has none. ``rmse`` is weighted likewise.
-    amplitude_bounds : (low, high)
-        Of c1 and c3. Amplitudes of at least 0 keep the curve a valid covariance in any dimension.
-    rate_bounds_per_m : (slowest, fastest), optional
-        Of -c2 and -c4 [1/m], positive. By default from 1e-6 over the largest distance (flat over the data) to 10 over
-        the smallest positive one (gone at the first bin).
-    starts : int
-        Number of trust-region searches.
-
-    Returns
-    -------
-    BiExponential
-        ``degenerate`` tells when one exponential does as well, an amplitude vanishes, the rates coincide or one
-        of them lies at a bound.
-
-    Raises
-    ------
-    UsageError
-        With fewer than two usable points, or bounds that hold nothing.
-
-    References
-    ----------
-    .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
-    """
-    problem = _Projection.of(distance_m, correlation, weights, amplitude_bounds, rate_bounds_per_m)
-    if len(problem.d) < 4:
-        single = problem.single()
-        return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
-    best = problem.double(starts)
-    return problem.judge(best)
-
-
-@dataclass(frozen=True, slots=True)
-class _Projection:
-    """The reduced problem: residuals as a function of the logarithms of the rates."""
-
-    d: FloatArray
-    y: FloatArray
-    root_weight: FloatArray
-    low: float
-    high: float
-    log_rates: tuple[float, float]
-
-    @classmethod
-    def of(
-        cls,
-        distance_m: ArrayLike,
-        correlation: ArrayLike,
-        weights: ArrayLike | None,
-        amplitude_bounds: tuple[float, float],
-        rate_bounds_per_m: tuple[float, float] | None,
-    ) -> _Projection:
-        d = np.asarray(distance_m, dtype=np.float64).ravel()
-        y = np.asarray(correlation, dtype=np.float64).ravel()
-        w = np.ones_like(d) if weights is None else np.asarray(weights, dtype=np.float64).ravel()
-        if not (d.shape == y.shape == w.shape):
-            raise UsageError(f"{d.size} distances, {y.size} correlations and {w.size} weights")
-        good = np.isfinite(d) & np.isfinite(y) & (w > 0) & (d >= 0)
-        d, y, w = d[good], y[good], w[good]
-        if len(d) < 2 or not d.max() > 0:
-            raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
-        slow, fast = rate_bounds_per_m or (1e-6 / d.max(), 10.0 / d[d > 0].min())
-        low, high = amplitude_bounds
-        if not (0 < slow < fast and low < high):
-            raise UsageError(f"bounds {amplitude_bounds} and {rate_bounds_per_m}", expected="low < high, rates > 0")
-        return cls(d, y, np.sqrt(w / w.mean()), low, high, (float(np.log(slow)), float(np.log(fast))))
-
-    def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""
-        basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None]) * self.root_weight[:, None]
-        target = self.y * self.root_weight
-        candidates = _candidate_amplitudes(basis, target, self.low, self.high)
-        residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - target
-        pick = np.argmin((residual**2).sum(axis=-1), axis=-1)[..., None, None]
-        chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
-        return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
-
-    def double(self, starts: int) -> FloatArray:
-        """Logarithms of the two best rates, the faster first."""
-        axis = np.linspace(*self.log_rates, 48)
-        first, second = np.triu_indices(len(axis), 1)
-        grid = np.column_stack([axis[second], axis[first]])
-        cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        found = [self._search(grid[cell]) for cell in np.argsort(cost)[:starts]]
-        best = min(found, key=lambda log_rates: float((self.amplitudes(log_rates)[1] ** 2).sum()))
-        return np.sort(best)[::-1]
-
-    def _search(self, start: FloatArray) -> FloatArray:
-        from scipy.optimize import least_squares
-
-        inside = np.clip(start, self.log_rates[0] + 1e-9, self.log_rates[1] - 1e-9)
-        fit = least_squares(
-            lambda p: self.amplitudes(p)[1], inside, bounds=self.log_rates, xtol=1e-15, ftol=1e-15, gtol=1e-15
-        )
-        return np.asarray(fit.x)
-
-    def single(self) -> float:
-        """Logarithm of the rate of the best single exponential."""
-        from scipy.optimize import minimize_scalar
-
-        def cost(log_rate: float) -> float:
-            return self._single_cost(log_rate)
-
-        axis = np.linspace(*self.log_rates, 200)
-        best = int(np.argmin([cost(a) for a in axis]))
-        bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
-        return float(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-13}).x)
-
-    def _single_amplitude(self, log_rate: float) -> float:
-        basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
-        amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, 1e-300))
-        return min(max(amplitude, self.low), self.high)
-
-    def _single_cost(self, log_rate: float) -> float:
-        curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
-        return float((((curve - self.y) * self.root_weight) ** 2).sum())
-
-    def result(self, log_rate: float, message: str) -> BiExponential:
-        """One exponential as a degenerate pair: c1 = 0."""
-        rate = -float(np.exp(log_rate))
-        rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
-        return BiExponential(0.0, rate, self._single_amplitude(log_rate), rate, rmse, True, message)
-
-    def judge(self, log_rates: FloatArray) -> BiExponential:
-        """The fit with a verdict on whether two exponentials are in the data."""
-        amplitude, residual = self.amplitudes(log_rates)
-        cost, n = float((residual**2).sum()), len(self.d)
-        single = self.single()
-        cost_single = self._single_cost(single)
-        c1, c3 = (float(a) for a in amplitude)
-        c2, c4 = (-float(rate) for rate in np.exp(log_rates))
-        scale = 1e-20 * float(((self.y * self.root_weight) ** 2).sum())
-        # Bayesian information criterion: two more coefficients must pay for themselves
-        gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
-        reasons = []
-        if gain <= 0:
-            reasons.append("one exponential describes the data as well (BIC)")
-        if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
-            reasons.append("one of the two amplitudes vanishes")
-        if log_rates[0] - log_rates[1] < 0.05:
-            reasons.append("the two rates coincide")
-        if log_rates[0] > self.log_rates[1] - 1e-3:
-            reasons.append("the fast rate lies at its bound: the first bins hold a jump, not a decay")
-        if -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3:
-            reasons.append("the slow rate is too small to tell from 0: the tail is flat over the data")
-        rmse = float(np.sqrt(cost / n))
-        return BiExponential(c1, c2, c3, c4, rmse, bool(reasons), "; ".join(reasons))
-
-
-def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float) -> FloatArray:
-    """Solutions (..., candidates, 2) of the bounded two-column problem: inside, on each edge, at each corner."""
-    gram = np.swapaxes(basis, -1, -2) @ basis
-    right = (np.swapaxes(basis, -1, -2) @ target[:, None])[..., 0]
-    a, b, c = gram[..., 0, 0], gram[..., 0, 1], gram[..., 1, 1]
-    tiny = 1e-300
-    determinant = a * c - b * b
-    regular = determinant > 1e-14 * a * c + tiny
-    safe = np.where(regular, determinant, 1.0)
-    first = np.where(regular, (c * right[..., 0] - b * right[..., 1]) / safe, low if np.isfinite(low) else 0.0)
-    second = np.where(regular, (a * right[..., 1] - b * right[..., 0]) / safe, low if np.isfinite(low) else 0.0)
-    inside = (first >= low) & (first <= high) & (second >= low) & (second <= high)
-    edges = [edge for edge in (low, high) if np.isfinite(edge)] or [0.0]
-    held = []
-    for edge in edges:
-        # one amplitude on the edge, the other free within the bounds
-        other = np.clip((right[..., 1] - b * edge) / np.maximum(c, tiny), low, high)
-        held.append(np.stack([np.full_like(other, edge), other], axis=-1))
-        other = np.clip((right[..., 0] - b * edge) / np.maximum(a, tiny), low, high)
-        held.append(np.stack([other, np.full_like(other, edge)], axis=-1))
-    free = np.where(inside[..., None], np.stack([first, second], axis=-1), held[0])
-    return np.stack([free, *held], axis=-2)

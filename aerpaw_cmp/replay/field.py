@@ -200,13 +200,15 @@ def _radiate(array: Array, turn: FloatArray, direction: FloatArray, axis: int) -
     # TR 38.901 section 7.3.2, model 2: the pattern stays, its polarisation turns in the (theta, phi) basis
     turned_theta = e_theta * np.cos(slant) - e_phi * np.sin(slant)
     turned_phi = e_theta * np.sin(slant) + e_phi * np.cos(slant)
-    sin_phi, cos_phi = np.sin(phi), np.cos(phi)
-    cos_theta, sin_theta = np.cos(theta), np.sin(theta)
+    # sines and cosines of theta and phi are ratios of the components; at a pole phi is 0
+    pole = across == 0.0
+    below = np.where(pole, 1.0, across)
+    cos_phi, sin_phi = np.where(pole, 1.0, local[0] / below), local[1] / below
     vector = np.stack(
         [
-            turned_theta * (cos_theta * cos_phi) - turned_phi * sin_phi,
-            turned_theta * (cos_theta * sin_phi) + turned_phi * cos_phi,
-            -turned_theta * sin_theta,
+            turned_theta * (local[2] * cos_phi) - turned_phi * sin_phi,
+            turned_theta * (local[2] * sin_phi) + turned_phi * cos_phi,
+            -turned_theta * across,
         ]
     )
     return np.asarray(np.einsum("pij,jpab->ipab", turn, vector))

@@ -29,7 +29,7 @@ LEAFLESS_FACTOR = 1 / 1.2
 _PIECE_M = 8.0  # paths are looked up in pieces of this length
 _CELL_M = 4.0
 _MAX_CELLS = 4_000_000
-_PIECES_AT_ONCE = 400_000  # about 200 MB of temporary arrays
+_PAIRS_AT_ONCE = 1_500_000  # of a piece and a body; about 150 MB of temporary arrays
 
 
 # ---------------------------------------------------------------- models: depth in foliage to loss
@@ -307,10 +307,11 @@ class CrownIndex:
         live = np.flatnonzero(last >= first)  # NaN compares false
         pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
         done = np.cumsum(pieces)
+        at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
         begin = 0
         while begin < len(live):
             used = done[begin - 1] if begin else 0
-            stop = max(begin + 1, int(np.searchsorted(done, used + _PIECES_AT_ONCE, side="right")))
+            stop = max(begin + 1, int(np.searchsorted(done, used + at_once, side="right")))
             some = live[begin:stop]
             total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop])
             begin = stop
@@ -328,33 +329,41 @@ class CrownIndex:
         move = end - start
         segment = np.repeat(np.arange(len(start)), pieces)
         number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
-        width = ((last - first) / pieces)[segment]
-        middle = first[segment] + (number + 0.5) * width
-        place = ((start[segment, :2] + middle[:, None] * move[segment, :2]) - self._low) / self._cell_m
-        cell = np.floor(place).astype(np.int64)
-        inside = ((cell >= 0) & (cell < self._shape2)).all(axis=1)
-        flat = cell[inside, 0] * self._shape2[1] + cell[inside, 1]
-        count = self._row[flat + 1] - self._row[flat]
-        piece = np.repeat(np.flatnonzero(inside), count)
-        slot = np.arange(len(piece)) - np.repeat(np.cumsum(count) - count, count) + np.repeat(self._row[flat], count)
-        body, owner = self._members[slot], segment[piece]
+        width = (last - first) / pieces
+        piece, body = self._candidates(start, move, first[segment] + (number + 0.5) * width[segment], segment)
 
         # the piece that holds the point nearest to the body's axis speaks for the whole segment
-        centre = self._bodies[body, :2] - start[owner, :2]
-        flat_move = move[owner, :2]
-        square = (flat_move**2).sum(axis=1)
-        low, high = first[owner], last[owner]
-        nearest = np.divide((centre * flat_move).sum(axis=1), square, out=low.copy(), where=square > 0)
-        nearest = np.clip(nearest, low, high)
-        gap = centre - nearest[:, None] * flat_move
-        close = (gap**2).sum(axis=1) < self._bodies[body, 4] ** 2
-        turn = np.where(width[piece] > 0, (nearest - low) / np.where(width[piece] > 0, width[piece], 1.0), 0.0)
-        mine = np.minimum(turn.astype(np.int64), pieces[owner] - 1) == number[piece]
-        hit = np.flatnonzero(close & mine)
+        owner = segment[piece]
+        low, wide = first[owner], width[owner]
+        step_east, step_north = move[owner, 0], move[owner, 1]
+        east = self._bodies[body, 0] - start[owner, 0]
+        north = self._bodies[body, 1] - start[owner, 1]
+        square = step_east * step_east + step_north * step_north
+        nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
+        np.clip(nearest, low, last[owner], out=nearest)
+        turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
+        east -= nearest * step_east
+        north -= nearest * step_north
+        close = east * east + north * north < self._bodies[body, 4] ** 2
+        hit = np.flatnonzero(close & (np.minimum(turn, pieces[owner] - 1) == number[piece]))
         owner, body = owner[hit], body[hit]
         share = _chord_share(start[owner], move[owner], self._bodies[body], self.shape)
         length = np.sqrt((move**2).sum(axis=1))
         return np.bincount(owner, weights=share * length[owner], minlength=len(start)).astype(np.float64)
+
+    def _candidates(
+        self, start: FloatArray, move: FloatArray, middle: FloatArray, segment: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Pairs (piece, body) of pieces, given by the middle of each, and the bodies listed in its cell."""
+        i = np.floor((start[segment, 0] + middle * move[segment, 0] - self._low[0]) / self._cell_m).astype(np.int64)
+        j = np.floor((start[segment, 1] + middle * move[segment, 1] - self._low[1]) / self._cell_m).astype(np.int64)
+        rows, columns = self._shape2
+        inside = np.flatnonzero((i >= 0) & (i < rows) & (j >= 0) & (j < columns))
+        cell = i[inside] * columns + j[inside]
+        count = self._row[cell + 1] - self._row[cell]
+        piece = np.repeat(inside, count)
+        slot = np.arange(len(piece)) + np.repeat(self._row[cell] - (np.cumsum(count) - count), count)
+        return piece, self._members[slot]
 
 
 def _slab(at: FloatArray, step: FloatArray, low: AnyArray, high: AnyArray) -> tuple[FloatArray, FloatArray]:

@@ -7,7 +7,7 @@ For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path
 3. no segment is cut by another face.
 
 A sequence is followed only while the beam from the image through its last face can still reach the next one.
-Sides are decided with a tolerance relative to the size of the scene; a segment never tests the faces it ends on.
+Sides are decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point.
 A solid hides only with its open inside: a segment that merely touches edges is decided by the points halfway between
 the touches. So a path along a wall stays, and there is no crack between two walls.
 """
@@ -264,7 +264,7 @@ def _paths_of_level(
             sequence, pose = level.faces[part][row], some[column]
             vertices, good = trace_back(faces, sequence, level.images_m[part][row], targets[pose], hiding.tolerance_m)
             sequence, pose, vertices = sequence[good], pose[good], vertices[good]
-            free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose], sequence)
+            free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
             pieces.append(_pad(pose[free], tower, sequence[free], vertices[free], max_depth))
     return merge(pieces, max_depth, None)
 
@@ -374,37 +374,32 @@ class Occlusion:
         self.low = np.array([box[m].min(axis=(0, 1)) for m in self.members]).reshape(-1, 3) - tolerance_m
         self.high = np.array([box[m].max(axis=(0, 1)) for m in self.members]).reshape(-1, 3) + tolerance_m
 
-    def any_segment(
-        self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray, sequence: IntArray
-    ) -> BoolArray:
-        """Which polylines source - vertices - target (paths,) are cut; no segment tests the faces it ends on."""
-        count, depth = sequence.shape
-        cut = np.zeros(count, dtype=np.bool_)
-        none = np.full(count, -1, dtype=np.int64)
-        start, start_face = sources_m, none
-        for step in range(depth + 1):
-            end = vertices_m[:, step] if step < depth else targets_m
-            end_face = sequence[:, step] if step < depth else none
+    def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
+        """Which polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
+        cut = np.zeros(len(sources_m), dtype=np.bool_)
+        start = sources_m
+        for step in range(vertices_m.shape[1] + 1):
+            end = vertices_m[:, step] if step < vertices_m.shape[1] else targets_m
             rows = np.flatnonzero(~cut)
-            cut[rows] = self.segments(start[rows], end[rows], start_face[rows], end_face[rows])
-            start, start_face = end, end_face
+            cut[rows] = self.segments(start[rows], end[rows])
+            start = end
         return cut
 
-    def segments(self, start: FloatArray, end: FloatArray, start_face: IntArray, end_face: IntArray) -> BoolArray:
-        """Which segments (n, 3) - (n, 3) are cut by a face other than their own two."""
+    def segments(self, start: FloatArray, end: FloatArray) -> BoolArray:
+        """Which segments (n, 3) - (n, 3) are cut."""
         cut = np.zeros(len(start), dtype=np.bool_)
         if not self.members:
             return cut
         step = max(1, CELLS_PER_CHUNK // len(self.members))
         for first in range(0, len(start), step):
             part = slice(first, first + step)
-            a, b, fa, fb = start[part], end[part], start_face[part], end_face[part]
+            a, b = start[part], end[part]
             near = self._boxes(a, b)
             here = np.zeros(len(a), dtype=np.bool_)
             for solid, members in enumerate(self.members):
                 rows = np.flatnonzero(near[:, solid] & ~here)
                 if len(rows):
-                    here[rows] = self._crosses(a[rows], b[rows], fa[rows], fb[rows], members)
+                    here[rows] = self._crosses(a[rows], b[rows], members)
             cut[part] = here
         return cut
 
@@ -423,16 +418,13 @@ class Occlusion:
                 np.minimum(leave, np.maximum(one, two), out=leave)
         return np.asarray(enter <= leave)
 
-    def _crosses(
-        self, start: FloatArray, end: FloatArray, start_face: IntArray, end_face: IntArray, members: IntArray
-    ) -> BoolArray:
+    def _crosses(self, start: FloatArray, end: FloatArray, members: IntArray) -> BoolArray:
         """Which segments cross one of the faces ``members``."""
         faces, tolerance_m = self.faces, self.tolerance_m
         normal, offset = faces.normal[members], faces.offset_m[members]
         before = start @ normal.T - offset
         after = end @ normal.T - offset
         through = ((before > tolerance_m) & (after < -tolerance_m)) | ((before < -tolerance_m) & (after > tolerance_m))
-        through &= (members != start_face[:, None]) & (members != end_face[:, None])
         row, column = np.nonzero(through)
         share = before[row, column] / (before[row, column] - after[row, column])
         point = start[row] + share[:, None] * (end[row] - start[row])

@@ -127,5 +127,8 @@ def _rss_warnings(panel: RssPanel) -> list[str]:
     if panel.lag_verdict in ("ambiguous", "failed"):
         found.append(f"{panel.name}: the check of the radio clock against the telemetry clock is {panel.lag_verdict}.")
     elif panel.lag_verdict == "ok" and abs(panel.lag_s) > 0.5:
-        found.append(f"{panel.name}: the radio clock runs {panel.lag_s:+.1f} s against the telemetry clock.")
+        applied = (panel.extra.get("clock") or {}).get("applied", "estimated")
+        found.append(
+            f"{panel.name}: the radio clock shows {panel.lag_s:+.1f} s more than the telemetry clock ({applied})."
+        )
     return found

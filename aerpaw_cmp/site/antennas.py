@@ -29,6 +29,9 @@ HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 MAXIMUM_EFFICIENCY = 1.12
 """Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration."""
 
+HIGHEST_DBI = 60.0
+"""No element has more gain; a file that says so holds something else."""
+
 Azimuth = Literal["clockwise", "counter-clockwise"]
 
 
@@ -207,7 +210,9 @@ class _Rows:
     frequency_hz: float | None = None
 
 
-def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azimuth | None = None) -> MeasuredPattern:
+def read_pattern_text(
+    path: str | Path, *, name: str | None = None, azimuth: Azimuth | None = None, polarised: bool = True
+) -> MeasuredPattern:
     """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
 
     Parameters
@@ -222,6 +227,8 @@ def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azi
         from all sides: that shows whether E_phi points along increasing phi. Where it points against it, as in
         AERPAW's files, phi is the angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same
         measurement so). Poles that radiate too little to tell are taken for AERPAW's.
+    polarised : bool
+        False keeps the total gain only, all of it in E_theta, as the gain grids have it.
 
     Returns
     -------
@@ -245,7 +252,11 @@ def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azi
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     if clockwise == along:
         e_phi = -e_phi
-    pattern = MeasuredPattern(name or path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
+    if polarised:
+        pattern = MeasuredPattern(name or path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
+    else:
+        total = np.hypot(np.abs(e_theta), np.abs(e_phi)).astype(np.complex128)
+        pattern = MeasuredPattern(name or path.stem, total.T, None, rows.frequency_hz)
     _check_power(pattern, path)
     return pattern
 
@@ -303,7 +314,8 @@ def _check_units(rows: _Rows, path: Path) -> None:
     values = rows.values
     for columns, what in (((0, 1), "angles"), ((5, 6), "phases")):
         largest = np.abs(values[:, columns]).max(axis=1)
-        if (worst := int(largest.argmax())) is not None and largest[worst] > 2 * np.pi + 0.1:
+        worst = int(largest.argmax())
+        if largest[worst] > 2 * np.pi + 0.1:
             raise InputError(
                 f"{what} reach {largest[worst]:g}",
                 expected=f"{what} in radians",
@@ -311,6 +323,14 @@ def _check_units(rows: _Rows, path: Path) -> None:
                 path=path,
                 line=rows.lines[worst],
             )
+    if values[:, 2:5].max() > HIGHEST_DBI:
+        worst = int(values[:, 2:5].max(axis=1).argmax())
+        raise InputError(
+            f"a gain of {values[worst, 2:5].max():g}",
+            expected=f"dBi, at most {HIGHEST_DBI:g}",
+            path=path,
+            line=rows.lines[worst],
+        )
     total = db_from_power(power_from_db(values[:, 3]) + power_from_db(values[:, 4]))
     wrong = np.flatnonzero(np.abs(total - values[:, 2]) > 0.05)
     if len(wrong):
@@ -457,6 +477,8 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     gain = np.asarray(content[variable], dtype=float)
     if not np.isfinite(gain).all():
         raise InputError(f"'{variable}' has {int((~np.isfinite(gain)).sum())} values that are no numbers", path=path)
+    if gain.max() > HIGHEST_DBI:
+        raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
     gain = gain[np.argsort(-elevation)][:, by_azimuth]
     pattern = MeasuredPattern(name or variable, np.sqrt(power_from_db(gain)).astype(np.complex128), None)

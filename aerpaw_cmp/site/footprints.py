@@ -34,6 +34,9 @@ TALLEST_M = 300.0
 FAR_M = 20_000.0
 """Outlines farther from the origin are not of this site."""
 
+GRID_M = 0.001
+"""Coordinates are rounded to this."""
+
 SLIVER_M = 0.3
 """Areas narrower than this everywhere are drawing errors; vertices closer to a straight line are dropped too."""
 
@@ -415,7 +418,8 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
     found: list[tuple[str, _Shape, Polygon]] = []
     used: set[str] = set()
     for shape in shapes:
-        for part in shapely.get_parts(_areas_only(shape.area)):
+        # rounded here to what site.yaml keeps: rounding coordinates one by one can make a ring cross itself
+        for part in shapely.get_parts(_areas_only(shapely.set_precision(shape.area, GRID_M))):
             plain = part.simplify(SLIVER_M / 2)
             plain = plain if isinstance(plain, Polygon) and plain.is_valid and not plain.is_empty else part
             plain = Polygon(plain.exterior, [hole for hole in plain.interiors if Polygon(hole).area >= MINIMUM_AREA_M2])
@@ -458,6 +462,8 @@ def import_site(
     model = site_model(base)
     found = import_footprints(files, SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg), **options)
     content = model.model_dump()
+    if model.dem is not None:  # the new file may lie in another folder
+        content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     content |= {
         "buildings": [
             {**_outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}

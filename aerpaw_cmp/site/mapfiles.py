@@ -112,7 +112,8 @@ def _geojson(content: dict[str, Any], path: Path) -> MapFile:
         nested = feature.get("properties", {}).get("tags") if is_feature and feature.get("properties") else None
         if isinstance(nested, dict):
             tags.update({str(k): str(v) for k, v in nested.items()})
-        identity = feature.get("id") or tags.get("@id") or f"feature {number}"
+        identity = str(feature.get("id", tags.get("@id", number)))
+        identity = f"feature {identity}" if identity.isdigit() else identity
         outline = Outline(tags.get("name") or f"{identity}", f"{path.name}: {identity}", tags)
         _geometry(feature.get("geometry") if is_feature else feature, outline, result, path)
         if outline.parts or outline.broken:

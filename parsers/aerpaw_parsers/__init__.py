@@ -15,6 +15,7 @@ from . import (
     quectel_ri,
     sounder_log,
     srsenb_log,
+    tap_jsonl,
     vehicle_out,
 )
 
@@ -29,5 +30,6 @@ READERS: tuple[Reader, ...] = (
     aadm_snr.READER,
     controller_log.READER,
     srsenb_log.READER,
+    tap_jsonl.READER,
     generic_csv.READER,
 )

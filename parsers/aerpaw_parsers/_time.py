@@ -248,14 +248,23 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
         Times that are none are False, and 1970-01-01 in ``instants``.
     """
     wall, valid, offset, zoned = parse_texts(column)
+    return parsed_to_utc(wall, valid, offset, zoned, options, needed_by=needed_by), valid
+
+
+def parsed_to_utc(
+    wall: IntArray, valid: BoolArray, offset_s: IntArray, zoned: BoolArray, options: ReadOptions, *, needed_by: str
+) -> Instants:
+    """What :func:`parse_texts` gives, to UTC."""
     naive = valid & ~zoned
-    utc = (wall - offset * 1_000_000_000).astype("datetime64[ns]")
-    ambiguous, nonexistent = np.zeros(len(column), dtype=bool), np.zeros(len(column), dtype=bool)
+    if len(wall) and naive.all():
+        return wall_to_utc(wall, options, needed_by=needed_by)
+    utc = (wall - offset_s * 1_000_000_000).astype("datetime64[ns]")
+    ambiguous, nonexistent = np.zeros(len(wall), dtype=bool), np.zeros(len(wall), dtype=bool)
     if not naive.any():
-        return Instants(utc, ambiguous, nonexistent), valid
+        return Instants(utc, ambiguous, nonexistent)
     local = wall_to_utc(wall[naive], options, needed_by=needed_by)
     utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
-    return Instants(utc, ambiguous, nonexistent, local.warnings), valid
+    return Instants(utc, ambiguous, nonexistent, local.warnings)
 
 
 def origin_ns(options: ReadOptions, *, needed_by: str) -> int | None:

@@ -39,7 +39,7 @@ def _fields(line: bytes) -> list[str]:
 
 def _header(lines: _lines.Lines, first: int) -> list[str]:
     try:
-        return [name.strip() for name in _fields(lines.raw(first))]
+        return [name.strip() for name in _fields(lines.raw(first).removeprefix(b"\xef\xbb\xbf"))]
     except csv.Error as error:
         raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
 
@@ -110,7 +110,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
     """
-    lines = _lines.split(data.removeprefix(b"\xef\xbb\xbf"))
+    lines = _lines.split(data)
     blank = lines.blank
     first = int(np.argmin(blank)) if len(lines) and not blank.all() else -1
     if first < 0:

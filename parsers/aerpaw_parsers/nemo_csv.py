@@ -12,8 +12,9 @@ import numpy as np
 
 from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.units import FloatArray, IntArray
 
-from . import _lines, _nemo
+from . import _lines, _nemo, _table
 
 _HEADER = b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
 _N = rb"(" + _lines.NUMBER + rb")"
@@ -37,6 +38,26 @@ def _reason(line: bytes) -> str | None:
     return "a field is no number"
 
 
+def _plain(lines: _lines.Lines) -> tuple[IntArray, FloatArray]:
+    """Rows of plain numbers and their nine columns, at once."""
+    rows, _, _ = _table.fields(lines, 9)
+    rows = rows[rows > 0]  # the header
+    value = _table.numbers(lines, rows, 9)
+    if value is None:
+        return rows[:0], np.empty((9, 0))
+    valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1])
+    return rows[valid], value[:, valid]
+
+
+def _columns(lines: _lines.Lines) -> tuple[IntArray, FloatArray]:
+    """Rows and their nine columns: the plain ones at once, the rest by the pattern."""
+    rows, value = _plain(lines)
+    odd, groups = _lines.match_rest(lines, _ROW, rows)
+    texts = np.stack([_lines.numbers(cells) for cells in _lines.columns(groups, 9)])
+    order = np.argsort(np.concatenate((rows, odd)), kind="stable")
+    return np.concatenate((rows, odd))[order], np.concatenate((value, texts), axis=1)[:, order]
+
+
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream with RSRP, SINR, CQI and the phone's own position.
 
@@ -46,8 +67,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If ``time_origin`` is no time, or is local and no time zone is given.
     """
     lines = _lines.split(data)
-    rows, groups = _lines.match(lines, _ROW)
-    column = [_lines.numbers(cells) for cells in _lines.columns(groups, 9)]
+    rows, column = _columns(lines)
     fits = np.abs(column[1]) <= _nemo.MOST_MS
     blank, rejected = _lines.remainder(lines, rows, _reason)
     rejected += lines.reject_all(rows[~fits], "the relative time is beyond any flight")

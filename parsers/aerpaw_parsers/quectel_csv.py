@@ -29,7 +29,7 @@ from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, FloatArray, IntArray
 
-from . import _frames, _lines, _time
+from . import _frames, _lines, _table, _time
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
@@ -140,8 +140,52 @@ def _rows(
     return _Rows(number[valid], instants, kept)
 
 
+_LAUNCHED = ((1, b'"+QNWCFG: ""lte_csi"""'), (6, b'"+QNWCFG: ""nr5g_csi"""'))
+"""Places of the two tokens in the 11 columns of the launched logger."""
+
+
+def _csi_rows(lines: _lines.Lines, options: ReadOptions, rejected: list[RejectedLine]) -> _Rows | None:
+    """CSI rows: those of the launched logger at once, others by the pattern; all columns but the first are numbers."""
+    number, wall, value = _launched(lines)
+    odd, groups = _lines.match_rest(lines, _CSI, number)
+    column = _lines.columns(groups, _CSI.groups)
+    parsed = _time.parse_texts(column[0])
+    order = np.argsort(np.concatenate((number, odd)), kind="stable")
+    number = np.concatenate((number, odd))[order]
+    wall = np.concatenate((wall, parsed[0]))[order]
+    valid = np.concatenate((np.ones(len(number) - len(odd), dtype=bool), parsed[1]))[order]
+    value = np.concatenate((value, np.stack([_values(cells) for cells in column[1:]])), axis=1)[:, order]
+    if not len(number):
+        return None
+    rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
+    instants = _time.wall_to_utc(wall[valid], options, needed_by="quectel_csv")
+    return _Rows(number[valid], instants, [np.zeros(0), *value[:, valid]])
+
+
+def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, FloatArray]:
+    """Lines, wall clocks and eight numbers of rows as the launched logger writes them."""
+    none = np.zeros(0, dtype=np.int64)
+    rows, starts, ends = _table.fields(lines, 11)
+    mine = ends[:, 0] - starts[:, 0] == 23
+    for place, token in _LAUNCHED:
+        mine &= ends[:, place] - starts[:, place] == len(token)
+    rows, starts = rows[mine], starts[mine]
+    for place, token in _LAUNCHED:
+        cells = lines.buffer[starts[:, place][:, None] + np.arange(len(token))]
+        if (cells != np.frombuffer(token, dtype=np.uint8)).any():
+            return none, none, np.empty((8, 0))
+    value = _table.numbers(lines, rows, 11, (2, 3, 4, 5, 7, 8, 9, 10), also=b'" :/QNWCFGlte_csinr5g')
+    if value is None:
+        return none, none, np.empty((8, 0))
+    wall, valid = _time.parse_digits(lines.buffer[starts[:, 0][:, None] + np.arange(23)], 3)
+    keep = valid & np.isfinite(value).all(axis=0)
+    return rows[keep], wall[keep], value[:, keep]
+
+
 def _values(cells: AnyArray) -> FloatArray:
     """Numbers of one column; ``-`` and nothing mean 'not valid now'."""
+    if cells.dtype.kind == "f":
+        return cells
     return np.asarray(_lines.numbers(np.where(cells == b"-", b"", cells)))
 
 
@@ -209,7 +253,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _lines.split(data)
     rejected: list[RejectedLine] = []
-    csi = _rows(lines, _CSI, options, rejected)
+    csi = _csi_rows(lines, options, rejected)
     lte = _rows(lines, _LTE, options, rejected)
     sa = _rows(lines, _SA, options, rejected)
     streams: list[Stream | None] = []

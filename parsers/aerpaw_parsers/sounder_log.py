@@ -17,7 +17,7 @@ from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray, IntArray
 
-from . import _frames, _lines, _time
+from . import _decimal, _frames, _lines, _time
 
 _STAMP = 28  # "[" + 26 characters of time + "]"
 _VALUE = 16  # od -f: right-aligned in sixteen columns
@@ -64,32 +64,6 @@ class _Samples:
         )
 
 
-def _decimal(cells: AnyArray) -> tuple[FloatArray, BoolArray]:
-    """Right-aligned plain decimals, ``(n, 16)`` uint8, to float64 exactly as ``float`` reads them.
-
-    At most 15 digits over a power of ten up to 1e15: both are exact in float64, so one division rounds once.
-    """
-    count, width = cells.shape
-    mantissa = np.zeros(count, dtype=np.int64)
-    places = np.zeros(count, dtype=np.int64)
-    begun, dotted, negative = (np.zeros(count, dtype=bool) for _ in range(3))
-    valid = np.ones(count, dtype=bool)
-    for column in np.ascontiguousarray(cells.T)[:width]:
-        digit = column - np.uint8(48)
-        is_digit = digit <= 9
-        minus, dot, space = column == 45, column == 46, column == 32
-        valid &= is_digit | ((space | minus) & ~begun) | (dot & ~dotted)
-        negative |= minus
-        begun |= ~space
-        mantissa = np.where(is_digit, mantissa * 10 + digit, mantissa)
-        places += is_digit & dotted
-        dotted |= dot
-    valid &= cells[:, -1] != 45
-    valid &= (cells[:, -1] - np.uint8(48)) <= 9
-    value = mantissa / 10.0**places
-    return np.where(negative, -value, value), valid
-
-
 def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     """Octal digits, ``(n, w)`` uint8, to integers."""
     digit = cells - np.uint8(48)
@@ -108,8 +82,8 @@ def _fixed_layout(lines: _lines.Lines) -> _Samples:
         cells = lines.fixed(rows, _STAMP + 1 + width + _VALUE)
         wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
         offset, octal = _octal(cells[:, _STAMP + 1 : _STAMP + 1 + width])
-        value, decimal = _decimal(cells[:, _STAMP + 1 + width :])
-        valid &= octal & decimal & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
+        value, plain = _decimal.decimal(np.ascontiguousarray(cells[:, _STAMP + 1 + width :].T), len(rows))
+        valid &= octal & plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
         valid &= cells[:, _STAMP + 1 + width] == 32
         found = found.join(_Samples(rows, wall, offset, value).take(valid))
     return found

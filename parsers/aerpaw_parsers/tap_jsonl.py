@@ -129,8 +129,12 @@ def _records(data: bytes) -> tuple[list[tuple[int, dict[str, Any]]], list[Reject
         if not line.strip():
             blank += 1
             continue
+        line = line.removesuffix(b"\r")
         try:
-            records.append((number, decode_line(line)))
+            record = decode_line(line)
+            if unterminated and number == len(lines):  # whole by its checksum; flagged as in every other reader
+                record["flags"] = [*_flags(record), "unterminated_line"]
+            records.append((number, record))
         except ValueError as error:
             reason = f"torn tail: {error}" if unterminated and number == len(lines) else str(error)
             rejected.append(RejectedLine(number, reason, line[:2000].decode("utf-8", errors="replace")[:500]))

@@ -16,14 +16,15 @@ Writers: AERPAW/aerpawlib ``examples/v1/{gps_logger,preplanned_trajectory,guided
 from __future__ import annotations
 
 import re
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import ReadResult, Stream
-from aerpaw_cmp.units import AnyArray
+from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray, IntArray
 
-from . import _frames, _lines, _time
+from . import _frames, _lines, _table, _time
 
 _N = rb"(" + _lines.NUMBER + rb"|nan|NaN|None)"
 _TRIPLE = rb'"?[(\[]' + _N + rb", ?" + _N + rb", ?" + _N + rb'[)\]]"?'
@@ -68,6 +69,90 @@ def _reason(line: bytes) -> str:
     return "a field is not of the form that vehicleOut has there"
 
 
+@dataclass
+class _Rows:
+    """Rows of any layout: 0-based lines; eleven numbers each, see ``_NUMBERS``; wall clock and its offset."""
+
+    line: IntArray
+    number: FloatArray
+    wall: IntArray
+    valid: BoolArray
+    offset_s: IntArray
+    zoned: BoolArray
+
+    def join(self, other: _Rows) -> _Rows:
+        """Rows of both, in file order."""
+        order = np.argsort(np.concatenate((self.line, other.line)), kind="stable")
+        return _Rows(
+            *(
+                np.concatenate((getattr(self, part.name), getattr(other, part.name)), axis=-1)[..., order]
+                for part in fields(self)
+            )
+        )
+
+
+_NUMBERS = ("index", "lon", "lat", "alt", "pitch", "yaw", "roll", "north", "east", "down", "fix", "satellites")
+
+
+def _by_pattern(lines: _lines.Lines, done: IntArray) -> _Rows:
+    """Rows of every layout, one by one and strictly: what the fast way left."""
+    rows, groups = _lines.match_rest(lines, _ROW, done)
+    column = _lines.columns(groups, _GROUPS)
+    value = {i: _lines.numbers(column[i]) for i in (*range(10), 11, 12, 13, 18, 19)}
+    # groups 4-6 hold the angles of the 10-field layout, 11-13 those of the 11-field one
+    angles = [np.fmax(value[4 + i], value[11 + i]) for i in range(3)]
+    number = np.stack(
+        [value[0], value[1], value[2], value[3], *angles, value[7], value[8], value[9], value[18], value[19]]
+    )
+    return _Rows(rows, number, *_time.parse_texts(column[17]))
+
+
+def _at_once(lines: _lines.Lines) -> _Rows:
+    """Rows of the two common layouts, plain numbers and times of 26 characters, without a loop over lines."""
+    none = np.zeros(0, dtype=np.int64)
+    nothing = _Rows(none, np.empty((len(_NUMBERS), 0)), none, none > 0, none, none > 0)
+    for count, time in ((14, 11), (8, 5), (9, 6)):
+        rows, starts, ends = _table.fields(lines, count)
+        mine = ends[:, time] - starts[:, time] == 26
+        if 2 * mine.sum() <= len(lines):
+            continue
+        rows, starts, ends = rows[mine], starts[mine], ends[mine]
+        if count == 14 and not _tuples_in_place(lines, starts, ends):
+            return nothing
+        wanted = [i for i in range(count) if i != time]
+        value = _table.numbers(lines, rows, count, wanted, strip=b'"()', also=b" :T/")
+        if value is None:
+            return nothing
+        number = np.full((len(_NUMBERS), len(rows)), np.nan)
+        number[:4], number[-2:] = value[:4], value[-2:]
+        if count == 14:
+            number[4:10] = value[4:10]
+        wall, valid = _time.parse_digits(lines.buffer[starts[:, time][:, None] + np.arange(26)], 6)
+        whole = np.all(
+            (number[[0, 10, 11]] == np.floor(number[[0, 10, 11]])) & (np.abs(number[[0, 10, 11]]) < 1e12), axis=0
+        )
+        keep = valid & whole & ~np.isnan(number[1:4]).any(axis=0) & ~(np.abs(number[10:]) > 999).any(axis=0)
+        if count == 14:
+            keep &= ~np.isnan(number[4:10]).any(axis=0)
+        zero = np.zeros(int(keep.sum()), dtype=np.int64)
+        return _Rows(rows[keep], number[:, keep], wall[keep], valid[keep], zero, zero > 0)
+    return nothing
+
+
+def _tuples_in_place(lines: _lines.Lines, starts: IntArray, ends: IntArray) -> bool:
+    """Whether each row has its quotes and brackets where the two tuples are, and nowhere else."""
+    at = lines.buffer
+    right = np.ones(len(starts), dtype=bool)
+    for first, last in ((4, 6), (7, 9)):
+        opening, closing = starts[:, first], ends[:, last]
+        right &= (ends[:, first] - opening > 2) & (closing - starts[:, last] > 2)
+        right &= (at[opening] == 34) & (at[opening + 1] == 40) & (at[closing - 1] == 34) & (at[closing - 2] == 41)
+    for sign, number in ((34, 4), (40, 2), (41, 2)):
+        places = np.flatnonzero(at == sign)
+        right &= np.searchsorted(places, ends[:, -1]) - np.searchsorted(places, starts[:, 0]) == number
+    return bool(right.all())
+
+
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry of one vehicle.
 
@@ -77,19 +162,21 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If the times carry no offset and no time zone is given.
     """
     lines = _lines.split(data)
-    rows, groups = _lines.match(lines, _ROW)
-    column = _lines.columns(groups, _GROUPS)
-    instants, valid = _time.texts_to_utc(column[17], options, needed_by="vehicleOut")
-    keep = np.flatnonzero(valid)
-    blank, rejected = _lines.remainder(lines, rows, _reason)
-    rejected += lines.reject_all(rows[~valid], "the time stamp is no date of the calendar")
-    flag = _lines.flags(len(rows))
+    fast = _at_once(lines)
+    rows = fast.join(_by_pattern(lines, fast.line))
+    instants = _time.parsed_to_utc(rows.wall, rows.valid, rows.offset_s, rows.zoned, options, needed_by="vehicleOut")
+    keep = np.flatnonzero(rows.valid)
+    blank, rejected = _lines.remainder(lines, rows.line, _reason)
+    rejected += lines.reject_all(rows.line[~rows.valid], "the time stamp is no date of the calendar")
+    flag = _lines.flags(len(rows.line))
     instants.flag(flag)
-    values, warnings = _values(column, flag)
-    if lines.unterminated and len(rows):
-        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
-    frame = _frames.frame("telemetry", instants.time, rows + 1, flag, values).iloc[keep].reset_index(drop=True)
-    warnings += [*instants.warnings, *_doubts(column, keep), *_frames.steps_back(frame)]
+    values, warnings = _values(rows.number, flag)
+    if lines.unterminated and len(rows.line):
+        _lines.add_flag(flag, rows.line == len(lines) - 1, _lines.UNTERMINATED)
+    frame = _frames.frame("telemetry", instants.time, rows.line + 1, flag, values)
+    if len(keep) < len(frame):
+        frame = frame.iloc[keep].reset_index(drop=True)
+    warnings += [*instants.warnings, *_doubts(rows.number[:, keep]), *_frames.steps_back(frame)]
     stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, source="vehicleOut"))
     return ReadResult(
         "vehicle_out",
@@ -102,14 +189,12 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )
 
 
-def _values(column: list[AnyArray], flag: AnyArray) -> tuple[dict[str, AnyArray], list[str]]:
+def _values(number: FloatArray, flag: AnyArray) -> tuple[dict[str, AnyArray], list[str]]:
     """Columns of the record model; positions without a fix and unknown attitudes become NaN."""
     warnings: list[str] = []
-    longitude, latitude, altitude = (_lines.numbers(column[i]) for i in (1, 2, 3))
-    # groups 4-9 hold the tuples of the 10-field layout, 11-13 the bare angles of the 11-field one
-    angles = [np.fmax(_lines.numbers(column[4 + i]), _lines.numbers(column[11 + i])) for i in range(3)]
-    velocity = [_lines.numbers(column[7 + i]) for i in range(3)]
-    fix, satellites = (_lines.numbers(column[i]).astype(np.int64) for i in (18, 19))
+    longitude, latitude, altitude = number[1:4]
+    angles, velocity = number[4:7], number[7:10]
+    fix, satellites = number[10].astype(np.int64), number[11].astype(np.int64)
     no_fix = (fix < 2) | (longitude < _INVALID_POSITION) | (latitude < _INVALID_POSITION) | (altitude < -998.5)
     _lines.add_flag(flag, no_fix, "no_fix")
     outside = ~no_fix & ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180) & (np.abs(altitude) < 1e5))
@@ -143,14 +228,13 @@ def _values(column: list[AnyArray], flag: AnyArray) -> tuple[dict[str, AnyArray]
     return values, warnings
 
 
-def _doubts(column: list[AnyArray], keep: AnyArray) -> list[str]:
+def _doubts(number: FloatArray) -> list[str]:
     """Things that a flight as a whole may show."""
     warnings = []
-    index = _lines.numbers(column[0])[keep]
-    jumps = int((np.diff(index) != 1).sum())
+    jumps = int((np.diff(number[0]) != 1).sum())
     if jumps:
         warnings.append(f"the row index jumps at {jumps} places: rows are missing or files were joined")
-    if len(keep) > 10 and (column[18][keep] == b"6").all() and (column[19][keep] == b"10").all():
+    if number.shape[1] > 10 and (number[10] == 6).all() and (number[11] == 10).all():
         warnings.append("fix 6 with 10 satellites throughout: a digital-twin run looks like this, not a flight")
     return warnings
 

@@ -58,10 +58,15 @@ def test_a_port_that_comes_later(tap, tmp_path):
         assert session.end().exit_code == 0
 
 
-@pytest.mark.parametrize("content", ["a file", "a folder"])
+@pytest.mark.parametrize("content", ["a file", "a folder", "/dev/null", "/dev/zero"])
 def test_not_a_serial_port(tmp_path, content):
     path = tmp_path / "port"
-    path.write_text("x") if content == "a file" else path.mkdir()
+    if content.startswith("/"):
+        path = Path(content)
+    elif content == "a file":
+        path.write_text("x")
+    else:
+        path.mkdir()
     with pytest.raises(InputError, match="cannot be opened as a serial port"):
         run_tap(TapSettings(tmp_path / "log", str(path)))
 
@@ -169,7 +174,7 @@ def test_two_taps_in_one_process(modem, tap, tmp_path):
     session = tap(sim.port)
     session.wait(lambda: len(sim.journal) > 5)
     with pytest.raises(InputError, match="the port is held"):
-        run_tap(TapSettings(tmp_path / "second", str(sim.port)))
+        run_tap(TapSettings(tmp_path / "second", str(sim.port), duration_s=3.0))
     session.end()
 
 

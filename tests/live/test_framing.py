@@ -114,6 +114,7 @@ def test_answer_of_another_query_is_not_taken():
 
 def test_ok_glued_to_the_last_field():
     assert live([b'+QNWCFG: "nr5g_csi",2,2,2,2OK\r\n'])[0].status == "ok"
+    assert unglue('+QSPN: "X+CREG: 1",2') == ('+QSPN: "X+CREG: 1",2',)
     assert unglue('+QSPN: "TOKYO') == ('+QSPN: "TOKYO',)
 
 

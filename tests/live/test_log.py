@@ -7,6 +7,8 @@ import os
 import signal
 import subprocess
 import sys
+import threading
+import time
 import zlib
 from pathlib import Path
 
@@ -184,6 +186,33 @@ def test_after_an_io_error_of_the_sync_a_new_segment_begins(tmp_path, monkeypatc
     assert "failing disk or card" in said[0]
     assert len(log.paths) == 2
     assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == [0, 1]
+
+
+def test_a_sync_that_fails_beside_the_polling_is_told_at_the_next_record(tmp_path, monkeypatch):
+    real = os.fdatasync
+    failed = threading.Event()
+
+    def failing(fd):
+        if threading.current_thread().name == "tap-fdatasync" and not failed.is_set():
+            failed.set()
+            raise OSError(errno.EIO, "Input/output error")
+        real(fd)
+
+    monkeypatch.setattr(log_module.os, "fdatasync", failing)
+    log, said = make(tmp_path, sync_interval_s=0.001, retry_s=0.0)
+    log.append({"kind": "x", "i": 0})
+    while not failed.is_set():
+        time.sleep(0.002)
+        log.tick()
+    deadline = time.monotonic() + 10
+    i = 0
+    while not said and time.monotonic() < deadline:
+        i += 1
+        log.append({"kind": "x", "i": i})
+    log.close()
+    assert "failing disk or card" in said[0]
+    assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == list(range(i + 1))
+    assert sum(r["kind"] == "disk" for r in read_log(tmp_path)) == 1
 
 
 def test_sync_interval(tmp_path, monkeypatch):

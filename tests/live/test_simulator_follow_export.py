@@ -63,7 +63,7 @@ def test_tap_of_a_transcript(tap, tools, tmp_path):
     path = tmp_path / "t.txt"
     path.write_bytes(TRANSCRIPT)
     session = tap(None, replay=path)
-    session.wait(lambda: (tmp_path / "log").exists() and len(tools.exchanges(tmp_path / "log", "nr5g_csi")) >= 4)
+    session.wait(lambda: len(tools.exchanges(tmp_path / "log", "nr5g_csi")) >= 4)
     session.end()
     ranks = [r["decoded"]["rank"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
     assert ranks[:4] == [3, 1, 3, 1]
@@ -208,7 +208,7 @@ def test_export_holds_no_formula(tmp_path):
         "lines": [evil],
         "n": 1,
     }
-    record |= {"decoded": {"state": evil, "rat": "@SUM(1)"}, "flags": ["+1+1", evil]}
+    record |= {"decoded": {"state": evil, "rat": "@SUM(1)"}, "flags": ["-1+1", evil]}
     (tmp_path / "tap_x.jsonl").write_bytes(encode_record(record) + b"torn")
     summary = export_csv(tmp_path, tmp_path / "out.csv")
     assert (summary.rows, len(summary.bad_lines)) == (1, 1)

@@ -347,7 +347,7 @@ def test_replay_of_an_earlier_log(modem, tap, tools, tmp_path):
     session.end()
     first = [r["lines"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
     again = tap(None, folder=tmp_path / "again", replay=tmp_path / "log")
-    again.wait(lambda: (tmp_path / "again").exists() and len(tools.exchanges(tmp_path / "again", "nr5g_csi")) >= 6)
+    again.wait(lambda: len(tools.exchanges(tmp_path / "again", "nr5g_csi")) >= 6)
     again.end()
     second = [r["lines"] for r in tools.exchanges(tmp_path / "again", "nr5g_csi")]
     assert second[:6] == first[:6]
@@ -379,6 +379,7 @@ def test_schedule_of_a_slow_modem_prefers_the_first_and_tells_what_it_missed():
     assert counts["ri"] >= 120
     assert abs(counts["a"] - counts["b"]) <= 1
     assert missed["a"] > 0
+    assert 97 <= counts["a"] + missed["a"] <= 100  # every slot is polled or missed, once
 
 
 def test_status_line():

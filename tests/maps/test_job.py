@@ -1,25 +1,32 @@
 """The map job with a small engine of closed forms handed in."""
 
+import json
 import tracemalloc
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.maps import export
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import (
     PAPER_RANK_ALTITUDES_M,
     Evaluation,
-    altitude_variance,
     empirical_cdf,
     foliage_difference,
-    honest_study,
-    interpolation_study,
     layers_of,
     map_job,
-    rank_fields,
     rank_of_singular_values,
+    summary_of,
+)
+from aerpaw_cmp.maps.study import (
+    altitude_variance,
+    honest_study,
+    interpolation_study,
+    rank_fields,
     rank_study,
+    summary_of_study,
 )
 
 GRID = Grid.over_area((-300.0, 300.0, -300.0, 300.0))
@@ -154,6 +161,36 @@ def test_layers_are_named_once(result):
     assert "rank_k10_h003m_joint" in names
     assert "rss_mimo_h070m_B" in names
     assert all(layer.values.shape == (len(GRID),) for layer in layers)
+
+
+def test_layer_names_take_any_altitude_k_and_tower():
+    engine = Engine()
+    found = map_job(
+        GRID, {"A": TOWERS["A"]}, engine, rss_altitudes_m=(0.5, 1.0), rank_altitudes_m=(2.5,), ks=(12.5, 1e6)
+    )
+    names = {layer.name for layer in layers_of(found)}
+    assert {
+        "rss_siso_h0p5m_joint",
+        "rss_siso_h001m_joint",
+        "rank_k12p5_h2p5m_joint",
+        "rank_k1000000_h2p5m_joint",
+    } <= names
+
+
+def test_summary_is_json_and_adds_up(result, tmp_path):
+    heights, rank = rank_fields(result)
+    study = rank_study(result)
+    honest = honest_study(GRID, heights, rank, study.fit, learning_sizes=(50,), block_m=300.0)
+    summary = summary_of(result) | summary_of_study(study, honest)
+    path = export.write_json(tmp_path / "m.json", GRID, SiteFrame(35.7, -78.7), [], summary)
+    read = json.loads(path.read_text())["summary"]
+    assert sum(t["served"] for t in read["towers"].values()) == len(GRID)
+    assert read["rss"]["A"]["siso"][0]["coverage"] == pytest.approx(result.coverage("siso", "A")[0])
+    for row in read["rank"]["joint"]:
+        assert sum(row["shares"].values()) == pytest.approx(1.0)
+    assert read["fit"]["c4"] == study.fit.c4
+    assert np.shape(read["leave_one_out"]["Kriging"]["mae"]) == (3, 2)
+    assert read["honest"]["trajectory"] is None
 
 
 def test_rank_study_runs_the_papers_comparison(result):

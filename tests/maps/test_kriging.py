@@ -258,6 +258,25 @@ def test_fewer_than_m_one_and_none_within_the_radius():
     assert anyway == expected
 
 
+def test_no_sample_at_all():
+    model = OrdinaryKriging(PAPER).fit(np.zeros((0, 2)), np.zeros(0))
+    assert np.isnan(model.predict([[0.0, 0.0]])[0]).all()
+    assert OrdinaryKriging(PAPER).fit([[0.0, 0.0]], np.zeros((1, 0))).predict([[0.0, 0.0]])[0].shape == (1, 0)
+
+
+def test_memory_of_a_prediction_is_bounded():
+    """What grows with the targets is neighbours and weights (a few hundred bytes), not the systems (7 kB)."""
+    import tracemalloc
+
+    model = OrdinaryKriging(PAPER, 20, np.inf).fit(scattered(60, 40), np.zeros(60))
+    targets = scattered(30_000, 41)
+    tracemalloc.start()
+    model.predict(targets)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 30_000 * 1000 + 60e6
+
+
 def test_radius_is_inclusive():
     """150 m / 30 m: the fifth cell counts, although 5 * 30.000000000000001 might not."""
     model = OrdinaryKriging(exponential, 1, 0.3).fit([[0.1 * 3, 0.0]], [5.0])
@@ -334,6 +353,31 @@ def test_an_invalid_correlation_never_gives_a_negative_variance():
     near = np.argsort(np.linalg.norm(points[None] - targets[:, None], axis=-1), axis=1)[:, :15]
     plain = [textbook(points[near[t]], np.zeros(15), targets[t], box)[1] for t in range(50)]
     assert min(plain) < 0, "the case is not hard"
+
+
+def test_a_curve_that_is_no_covariance_does_not_blow_up():
+    """Found on a real flight log: 1 up to 8 m and then a jump. Textbook weights exceed 1e4, most with a variance > 0."""
+
+    def shelf(d):
+        return np.where(d < 8.0, 1.0, 0.55 * np.exp(-d / 75))
+
+    rng = np.random.default_rng(0)
+    along = np.linspace(0, 600, 150)
+    points = np.column_stack([along, 30 * np.sin(along / 60)]) + rng.normal(0, 1, (150, 2))
+    targets = points[rng.integers(0, 150, 3000)] + rng.normal(0, 8, (3000, 2))
+    rule = OrdinaryKriging(shelf, 20, outside="nearest").fit(points, np.zeros(150)).weights(targets)
+    assert np.abs(rule.weight).max() < 2
+    np.testing.assert_allclose(rule.weight.sum(axis=1), 1.0, atol=1e-9)
+    assert (rule.variance >= 0).all()
+
+
+def test_a_correlation_above_one_counts_as_one():
+    points = scattered(60, 38)
+    values = np.random.default_rng(39).normal(size=60)
+    high = OrdinaryKriging(lambda d: 2.2 * np.exp(-d / 55), 10, outside="nearest").fit(points, values)
+    one = OrdinaryKriging(lambda d: np.minimum(2.2 * np.exp(-d / 55), 1.0), 10, outside="nearest").fit(points, values)
+    np.testing.assert_array_equal(high.leave_one_out()[0], one.leave_one_out()[0])
+    assert np.abs(high.leave_one_out()[0]).max() < 2 * np.abs(values).max()
 
 
 def test_nugget_is_a_jump_unless_it_is_noise():

@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import io
+import zlib
 
 import numpy as np
 import scipy.io
@@ -163,6 +164,32 @@ def mat_flight(**changes: object) -> bytes:
     return file.getvalue()
 
 
+def tap_line(text: str) -> bytes:
+    """A record of the tap with its checksum."""
+    return f'{text},"crc":"{zlib.crc32(text.encode()):08x}"}}\n'.encode()
+
+
+TAP_TIMES = '"sent_utc_ns":1740927600{0}0000000,"last_utc_ns":1740927600{0}4000000'
+TAP = (
+    tap_line('{"kind":"header","schema":"aerpaw-cmp-tap/1","ri_base":"one","n":0')
+    + tap_line(
+        '{"kind":"exchange","query":"servingcell","status":"ok","flags":[],"n":1,'
+        + TAP_TIMES.format("10")
+        + ',"decoded":{"rat":"NR5G-SA","nr":{"rsrp_dbm":-80,"sinr_db":20}}'
+    )
+    + tap_line(
+        '{"kind":"exchange","query":"nr5g_csi","status":"ok","flags":[],"n":2,'
+        + TAP_TIMES.format("20")
+        + ',"decoded":{"rank":2,"ri_raw":2,"mcs":11,"cqi":9,"pmi":7}'
+    )
+    + tap_line(
+        '{"kind":"exchange","query":"nr5g_csi","status":"ok","flags":["no_csi"],"n":3,'
+        + TAP_TIMES.format("70")
+        + ',"decoded":{"rank":null,"ri_raw":0}'
+    )
+    + b'{"kind":"exchange","query":"nr5g_csi","sta\n'
+)
+
 SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "vehicle_out": {
         "ten_fields": (VEHICLE_10, 3, 0),
@@ -185,6 +212,7 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "aadm_snr": {"table": (SNR_CSV, 2, 1)},
     "controller_log": {"console": (CONTROLLER, 3, 1)},
     "srsenb_log": {"console": (SRSENB, 3, 1)},
+    "tap_jsonl": {"session": (TAP, 3, 1)},
     "generic_csv": {"mapped": (GENERIC, 2, 1)},
 }
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]

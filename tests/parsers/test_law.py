@@ -127,6 +127,15 @@ def test_trailing_text_without_line_end(reader: str, sample: str) -> None:
     assert len(result.rejected) == rejected + (reader not in ("controller_log", "srsenb_log", "nemo_kml"))
 
 
+@pytest.mark.parametrize("reader", ["generic_csv", "nemo_csv", "quectel_ri", "aadm_snr"])
+def test_byte_order_mark(reader: str) -> None:
+    ((data, accepted, rejected),) = SAMPLES[reader].values()
+    result = check_law(reader, b"\xef\xbb\xbf" + data)
+    assert result is not None
+    assert (result.accepted, len(result.rejected)) == (accepted, rejected)
+    check_law(reader, b"\xef\xbb\xbf")
+
+
 @pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
 def test_nul_bytes_and_a_huge_line(reader: str, sample: str) -> None:
     data, accepted, _ = SAMPLES[reader][sample]

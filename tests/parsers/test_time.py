@@ -99,6 +99,12 @@ def test_days_that_are_none(text: str) -> None:
     assert not valid[0]
 
 
+@pytest.mark.parametrize("text", ["24:00:00", "10:60:00", "10:00:60", "1a:00:00", "10-00:00", "10:00 00"])
+def test_times_of_day_that_are_none(text: str) -> None:
+    _, valid = _time.parse_digits(np.frombuffer(f"2025-03-02 {text}".encode(), dtype=np.uint8)[None, :], 0)
+    assert not valid[0]
+
+
 @pytest.mark.parametrize(
     ("text", "expected"),
     [

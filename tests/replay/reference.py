@@ -70,21 +70,50 @@ def element_field(turn, direction, slant, field):
     return matvec(turn, plus(scaled(theta_hat, f_theta), scaled(phi_hat, f_phi)))
 
 
-def path_amplitude(tx, rx, tx_turn, rx_turn, tx_slant, rx_slant, planes, wavelength, field):
-    """One element pair over mirrors ``planes`` = [(normal, offset, eta, thickness)], from tx to rx."""
+def reflection_points(tx, rx, planes):
+    """[tx, reflection points, rx], or None when they do not follow each other in this order."""
     images = [tx]
     for n, d, _, _ in planes:
         images.append(minus(images[-1], scaled(n, 2 * (dot(n, images[-1]) - d))))
     points = [rx]
     for (n, d, _, _), image in zip(planes[::-1], images[:0:-1], strict=True):
         step = minus(points[0], image)
-        points.insert(0, plus(image, scaled(step, (d - dot(n, image)) / dot(n, step))))
+        share = (d - dot(n, image)) / dot(n, step)
+        if not 0 < share < 1:
+            return None
+        points.insert(0, plus(image, scaled(step, share)))
     points.insert(0, tx)
-    length = sum((mp.sqrt(dot(minus(b, a), minus(b, a))) for a, b in itertools.pairwise(points)), mp.mpf(0))
-    directions = [unit(minus(b, a)) for a, b in itertools.pairwise(points)]
+    return points
+
+
+def unfolded(tx, rx, planes):
+    """Length and directions of all legs from the last image, wherever the reflection points lie."""
+    image = tx
+    for n, d, _, _ in planes:
+        image = minus(image, scaled(n, 2 * (dot(n, image) - d)))
+    step = minus(rx, image)
+    directions = [unit(step)]
+    for n, _, _, _ in planes[::-1]:
+        directions.insert(0, minus(directions[0], scaled(n, 2 * dot(n, directions[0]))))
+    return mp.sqrt(dot(step, step)), directions
+
+
+def path_amplitude(tx, rx, tx_turn, rx_turn, tx_slant, rx_slant, planes, wavelength, field):
+    """One element pair over mirrors ``planes`` = [(normal, offset, eta, thickness)], from tx to rx.
+
+    A path belongs to the array centres. Near a corner of two faces some pairs would meet them in the other order;
+    for those the path is continued as if the faces had no end.
+    """
+    points = reflection_points(tx, rx, planes)
+    if points is None:
+        length, directions = unfolded(tx, rx, planes)
+    else:
+        steps = [minus(b, a) for a, b in itertools.pairwise(points)]
+        length = sum((mp.sqrt(dot(step, step)) for step in steps), mp.mpf(0))
+        directions = [unit(step) for step in steps]
     wave = element_field(tx_turn, directions[0], tx_slant, field)
     for (n, _, eta, thickness), before, after in zip(planes, directions[:-1], directions[1:], strict=True):
-        te, tm = fresnel(-dot(before, n), eta, thickness, wavelength)
+        te, tm = fresnel(abs(dot(before, n)), eta, thickness, wavelength)
         s = unit(cross(before, n))
         p_in, p_out = cross(s, before), cross(s, after)
         wave = plus(scaled(s, te * dot(s, wave)), scaled(p_out, tm * dot(p_in, wave)))

@@ -75,6 +75,15 @@ def test_tolerance_reaches_over_the_edge_of_a_polygon_with_holes(scenes):
     assert inside(faces, roof, point, 1e-3)[0]
 
 
+@pytest.mark.parametrize("shape", [box(0, 0, 20, 20), COURT])
+def test_negative_tolerance_leaves_the_edges_out(scenes, shape):
+    faces = site_faces(scenes.site([barn(shape)]))
+    roof = np.full(3, len(faces) - 1)
+    points = np.array([[0.0, 2.0, 6.0], [1e-3, 2.0, 6.0], [2.0, 20.0, 6.0]])
+    assert inside(faces, roof, points, 1e-6).tolist() == [True, True, True]
+    assert inside(faces, roof, points, -1e-6).tolist() == [False, True, False]
+
+
 @pytest.mark.parametrize("shape", [box(0, 0, 20, 10), COURT, Polygon([(0, 0), (9, 2), (4, 8)])])
 def test_triangles_cover_the_faces_exactly_once(scenes, shape):
     faces = site_faces(scenes.site([barn(shape)]))

@@ -135,7 +135,7 @@ def test_grid_finds_every_crown(monkeypatch: pytest.MonkeyPatch) -> None:
         share = foliage._chord_share(start, end - start, np.broadcast_to(body, (500, 5)), "cone")
         one_by_one += share * np.linalg.norm(end - start, axis=1)
     np.testing.assert_allclose(found, one_by_one, rtol=1e-9, atol=1e-9)
-    monkeypatch.setattr(foliage, "_PIECES_AT_ONCE", 7)  # small batches give the same sums
+    monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 70)  # small batches give the same sums
     np.testing.assert_allclose(CrownIndex(stand).chords_m(start, end), found, rtol=1e-12, atol=1e-12)
 
 

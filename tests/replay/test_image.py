@@ -195,3 +195,17 @@ def test_triangular_roof_reflects_inside_its_polygon_only(scenes):
     faces, paths = search(site, [[50.0, -15.0, 10.0], [65.0, 15.0, 10.0]], 1)
     roof = faces.label.index("b roof")
     assert paths.pose[paths.faces[:, 0] == roof].tolist() == [0]
+
+
+def test_faces_that_may_not_reflect_do_not_at_any_place_of_a_sequence(scenes):
+    site = scenes.site([Building("a", box(40, -50, 45, 50), 30.0)])
+    faces = site_faces(site)
+    target = np.array([[10.0, 20.0, 15.0]])
+    whole = find_paths(faces, SOURCE, target, max_depth=2)
+    wall = int(np.flatnonzero(faces.normal[:, 0] == -1.0)[0])
+    assert {0, wall} in [set(row) for row in whole.faces.tolist()]  # a corner reflection
+    for face in (0, wall):
+        usable = np.ones((1, len(faces)), dtype=bool)
+        usable[0, face] = False
+        some = find_paths(faces, SOURCE, target, max_depth=2, usable=usable)
+        assert scenes.keys(some) == {key for key in scenes.keys(whole) if face not in key[2:]}

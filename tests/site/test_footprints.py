@@ -2,10 +2,12 @@
 
 import json
 import math
+import os
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shapely
 from shapely.geometry import box
 
 from aerpaw_cmp.errors import InputError, UsageError
@@ -215,6 +217,24 @@ def test_duplicates_slivers_and_overlaps(tmp_path: Path) -> None:
     assert all(a.intersection(b).area < 0.01 for i, a in enumerate(shapes) for b in shapes[:i])
 
 
+def test_rounding_for_the_file_breaks_no_outline(tmp_path: Path) -> None:
+    # rounding vertices one by one once made notched, cut-away outlines cross themselves
+    random = np.random.default_rng(1)
+    features: list[tuple[list[Ring], dict[str, object]]] = []
+    for _ in range(250):
+        turn, corner, size = random.uniform(0, np.pi), random.uniform(-150, 150, 2), random.uniform(8, 30, 2)
+        box_ = np.array([(0, 0), (1, 0), (1, 1), (0.5, 1), (0.5, 0.6), (0, 0.6)]) * size
+        rotation = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        ring = [(float(x), float(y)) for x, y in corner + box_ @ rotation.T]
+        features.append(([ring], {"building": "yes", "height": f"{random.uniform(4, 12):.1f}"}))
+    model, _ = import_site([geojson(tmp_path / "v.json", *features)])
+    write_site_yaml(model, tmp_path / "site.yaml")
+    site = load_site(tmp_path / "site.yaml")
+    assert len(site.buildings) > 200
+    drawn = shapely.union_all([shapely.Polygon(rings[0]) for rings, _ in features]).area
+    assert sum(b.footprint.area for b in site.buildings) == pytest.approx(drawn, rel=0.01)
+
+
 def test_overlapping_forests_do_not_double_the_trees(tmp_path: Path) -> None:
     wood: dict[str, object] = {"landuse": "forest"}
     found = imported(tmp_path, ([square(0, 0, 100)], wood), ([square(50, 0, 100)], wood))
@@ -325,3 +345,14 @@ def test_nothing_named() -> None:
         import_site([])
     with pytest.raises(InputError, match="cannot be read"):
         import_footprints(["/nowhere/at/all.osm"], FRAME)
+
+
+@pytest.mark.field
+@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
+def test_geofence_of_the_field() -> None:
+    path = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "telemetry" / "AERPAW_Big_Geofence.kml"
+    site = load_site("lake_wheeler")
+    found = import_footprints([path], site.frame)
+    assert (len(found.geofences), len(found.buildings), found.actions) == (1, 0, [])
+    assert 1e4 < found.geofences[0].area.area < 5e6
+    assert found.geofences[0].area.distance(shapely.Point(0, 0)) < 500  # the flights start near LW1

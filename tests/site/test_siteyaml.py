@@ -10,7 +10,8 @@ from pyproj import Geod
 
 from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
-from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, load_site
+from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SiteModel, build_site, load_site
+from aerpaw_cmp.yamlfile import parse_yaml
 
 MINIMAL = """\
 name: test
@@ -92,10 +93,19 @@ def test_trees_stand_in_forests_and_clear_of_masts() -> None:
         ("sead: 1", "line 5: unknown key 'sead'. Likely cause: did you mean 'area_m'|line 5: unknown key 'sead'"),
         ("trees: {sead: 1}", "line 5: unknown key 'trees.sead'. Likely cause: did you mean 'seed'"),
         ("name: again", r"line 5: the key 'name' stands twice \(first on line 1\)"),
-        ("ground_material: medium_dry_grund", "did you mean 'medium_dry_ground'"),
+        (
+            "ground_material: medium_dry_grund",
+            "line 5: ground_material: unknown material .*did you mean 'medium_dry_ground'",
+        ),
         ("buildings:\n- {name: a, height_m: -1, polygon_m: [[0,0],[1,0],[1,1]]}", "line 6: .*height_m: found -1"),
-        ("buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[0,0],[0,0]]}", "'a' has fewer than 3 distinct"),
-        ("buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[9,9],[9,0],[0,9]]}", "'a' is not a simple outline"),
+        (
+            "buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[0,0],[0,0]]}",
+            "line 6: .*'a' has fewer than 3 distinct",
+        ),
+        (
+            "buildings:\n- {name: a, height_m: 1, polygon_m: [[0,0],[9,9],[9,0],[0,9]]}",
+            "line 6: .*'a' is not a simple outline",
+        ),
         ("buildings:\n- {name: a, height_m: 1}", "give polygon_m .* or polygon_deg"),
         (
             "forests:\n- {name: w, polygon_deg: [[-78.7, 35.7], [-78.6, 35.7], [-78.6, 35.8]]}",
@@ -132,6 +142,12 @@ def test_towers_in_the_wrong_place(tmp_path: Path, tower: str, words: str) -> No
     )
     with pytest.raises(UsageError, match=words):
         load_site(site_file(tmp_path, text))
+
+
+def test_antenna_inside_a_building_is_noted(tmp_path: Path) -> None:
+    hall = "buildings:\n- {name: hall, height_m: %g, polygon_m: [[-9, -9], [9, -9], [9, 9], [-9, 9]]}"
+    assert any("inside building 'hall'" in n for n in load_site(site_file(tmp_path, MINIMAL + hall % 12)).notes)
+    assert not load_site(site_file(tmp_path, MINIMAL + hall % 9)).notes  # on the roof
 
 
 def test_no_such_site(tmp_path: Path) -> None:
@@ -193,3 +209,21 @@ def test_altitude_above_takeoff_of_a_flight() -> None:
     datum = VerticalDatum(takeoff_ground_m=-2.0)
     assert datum.up_m(Height(30, HeightReference.ABOVE_TAKEOFF), "UAV") == 28
     assert datum.up_m(Height(30, HeightReference.ABOVE_GROUND), "UAV", ground_m=4) == 34
+
+
+def test_the_documented_site_is_valid() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
+    model = parse_yaml(text.split("```yaml\n")[1].split("```")[0], SiteModel)
+    assert model.dem is not None
+    assert set(type(model).model_fields) == model.model_fields_set  # the page shows every key
+    site = build_site(model)
+    assert site.towers["LW2"].position_m[2] == pytest.approx(10.0)
+    assert len(site.trees) > 10
+
+
+def test_the_documented_differences_are_the_computed_ones() -> None:
+    text = (Path(__file__).parents[2] / "docs" / "lake_wheeler.md").read_text(encoding="utf-8")
+    for note in load_site("lake_wheeler").notes[2:]:
+        tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
+        row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
+        assert f"| {metres} |" in row

@@ -1,0 +1,269 @@
+"""The paper's correlation curve (arXiv 2502.10324, section VI-A) and its fit by variable projection."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..errors import UsageError
+from ..units import FloatArray
+
+TINY = 1e-300
+
+
+@dataclass(frozen=True, slots=True)
+class BiExponential:
+    """``c1 exp(c2 d) + c3 exp(c4 d)``, d in metres; the faster decay first.
+
+    Parameters
+    ----------
+    c1, c2, c3, c4 : float
+        Amplitudes c1, c3 and rates c2 <= c4 <= 0 [1/m].
+    rmse : float
+        Root of the mean squared residual of the fit.
+    degenerate : bool
+        True when the data do not hold two exponentials; the curve is still the best found, the four numbers are
+        then no property of the data.
+    message : str
+        Why, as a sentence; empty when not degenerate.
+
+    Examples
+    --------
+    >>> paper = BiExponential(0.2932, -0.0508, 0.7057, -0.001, rmse=0.0153)
+    >>> round(float(paper(0.0)), 4), round(paper.nugget, 4)
+    (0.9989, 0.0011)
+    """
+
+    c1: float
+    c2: float
+    c3: float
+    c4: float
+    rmse: float
+    degenerate: bool = False
+    message: str = ""
+
+    def __call__(self, distance_m: ArrayLike) -> FloatArray:
+        """Correlation at distances [m]."""
+        d = np.asarray(distance_m, dtype=np.float64)
+        return np.asarray(self.c1 * np.exp(self.c2 * d) + self.c3 * np.exp(self.c4 * d))
+
+    @property
+    def nugget(self) -> float:
+        """1 - Phi(0+)."""
+        return 1.0 - self.c1 - self.c3
+
+
+PAPER_BIEXPONENTIAL = BiExponential(0.2932, -0.0508, 0.7057, -0.001, 0.0153)
+"""The paper's fit (section VII-C)."""
+
+
+def fit_biexponential(
+    distance_m: ArrayLike,
+    correlation: ArrayLike,
+    *,
+    weights: ArrayLike | None = None,
+    amplitude_bounds: tuple[float, float] = (0.0, np.inf),
+    greatest_at_zero: float = 1.0,
+    rate_bounds_per_m: tuple[float, float] | None = None,
+    starts: int = 6,
+) -> BiExponential:
+    """Least-squares bi-exponential by variable projection.
+
+    For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form, so only the
+    logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its ``starts``
+    best cells.
+
+    Parameters
+    ----------
+    distance_m, correlation : (n,)
+        The points; NaN pairs do not count.
+    weights : (n,), optional
+        Such as the number of pairs of each bin; the paper's fit has none. ``rmse`` is weighted likewise.
+    amplitude_bounds : (low, high)
+        Of c1 and c3. Amplitudes of at least 0 keep the curve a valid covariance in any dimension.
+    greatest_at_zero : float
+        Bound of c1 + c3. A correlation is at most 1; without the bound, data that begin beyond distance 0 let the
+        fast exponential shoot up between 0 and the first point. Infinite for a free fit.
+    rate_bounds_per_m : (slowest, fastest), optional
+        Of -c2 and -c4 [1/m], positive. By default from 1e-6 over the largest distance (flat over the data) to 10 over
+        the smallest positive one (gone at the first bin).
+    starts : int
+        Number of trust-region searches.
+
+    Returns
+    -------
+    BiExponential
+        ``degenerate`` tells when one exponential does as well, an amplitude vanishes, the rates coincide or one
+        of them lies at a bound.
+
+    Raises
+    ------
+    UsageError
+        With fewer than two usable points, or bounds that hold nothing.
+
+    References
+    ----------
+    .. [1] Golub and Pereyra, Inverse Problems 19 (2003) R1, doi:10.1088/0266-5611/19/2/201
+    """
+    problem = _Projection.of(distance_m, correlation, weights, (*amplitude_bounds, greatest_at_zero), rate_bounds_per_m)
+    if len(problem.d) < 4:
+        single = problem.single()
+        return problem.result(single, f"{len(problem.d)} points cannot tell four coefficients")
+    best = problem.double(starts)
+    return problem.judge(best)
+
+
+@dataclass(frozen=True, slots=True)
+class _Projection:
+    """The reduced problem: residuals as a function of the logarithms of the rates."""
+
+    d: FloatArray
+    y: FloatArray
+    root_weight: FloatArray
+    low: float
+    high: float
+    total: float
+    log_rates: tuple[float, float]
+
+    @classmethod
+    def of(
+        cls,
+        distance_m: ArrayLike,
+        correlation: ArrayLike,
+        weights: ArrayLike | None,
+        bounds: tuple[float, float, float],
+        rate_bounds_per_m: tuple[float, float] | None,
+    ) -> _Projection:
+        d = np.asarray(distance_m, dtype=np.float64).ravel()
+        y = np.asarray(correlation, dtype=np.float64).ravel()
+        w = np.ones_like(d) if weights is None else np.asarray(weights, dtype=np.float64).ravel()
+        if not (d.shape == y.shape == w.shape):
+            raise UsageError(f"{d.size} distances, {y.size} correlations and {w.size} weights")
+        good = np.isfinite(d) & np.isfinite(y) & (w > 0) & (d >= 0)
+        d, y, w = d[good], y[good], w[good]
+        if len(d) < 2 or not d.max() > 0:
+            raise UsageError(f"{len(d)} usable points for a curve", expected="at least two, at different distances")
+        slow, fast = rate_bounds_per_m or (1e-6 / d.max(), 10.0 / d[d > 0].min())
+        low, high, total = bounds
+        if not (0 < slow < fast and low < high and total > max(2 * low, low)):
+            raise UsageError(f"bounds {bounds} and {rate_bounds_per_m}", expected="bounds that leave room, rates > 0")
+        return cls(d, y, np.sqrt(w / w.mean()), low, high, total, (float(np.log(slow)), float(np.log(fast))))
+
+    def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""
+        basis = np.exp(-np.exp(log_rates)[..., None, :] * self.d[:, None]) * self.root_weight[:, None]
+        target = self.y * self.root_weight
+        candidates = _candidate_amplitudes(basis, target, self.low, self.high, self.total)
+        residual = (basis[..., None, :, :] @ candidates[..., :, :, None])[..., 0] - target
+        pick = np.argmin((residual**2).sum(axis=-1), axis=-1)[..., None, None]
+        chosen = np.take_along_axis(candidates, pick, axis=-2)[..., 0, :]
+        return chosen, np.take_along_axis(residual, pick, axis=-2)[..., 0, :]
+
+    def double(self, starts: int) -> FloatArray:
+        """Logarithms of the two best rates, the faster first."""
+        axis = np.linspace(*self.log_rates, 48)
+        first, second = np.triu_indices(len(axis), 1)
+        grid = np.column_stack([axis[second], axis[first]])
+        cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
+        found = [self._search(grid[cell]) for cell in np.argsort(cost)[:starts]]
+        best = min(found, key=lambda log_rates: float((self.amplitudes(log_rates)[1] ** 2).sum()))
+        return np.sort(best)[::-1]
+
+    def _search(self, start: FloatArray) -> FloatArray:
+        from scipy.optimize import least_squares
+
+        inside = np.clip(start, self.log_rates[0] + 1e-9, self.log_rates[1] - 1e-9)
+        fit = least_squares(
+            lambda p: self.amplitudes(p)[1], inside, bounds=self.log_rates, xtol=1e-15, ftol=1e-15, gtol=1e-15
+        )
+        return np.asarray(fit.x)
+
+    def single(self) -> float:
+        """Logarithm of the rate of the best single exponential."""
+        from scipy.optimize import minimize_scalar
+
+        def cost(log_rate: float) -> float:
+            return self._single_cost(log_rate)
+
+        axis = np.linspace(*self.log_rates, 200)
+        best = int(np.argmin([cost(a) for a in axis]))
+        bracket = (axis[max(best - 1, 0)], axis[min(best + 1, len(axis) - 1)])
+        return float(minimize_scalar(cost, bounds=bracket, method="bounded", options={"xatol": 1e-13}).x)
+
+    def _single_amplitude(self, log_rate: float) -> float:
+        basis = np.exp(-np.exp(log_rate) * self.d) * self.root_weight
+        amplitude = float(basis @ (self.y * self.root_weight) / max(basis @ basis, TINY))
+        return min(max(amplitude, self.low), self.high, self.total)
+
+    def _single_cost(self, log_rate: float) -> float:
+        curve = self._single_amplitude(log_rate) * np.exp(-np.exp(log_rate) * self.d)
+        return float((((curve - self.y) * self.root_weight) ** 2).sum())
+
+    def result(self, log_rate: float, message: str) -> BiExponential:
+        """One exponential as a degenerate pair: c1 = 0."""
+        rate = -float(np.exp(log_rate))
+        rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
+        return BiExponential(0.0, rate, self._single_amplitude(log_rate), rate, rmse, True, message)
+
+    def judge(self, log_rates: FloatArray) -> BiExponential:
+        """The fit with a verdict on whether two exponentials are in the data."""
+        amplitude, residual = self.amplitudes(log_rates)
+        cost, n = float((residual**2).sum()), len(self.d)
+        single = self.single()
+        cost_single = self._single_cost(single)
+        c1, c3 = (float(a) for a in amplitude)
+        c2, c4 = (-float(rate) for rate in np.exp(log_rates))
+        scale = 1e-20 * float(((self.y * self.root_weight) ** 2).sum())
+        # Bayesian information criterion: two more coefficients must pay for themselves
+        gain = n * np.log((cost_single + scale) / (cost + scale)) - 2 * np.log(n)
+        reasons = []
+        if gain <= 0:
+            reasons.append("one exponential describes the data as well (BIC)")
+        if min(abs(c1), abs(c3)) < 1e-3 * max(abs(c1), abs(c3), 1e-300):
+            reasons.append("one of the two amplitudes vanishes")
+        if log_rates[0] - log_rates[1] < 0.05:
+            reasons.append("the two rates coincide")
+        if log_rates[0] > self.log_rates[1] - 1e-3:
+            reasons.append("the fast rate lies at its bound: the first bins hold a jump, not a decay")
+        if -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3:
+            reasons.append("the slow rate is too small to tell from 0: the tail is flat over the data")
+        rmse = float(np.sqrt(cost / n))
+        return BiExponential(c1, c2, c3, c4, rmse, bool(reasons), "; ".join(reasons))
+
+
+def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float, total: float) -> FloatArray:
+    """Best points (..., candidates, 2) of a two-column least-squares problem inside its bounds and on each edge.
+
+    The bounds are ``low <= c <= high`` for both and ``c1 + c3 <= total``; the least cost among the candidates is the
+    bounded optimum, because a convex cost has it inside or on an edge.
+    """
+    gram = np.swapaxes(basis, -1, -2) @ basis
+    right = (np.swapaxes(basis, -1, -2) @ target[:, None])[..., 0]
+    a, b, c = gram[..., 0, 0], gram[..., 0, 1], gram[..., 1, 1]
+    p, q = right[..., 0], right[..., 1]
+    edges = []
+    for edge in {low, min(high, total - low)}:
+        if np.isfinite(edge):
+            top = min(high, total - edge)
+            edges.append((np.full_like(p, edge), _clipped(q - b * edge, c, low, top)))
+            edges.append((_clipped(p - b * edge, a, low, top), np.full_like(p, edge)))
+    if total <= 2 * high and np.isfinite(total):
+        # c3 = total - c1
+        first = _clipped(p - q + (c - b) * total, a - 2 * b + c, max(low, total - high), min(high, total - low))
+        edges.append((first, total - first))
+    determinant = a * c - b * b
+    regular = determinant > 1e-14 * a * c + TINY
+    safe = np.where(regular, determinant, 1.0)
+    first, second = (c * p - b * q) / safe, (a * q - b * p) / safe
+    inside = regular & (np.minimum(first, second) >= low) & (np.maximum(first, second) <= high)
+    inside &= first + second <= total
+    fallback = edges[0] if edges else (np.zeros_like(p), _clipped(q, c, low, high))
+    free = (np.where(inside, first, fallback[0]), np.where(inside, second, fallback[1]))
+    return np.stack([np.stack(pair, axis=-1) for pair in (free, fallback, *edges)], axis=-2)
+
+
+def _clipped(right: FloatArray, square: FloatArray, low: float, high: float) -> FloatArray:
+    """Minimum over [low, high] of square * x^2 - 2 * right * x."""
+    return np.asarray(np.clip(right / np.maximum(square, TINY), low, high))

@@ -1,0 +1,250 @@
+"""Correlation and interpolation of maps: the paper's comparison (section VII-C), and the one with gaps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..units import FloatArray
+from .evaluate import (
+    IntervalCoverage,
+    Predictor,
+    Score,
+    along_trajectory,
+    altitude_held_out,
+    blocked,
+    interval_coverage,
+    learning_curve,
+    leave_one_out_estimate,
+    score,
+)
+from .grid import Grid, without_coverage_as_nan
+from .interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean
+from .job import MapResult
+from .kriging import OrdinaryKriging
+from .variogram import (
+    PAPER_BIEXPONENTIAL,
+    BiExponential,
+    BinnedCorrelation,
+    field_correlation,
+    fit_biexponential,
+    fit_vertical_scale,
+    vector_correlation,
+    vertical_correlation,
+)
+
+
+@dataclass(frozen=True, slots=True)
+class Study:
+    """The paper's section VII-C on maps: correlation, curve, and leave-one-out errors of each interpolator.
+
+    Parameters
+    ----------
+    correlation : BinnedCorrelation
+        Of the positions' vectors.
+    fit : BiExponential
+        The curve through it.
+    scores : mapping of str to Score
+        "Kriging", "makima", "spline" (the paper's), "nearest", "inverse distance", "serving-tower mean"; arrays of
+        shape (altitudes, K).
+    intervals : IntervalCoverage
+        Of the Kriging variance with one v^2 per map: its sample variance.
+    intervals_paper : IntervalCoverage
+        With the paper's v^2, the variance over the altitudes at each position; positions with v^2 = 0 do not count.
+    """
+
+    correlation: BinnedCorrelation
+    fit: BiExponential
+    scores: Mapping[str, Score]
+    intervals: IntervalCoverage
+    intervals_paper: IntervalCoverage
+
+
+def rank_fields(
+    result: MapResult, lowest_altitude_m: float = 30.0, out_of_coverage: Literal["missing", "zero"] = "missing"
+) -> tuple[tuple[float, ...], FloatArray]:
+    """Altitudes and joint ranks (n, altitudes, K) to interpolate; the paper leaves 3 m out.
+
+    ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
+    """
+    rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= lowest_altitude_m]
+    rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)
+    heights = tuple(result.rank_altitudes_m[i] for i in rows)
+    return heights, without_coverage_as_nan(rank) if out_of_coverage == "missing" else rank
+
+
+def rank_study(
+    result: MapResult,
+    *,
+    lowest_altitude_m: float = 30.0,
+    out_of_coverage: Literal["missing", "zero"] = "missing",
+    neighbours: int = 20,
+    radius_m: float = 150.0,
+    selection: Literal["nearest", "random"] = "nearest",
+    seed: int = 0,
+) -> Study:
+    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`."""
+    _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
+    return interpolation_study(
+        result.grid, rank, result.towers_m, neighbours=neighbours, radius_m=radius_m, selection=selection, seed=seed
+    )
+
+
+def interpolation_study(
+    grid: Grid,
+    values: FloatArray,
+    towers_m: FloatArray,
+    *,
+    neighbours: int = 20,
+    radius_m: float = 150.0,
+    selection: Literal["nearest", "random"] = "nearest",
+    seed: int = 0,
+) -> Study:
+    """Correlation and leave-one-out interpolation of maps.
+
+    Parameters
+    ----------
+    grid : Grid
+        Positions.
+    values : (n, altitudes, K)
+        Rank or RSS; NaN out of coverage. For RSS the last axis may hold towers.
+    towers_m : (towers, 2+)
+        For the serving-tower mean.
+    neighbours, radius_m, selection, seed
+        M, r0 and the choice of samples, the same for every local interpolator.
+    """
+    points = grid.points_m
+    correlation = vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
+    fit = _curve(correlation)
+    kriging = OrdinaryKriging(fit, neighbours, radius_m, selection=selection, seed=seed)
+    estimate, variance = leave_one_out_estimate(kriging, points, values)
+    peers: dict[str, Predictor] = {
+        "makima": IndexInterpolation("makima", grid, neighbours, radius_m, selection=selection, seed=seed),
+        "spline": IndexInterpolation("spline", grid, neighbours, radius_m, selection=selection, seed=seed),
+        "nearest": Nearest(radius_m),
+        "inverse distance": InverseDistance(neighbours, radius_m),
+        "serving-tower mean": ServingTowerMean(towers_m),
+    }
+    scores = {"Kriging": score(values, estimate)}
+    scores |= {name: score(values, leave_one_out_estimate(peer, points, values)[0]) for name, peer in peers.items()}
+    sill = kriging.sill_.reshape(values.shape[1:])
+    relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
+    return Study(
+        correlation,
+        fit,
+        scores,
+        interval_coverage(values, estimate, variance),
+        interval_coverage(values, estimate, relative * altitude_variance(values)[:, None, :]),
+    )
+
+
+def altitude_variance(values: FloatArray) -> FloatArray:
+    """The paper's v^2 (n, K): sample variance over the altitudes of (n, altitudes, K); NaN below two values."""
+    known = np.isfinite(values)
+    count = known.sum(axis=1)
+    mean = np.where(known, values, 0.0).sum(axis=1) / np.maximum(count, 1)
+    squares = np.where(known, values - mean[:, None], 0.0) ** 2
+    return np.asarray(np.where(count > 1, squares.sum(axis=1) / np.maximum(count - 1, 1), np.nan))
+
+
+def _curve(correlation: BinnedCorrelation) -> BiExponential:
+    if np.isfinite(correlation.correlation[1:]).any():
+        return fit_biexponential(correlation.distance_m, correlation.correlation)
+    reason = "no two positions have varying rank vectors: the paper's curve stands in"
+    return replace(PAPER_BIEXPONENTIAL, rmse=float("nan"), degenerate=True, message=reason)
+
+
+@dataclass(frozen=True, slots=True)
+class HonestStudy:
+    """Kriging where no near neighbour gives the answer away. Scores have the shape (altitudes, K).
+
+    Parameters
+    ----------
+    blocked : Score
+        One square block of the area left out at a time.
+    altitude_held_out : Score
+        One altitude left out at a time, predicted in 3-D.
+    vertical_scale : float
+        Anisotropy used for it, fitted to the correlation of the altitudes' maps.
+    trajectory : Score or None
+        Trained on the cells of a flight only.
+    learning_sizes : tuple of int
+        Numbers of random samples.
+    learning_mae : (sizes, altitudes, K)
+        MAE at the other positions.
+    """
+
+    blocked: Score
+    altitude_held_out: Score
+    vertical_scale: float
+    trajectory: Score | None
+    learning_sizes: tuple[int, ...]
+    learning_mae: FloatArray
+
+
+def honest_study(
+    grid: Grid,
+    altitudes_m: Sequence[float],
+    values: FloatArray,
+    fit: BiExponential,
+    *,
+    trajectory_m: ArrayLike | None = None,
+    block_m: float = 300.0,
+    learning_sizes: Sequence[int] = (25, 50, 100, 200, 400, 800, 1600),
+    neighbours: int = 20,
+    seed: int = 0,
+) -> HonestStudy:
+    """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
+
+    What is held out is the values; the correlation curve is the one given, of the whole map.
+
+    Parameters
+    ----------
+    grid, altitudes_m, values
+        Maps (n, altitudes, K), as in :func:`interpolation_study`.
+    fit : BiExponential
+        Of :class:`Study`.
+    trajectory_m : (samples, 2+), optional
+        A flight [m].
+    block_m : float
+        Side of the blocks.
+    learning_sizes : sequence of int
+        Those not below the number of positions are left out.
+    neighbours, seed
+        M; seed of the learning curve.
+    """
+    points = grid.points_m
+    wide = OrdinaryKriging(fit, neighbours, outside="nearest")
+    horizontal = field_correlation(points, values, width_m=grid.spacing_m)
+    across = vertical_correlation(altitudes_m, np.moveaxis(values, 0, -1))
+    in_space = _curve(horizontal)
+    varies = np.isfinite(across.correlation[1:]).any()
+    scale = fit_vertical_scale(in_space, across) if varies else 1.0
+    space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
+    sizes = tuple(size for size in learning_sizes if size < len(grid))
+    return HonestStudy(
+        blocked(wide, points, values, block_m),
+        altitude_held_out(space, points, altitudes_m, values),
+        scale,
+        None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
+        sizes,
+        learning_curve(wide, points, values, sizes, seed=seed),
+    )
+
+
+def summary_of_study(study: Study, honest: HonestStudy | None = None) -> dict[str, Any]:
+    """Numbers of the studies for ``metrics.json`` and ``--json``; NaN becomes null in the export."""
+    content: dict[str, Any] = {
+        "correlation": asdict(study.correlation),
+        "fit": asdict(study.fit),
+        "leave_one_out": {name: asdict(found) for name, found in study.scores.items()},
+        "intervals": asdict(study.intervals),
+        "intervals_paper": asdict(study.intervals_paper),
+    }
+    if honest is not None:
+        content["honest"] = asdict(honest)
+    return content

@@ -1,0 +1,106 @@
+"""The site as files that other programs open: PLY meshes and a Mitsuba scene for Sionna RT."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+
+from ..errors import UsageError
+from ..units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
+from .materials import material
+from .meshes import CROWN, Mesh, site_meshes
+from .site import Site
+
+HALF_SPACE_THICKNESS_M = 1.0
+"""Thickness given to ground in the export: a slab from which no echo of its second face returns."""
+
+CROWN_PERMITTIVITY = 1.1
+
+
+def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = 0.5) -> list[Path]:
+    """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
+
+    Parameters
+    ----------
+    site : Site
+        Any. East is x, north is y, up is z.
+    folder : str or Path
+        Made when missing; files of the same names are replaced.
+    trees : bool
+        Crowns and trunks too. Crowns are thin slabs to Sionna, so their loss counts per face, not per metre; the
+        replay keeps them out of the scene for that reason.
+    gamma_db_per_m : float
+        Attenuation in crowns, turned into a conductivity.
+
+    Returns
+    -------
+    list of Path
+        The files written, the XML file first.
+    """
+    folder = Path(folder)
+    meshes = site_meshes(site, trees=trees)
+    lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
+    lines += [_bsdf(name, gamma_db_per_m) for name in meshes]
+    written = [folder / "scene.xml"]
+    try:
+        (folder / "meshes").mkdir(parents=True, exist_ok=True)
+        for name, mesh in meshes.items():
+            written.append(folder / "meshes" / f"{name}.ply")
+            write_ply(mesh, written[-1])
+            lines.append(
+                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}>'
+                f'<string name="filename" value="meshes/{name}.ply"/>'
+                f'<boolean name="face_normals" value="true"/><ref id={quoteattr(_bsdf_id(name))} name="bsdf"/></shape>'
+            )
+        written[0].write_text("\n".join([*lines, "</scene>", ""]), encoding="utf-8")
+    except OSError as error:
+        raise UsageError(f"cannot be written ({error.strerror})", path=error.filename or folder) from None
+    return written
+
+
+def _comment(site: Site) -> str:
+    frame = site.frame
+    text = f"{site.name}: x east, y north, z up [m] from {frame.latitude_deg:.8f}, {frame.longitude_deg:.8f}" + (
+        "; buildings and forests are illustrative" if site.illustrative else ""
+    )
+    return text.replace("--", "- -")
+
+
+def _bsdf_id(name: str) -> str:
+    return f"mat-{name}" if name == CROWN else f"mat-itu_{name}"
+
+
+def _bsdf(name: str, gamma_db_per_m: float) -> str:
+    if name == CROWN:
+        sigma = _conductivity(gamma_db_per_m)
+        values = {"relative_permittivity": CROWN_PERMITTIVITY, "conductivity": sigma, "thickness": 2.5}
+        return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
+    thickness = material(name).thickness_m
+    inner = f'<string name="type" value="{name}"/>'
+    inner += _floats({"thickness": HALF_SPACE_THICKNESS_M if thickness is None else thickness})
+    return f'<bsdf type="itu-radio-material" id="{_bsdf_id(name)}">{inner}</bsdf>'
+
+
+def _floats(values: Mapping[str, float]) -> str:
+    return "".join(f'<float name="{name}" value="{value:.6g}"/>' for name, value in values.items())
+
+
+def _conductivity(gamma_db_per_m: float) -> float:
+    """Conductivity [S/m] that attenuates by ``gamma``: 2 n a eps0 c for weak loss, whatever the frequency."""
+    neper_per_m = gamma_db_per_m / (20 / np.log(10))
+    return float(2 * np.sqrt(CROWN_PERMITTIVITY) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS)
+
+
+def write_ply(mesh: Mesh, path: Path) -> None:
+    """A binary little-endian PLY, float32 (0.1 mm at 2 km)."""
+    head = (
+        "ply\nformat binary_little_endian 1.0\n"
+        f"element vertex {len(mesh.vertices_m)}\nproperty float x\nproperty float y\nproperty float z\n"
+        f"element face {len(mesh.triangles)}\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    faces = np.empty(len(mesh.triangles), dtype=[("n", "u1"), ("i", "<i4", 3)])
+    faces["n"], faces["i"] = 3, mesh.triangles
+    path.write_bytes(head.encode() + mesh.vertices_m.astype("<f4").tobytes() + faces.tobytes())

@@ -1,0 +1,126 @@
+"""Whole reports as processes: time as a ratio to a peer of the same run, and peak memory.
+
+1. A two-channel flight of 3304 samples, image engine: time over that of importing what it is made of
+   (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
+2. The sample flight: seconds and peak memory.
+3. The second report of a flight over the first, ``sionna`` engine, path cache empty before the first.
+
+    python benchmarks/report.py [--quick] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import os
+import resource
+import statistics
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import yaml
+
+ROOT = Path(__file__).parents[1]
+IMPORTS = "import sionna.rt, matplotlib.pyplot, pandas"
+
+
+def run(command: list[str], **environment: str) -> dict[str, float]:
+    """Seconds and peak memory [MiB] of one process."""
+    started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    path = f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"
+    done = subprocess.run(
+        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path, **environment}
+    )
+    if done.returncode:
+        raise SystemExit(f"{' '.join(command)}\n{done.stderr}")
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
+    return {"wall_s": time.perf_counter() - started, "cpu_s": cpu, "peak_mib": after.ru_maxrss / 1024}
+
+
+def report(flight: Path, out: Path, *options: str) -> list[str]:
+    """The command line of a report."""
+    return [sys.executable, "-m", "aerpaw_cmp", "report", str(flight), "-o", str(out), *options]
+
+
+def two_channels(folder: Path) -> tuple[Path, list[str], str]:
+    """The flight of part 1, its options, and where it comes from."""
+    field = os.environ.get("AERPAW_CMP_FIELD_DATA")
+    if field:
+        return ROOT / "tests" / "field" / "dataset12_40m.yaml", ["--logs-root", field], "dataset12 40 m"
+    content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text())
+    content["flight"]["plan"] |= {"rss_interval_s": 0.1, "offsets_db": {}, "bad_lines": 0}
+    content["logs"] = [log for log in content["logs"] if log.get("node") in (None, "LW1") and "ri" not in log["path"]]
+    flight = folder / "flight.yaml"
+    flight.write_text(yaml.safe_dump(content))
+    run([sys.executable, "-m", "aerpaw_cmp", "simulate", str(flight)])
+    return flight, [], "simulated, one tower, two channels"
+
+
+def main() -> None:
+    """Print the three parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="one run of each, 1e4 samples in part 3")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args()
+    repeats = 1 if arguments.quick else 3
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        flight, options, source = two_channels(folder)
+        imports, reports = [], []
+        run([sys.executable, "-c", IMPORTS])
+        for number in range(repeats):  # in turns: a machine that slows down slows both
+            imports.append(run([sys.executable, "-c", IMPORTS]))
+            reports.append(run(report(flight, folder / f"r{number}", *options)))
+        cold = str(folder / "cache")
+        content = yaml.safe_load(flight.read_text())
+        content["rt"] = {**content.get("rt", {}), "audit_links": 0, "samples": 10_000 if arguments.quick else 1_000_000}
+        traced = folder / "sionna.yaml"
+        if options:
+            traced.write_text(yaml.safe_dump(content))
+        else:
+            traced = flight.with_name("sionna.yaml")
+            traced.write_text(yaml.safe_dump(content))
+        both = [
+            run(report(traced, folder / "s", "--engine", "sionna", *options, "--json"), AERPAW_CMP_CACHE=cold)
+            for _ in range(2)
+        ]
+        stages = json.loads((folder / "s" / "metrics.json").read_text())["stages"]
+        sample = run(report(ROOT / "sample_logs" / "flight.yaml", folder / "sample"))
+    result = {
+        "two_channels": {
+            "flight": source,
+            "imports_s": statistics.median(r["wall_s"] for r in imports),
+            "report_s": statistics.median(r["wall_s"] for r in reports),
+            "ratio": statistics.median(r["wall_s"] / i["wall_s"] for r, i in zip(reports, imports, strict=True)),
+            "peak_mib": max(r["peak_mib"] for r in reports),
+        },
+        "sample": sample,
+        "second_report": {
+            "first_s": both[0]["wall_s"],
+            "second_s": both[1]["wall_s"],
+            "times_faster": both[0]["wall_s"] / both[1]["wall_s"],
+            "second_replay_s": stages.get("replay_s"),
+            "samples": content["rt"]["samples"],
+        },
+    }
+    if arguments.json:
+        print(json.dumps(result, indent=1))
+        return
+    one, two, three = result["two_channels"], result["sample"], result["second_report"]
+    print(
+        f"report of {one['flight']}: {one['report_s']:.1f} s, "
+        f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s"
+    )
+    print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
+    print(
+        f"second report, sionna, {three['samples']} samples: {three['first_s']:.1f} s, then {three['second_s']:.1f} s,"
+        f" {three['times_faster']:.1f} times faster (replay stage of the second: {three['second_replay_s']:.2f} s)"
+    )
+
+
+if __name__ == "__main__":
+    main()

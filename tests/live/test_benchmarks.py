@@ -1,0 +1,44 @@
+"""The benchmarks of the tap run, small; what they measure is theirs to say."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+FOLDER = Path(__file__).resolve().parents[2] / "benchmarks"
+
+
+def run(name, *arguments):
+    command = [sys.executable, FOLDER / name, *arguments, "--json"]
+    done = subprocess.run(command, text=True, capture_output=True, check=False, timeout=120)
+    assert not done.stderr, done.stderr
+    return done.returncode, json.loads(done.stdout)
+
+
+def test_sigkill():
+    code, result = run("tap_sigkill.py", "--kills", "3", "--parallel", "3")
+    assert code == 0
+    assert result["kills"] == 3
+    assert (result["lost"], result["corrupt"], result["out_of_order"]) == (0, 0, 0)
+
+
+def test_replug():
+    code, result = run("tap_replug.py", "--cycles", "2")
+    assert code == 0
+    assert (result["lost"], result["cycles_in_a_gap_record"], result["gap_records"]) == (0, 2, 2)
+
+
+@pytest.mark.parametrize(
+    ("name", "arguments", "key"),
+    [
+        ("tap_soak.py", ("--simulated-s", "20"), "memory_last_third_kib"),
+        ("tap_cpu.py", ("--seconds", "1"), "cpu_percent_of_one_core"),
+    ],
+)
+def test_soak_and_cpu(name, arguments, key):
+    _, result = run(name, *arguments)  # their exit codes depend on the machine
+    assert key in result

@@ -1,0 +1,108 @@
+"""Formats with a fast way must say the same by their slow, strict way: two routes to one result."""
+
+from __future__ import annotations
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.readers import by_name
+from aerpaw_cmp.records import ReadResult
+from aerpaw_parsers import _table, vehicle_out
+from tests.parsers.samples import OPTIONS, SAMPLES
+
+CASES = [(reader, name) for reader in ("vehicle_out", "nemo_csv", "quectel_csv") for name in SAMPLES[reader]]
+
+
+def by_the_slow_way(reader: str, data: bytes) -> ReadResult:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(_table, "numbers", lambda *_, **__: None)
+        return by_name(reader).read(data, OPTIONS)
+
+
+def assert_same(one: ReadResult, other: ReadResult) -> None:
+    assert (one.lines, one.accepted, one.blank, one.rejected) == (
+        other.lines,
+        other.accepted,
+        other.blank,
+        other.rejected,
+    )
+    assert one.warnings == other.warnings
+    assert len(one.streams) == len(other.streams)
+    for a, b in zip(one.streams, other.streams, strict=True):
+        # pandas' parser before version 3 may differ from float() in the last place
+        pd.testing.assert_frame_equal(a.frame, b.frame, rtol=1e-14, atol=0)
+
+
+@pytest.mark.parametrize(("reader", "sample"), CASES)
+def test_samples(reader: str, sample: str) -> None:
+    data = SAMPLES[reader][sample][0]
+    assert_same(by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data))
+
+
+@pytest.mark.parametrize(
+    ("reader", "sample", "old", "new"),
+    [
+        ("vehicle_out", "ten_fields", b"35.7300002", b"35.73(00002"),
+        ("vehicle_out", "ten_fields", b"35.7300002", b'35.73"00002'),
+        ("vehicle_out", "ten_fields", b'-0.05)","(1.0', b'-0.05,"(1.0'),
+        ("vehicle_out", "ten_fields", b"35.7300002", b""),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35.73.0002"),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35 7300002"),
+        ("nemo_csv", "table", b",4.0,,,", b",NA,,,"),
+        ("nemo_csv", "table", b",4.0,,,", b",4.0,--1,,"),
+        ("nemo_csv", "table", b"1000.0", b""),
+        ("nemo_csv", "table", b",4.0,,,", b",4\r.0,,,"),
+        ("quectel_csv", "csi", b"24,4,12,5", b"24,4.,12,NA"),
+    ],
+)
+def test_what_is_wrong_is_rejected_by_both(reader: str, sample: str, old: bytes, new: bytes) -> None:
+    data = SAMPLES[reader][sample][0].replace(old, new, 1)
+    good = by_name(reader).read(SAMPLES[reader][sample][0], OPTIONS)
+    fast, slow = by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data)
+    assert fast.accepted == good.accepted - 1
+    assert_same(fast, slow)
+
+
+def test_the_fast_way_is_taken() -> None:
+    from aerpaw_parsers import _lines, nemo_csv, quectel_csv
+
+    for name, rows in (("ten_fields", 3), ("nine_fields", 2), ("eight_fields", 2)):
+        assert len(vehicle_out._at_once(_lines.split(SAMPLES["vehicle_out"][name][0])).line) == rows
+    assert len(nemo_csv._plain(_lines.split(SAMPLES["nemo_csv"]["table"][0]))[0]) == 3
+    whole = b"".join(
+        line for line in SAMPLES["quectel_csv"]["csi"][0].splitlines(keepends=True) if not line.endswith(b",\r\n")
+    )
+    assert len(quectel_csv._launched(_lines.split(whole))[0]) == 3
+
+
+@given(st.sampled_from(CASES), st.data())
+@settings(max_examples=200, deadline=None)
+def test_damaged_samples(case: tuple[str, str], data: st.DataObject) -> None:
+    """Rejected or read, a damaged line is so by both ways, or by the slow way only where a number is oddly written."""
+    reader, name = case
+    sample = bytearray(SAMPLES[reader][name][0] * 2)
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(sample) - 1))
+        new = data.draw(
+            st.sampled_from([b"", b"7", b",", b"-", b"(", b")", b'"', b"e", b"\n", b"x", b"\0", b" ", b"999"])
+        )
+        sample[at : at + data.draw(st.integers(0, 2))] = new
+    fast, slow = by_name(reader).read(bytes(sample), OPTIONS), by_the_slow_way(reader, bytes(sample))
+    slow_lines = {line for stream in slow.streams for line in stream.frame["line"]}
+    for one in fast.streams:
+        frame = one.frame.set_index("line")
+        both = sorted({line for s in slow.streams if s.name == one.name for line in s.frame["line"]} & set(frame.index))
+        if not both:
+            continue
+        other = next(s for s in slow.streams if s.name == one.name).frame.set_index("line")
+        left, right = frame.loc[both], other.loc[both]
+        assert (left["time"] == right["time"]).all()
+        numbers = left.select_dtypes("number").columns
+        assert np.allclose(left[numbers], right[numbers], rtol=1e-14, atol=0, equal_nan=True)
+    # what only one way takes is a spelling such as '.5' or '3.0': never many lines
+    fast_lines = {line for stream in fast.streams for line in stream.frame["line"]}
+    assert len(fast_lines ^ slow_lines) <= 3
+    assert slow_lines <= fast_lines

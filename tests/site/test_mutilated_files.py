@@ -1,0 +1,119 @@
+"""Whatever is done to a file, the answer is a result or one message: never another exception."""
+
+import contextlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.errors import AerpawCmpError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.site.antennas import read_gain_grid, read_pattern_text
+from aerpaw_cmp.site.dem import read_dem
+from aerpaw_cmp.site.footprints import import_footprints
+from aerpaw_cmp.site.siteyaml import load_site
+
+FRAME = SiteFrame(35.7275, -78.696)
+GEOJSON = b"""{"type": "FeatureCollection", "features": [{"type": "Feature", "id": 7, "properties": {"building": "yes",
+"height": "12 m", "building:levels": "2"}, "geometry": {"type": "Polygon", "coordinates": [[[-78.696, 35.7275],
+[-78.695, 35.7275], [-78.695, 35.728], [-78.696, 35.7275]]]}}, {"type": "Feature", "properties": {"natural": "tree"},
+"geometry": {"type": "Point", "coordinates": [-78.696, 35.7275]}}]}"""
+OVERPASS = b"""{"elements": [{"type": "node", "id": 1, "lat": 35.7275, "lon": -78.696}, {"type": "node", "id": 2, "lat": 35.7276,
+"lon": -78.696}, {"type": "node", "id": 3, "lat": 35.7276, "lon": -78.695}, {"type": "way", "id": 4, "nodes": [1, 2, 3, 1],
+"tags": {"building": "yes"}}, {"type": "relation", "id": 5, "tags": {"type": "multipolygon", "natural": "wood"},
+"members": [{"type": "way", "ref": 4, "role": "outer"}]}]}"""
+OSM = b"""<osm><node id="1" lat="35.7275" lon="-78.696"/><node id="2" lat="35.7276" lon="-78.696"/><node id="3" lat="35.7276"
+lon="-78.695"/><way id="4"><nd ref="1"/><nd ref="2"/><nd ref="3"/><nd ref="1"/><tag k="building" v="yes"/></way><relation
+id="5"><member type="way" ref="4" role="outer"/><tag k="type" v="multipolygon"/><tag k="natural" v="wood"/></relation></osm>"""
+KML = b"""<kml xmlns="http://www.opengis.net/kml/2.2"><Placemark><name>fence</name><ExtendedData><Data name="height"><value>3
+</value></Data></ExtendedData><Polygon><outerBoundaryIs><LinearRing><coordinates>-78.696,35.7275,0 -78.695,35.7275,0
+-78.695,35.728,0</coordinates></LinearRing></outerBoundaryIs></Polygon></Placemark></kml>"""
+SITE = b"""name: test
+origin: {latitude_deg: 35.7275, longitude_deg: -78.696, ground: {height_m: 79, reference: orthometric}}
+towers:
+  T: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna: {height_m: 90, reference: orthometric}}
+buildings:
+- {name: a, height_m: 4, material: wood, polygon_m: [[10, 10], [20, 10], [20, 20]]}
+forests:
+- {name: w, polygon_deg: [[35.728, -78.697], [35.729, -78.697], [35.729, -78.696]], trees_per_hectare: 9}
+trees: {seed: 3, height_m: {mean: 9, deviation: 1, maximum: 12}, points_m: [[50, 60]]}
+"""
+DEM = b"ncols 3\nnrows 3\nxllcorner -150\nyllcorner -150\ncellsize 100\nNODATA_value -9999\n1 2 3\n4 5 6\n7 8 -9999\n"
+PATTERN = (
+    b"2\nFrequency=3300(MHz)\n\nPhi\tTheta\tE Total. dB\tE(Phi) . Amp dB\tE(Theta) . Amp dB\tE(Phi) . Phase\tE(Theta) . Phase\n"
+    + "\n".join(
+        f"{phi:.6f}\t{theta:.6f}\t-3.0103\t-6.0206\t-6.0206\t0.1\t{0.2 * phi:.3f}"
+        for phi in np.arange(4) * np.pi / 4
+        for theta in np.linspace(-np.pi, np.pi, 9)
+    ).encode()
+)
+
+READERS = {
+    "v.json": (GEOJSON, lambda path: import_footprints([path], FRAME)),
+    "o.json": (OVERPASS, lambda path: import_footprints([path], FRAME)),
+    "v.osm": (OSM, lambda path: import_footprints([path], FRAME)),
+    "v.kml": (KML, lambda path: import_footprints([path], FRAME)),
+    "site.yaml": (SITE, load_site),
+    "d.asc": (DEM, lambda path: read_dem(path, FRAME, crs="local")),
+    "p.txt": (PATTERN, read_pattern_text),
+}
+SPOIL = [
+    b"",
+    b"-",
+    b"0",
+    b"9e999",
+    b"nan",
+    b"null",
+    b"[",
+    b"}",
+    b'"',
+    b"<",
+    b"\xff",
+    b"\x00",
+    b"1e30",
+    b"true",
+    b"\n",
+    b"180",
+]
+
+
+@pytest.mark.parametrize("name", READERS)
+def test_the_whole_file_reads(tmp_path: Path, name: str) -> None:
+    content, read = READERS[name]
+    (tmp_path / name).write_bytes(content)
+    assert read(tmp_path / name) is not None
+
+
+@pytest.mark.parametrize("name", READERS)
+@settings(max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(
+    cuts=st.lists(
+        st.tuples(st.floats(0, 1, exclude_max=True), st.integers(0, 12), st.sampled_from(SPOIL)), min_size=1, max_size=3
+    )
+)
+def test_mutilated_files_give_one_message(tmp_path: Path, name: str, cuts: list[tuple[float, int, bytes]]) -> None:
+    content, read = READERS[name]
+    for place, length, spoil in cuts:
+        at = int(place * len(content))
+        content = content[:at] + spoil + content[at + length :]
+    path = tmp_path / name
+    path.write_bytes(content)
+    with contextlib.suppress(AerpawCmpError):
+        read(path)
+
+
+@settings(max_examples=50, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(place=st.floats(0, 1, exclude_max=True), spoil=st.sampled_from(SPOIL), truncate=st.booleans())
+def test_mutilated_gain_grids_give_one_message(tmp_path: Path, place: float, spoil: bytes, truncate: bool) -> None:
+    from scipy.io import savemat
+
+    path = tmp_path / "g.mat"
+    grid = {"theta2": np.linspace(90, -90, 7), "phi2": np.arange(12) * 30.0, "g": np.full((7, 12), -1.0)}
+    savemat(path, grid)
+    content = path.read_bytes()
+    at = int(place * len(content))
+    path.write_bytes(content[:at] if truncate else content[:at] + spoil + content[at + len(spoil) :])
+    with contextlib.suppress(AerpawCmpError):
+        read_gain_grid(path, "g")

@@ -19,11 +19,11 @@ from .records import Kind
 from .replay.arrays import (
     TOWER_PORTS_M,
     Array,
-    Isotropic,
     Link,
     Pattern,
     rotation_from_yaw_pitch_roll,
 )
+from .site.antennas import Isotropic
 from .units import FloatArray, wavelength_m
 from .yamlfile import load_yaml
 
@@ -316,6 +316,31 @@ class RtSettings(Settings):
     cache: bool = True
 
 
+class PortSettings(Settings):
+    """One USRP port of the table of reference powers, and what lies between it and the antenna."""
+
+    node: str
+    channel: str = "ch0"
+    gain_db: float
+    amplifier: bool = False
+    extra_gain_db: float = 0.0
+    """Amplifiers, minus cables, that the table does not contain."""
+
+
+class ReferencePowers(Settings):
+    """A link budget: the offset it predicts is shown beside the fitted one."""
+
+    file: str
+    """CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``."""
+    receivers: dict[str, PortSettings]
+    """By channel of the RSS logs."""
+    transmitter: PortSettings | None = None
+    """Without one, the link's transmit power is taken as true."""
+    transmit_amplitude_dbfs: float = 0.0
+    receiver_gain_removed: bool = True
+    """The sounder logs dB re full scale minus its gain setting."""
+
+
 class RssSettings(Settings):
     """How RSS is compared."""
 
@@ -332,6 +357,7 @@ class RssSettings(Settings):
     """Samples below this height are left out of the comparison, and counted."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
     waypoint_labels: bool = True
+    reference_powers: ReferencePowers | None = None
 
     @field_validator("span_db")
     @classmethod

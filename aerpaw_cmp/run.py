@@ -152,12 +152,13 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
 def _report_data(
     data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
 ) -> Any:
-    from .comparison import inputs_of, track_of, versions, waypoints_of
+    from .comparison import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
 
     settings = data.settings
     warnings = list(data.warnings)
     warnings += [w for result in (*rss, *rank) for w in result.warnings]
+    pairs = pairs_of([r.panel for r in rss])
     return ReportData(
         title=settings.report.title or settings.flight.title or settings.flight.name,
         flight=settings.flight.name,
@@ -169,6 +170,8 @@ def _report_data(
         waypoints=waypoints_of(data),
         rss=tuple(r.panel for r in rss),
         rank=tuple(r.panel for r in rank),
+        pairs=tuple(p.panel for p in pairs),
+        extra_metrics=metrics_beyond_panels([*rss, *rank, *pairs]),
         engine=engine,
         speed=speed,
         synthetic=settings.flight.synthetic,

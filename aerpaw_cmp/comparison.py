@@ -4,32 +4,36 @@ from __future__ import annotations
 
 import math
 import platform
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib.metadata import PackageNotFoundError, version
+from itertools import combinations
 from typing import Any
 
 import numpy as np
 
 from . import __version__
+from .alternatives import expected_offset, foliage_rank_difference, foliage_rss_difference, rss_alternatives
 from .compare import offset as offsets
 from .compare import rank as ranks
-from .compare import rss
+from .compare import rss, statistics
+from .config import RssSettings
 from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
 from .replaying import Clock, Replayed, direct_foliage_m
 from .report import data as report
-from .units import BoolArray, FloatArray
+from .units import BoolArray, FloatArray, IntArray
 
 Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
 class Compared:
-    """A finished panel of the report, and what the reader must be told about it."""
+    """A finished panel of the report, what the reader must be told about it, and numbers for metrics.json alone."""
 
     panel: Any
-    warnings: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+    metrics: Mapping[str, Any] = field(default_factory=dict)
 
 
 def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
@@ -42,89 +46,277 @@ def baseline_levels(data: FlightData, tower: str, replayed: Replayed) -> dict[st
 
 
 def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) -> Compared:
-    """Offset, RMSE, correlation, intervals and baselines of one tower and channel."""
-    settings, clock = data.settings.rss, replayed.clock
-    level = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
-    simulated = replayed.spread(level[:, 0])
-    measured = series.measured_db
-    if settings.window_s > 0:
-        measured = rss.local_mean_db(series.time, measured, settings.window_s)
-        if settings.field == "local_mean":
-            simulated = rss.local_mean_db(series.time, simulated, settings.window_s)
-    geometry = _geometry(data, series.tower, replayed)
-    posed = replayed.valid.copy()
-    if settings.minimum_height_m is not None:
-        with np.errstate(invalid="ignore"):
-            posed &= geometry["altitude_m"] >= settings.minimum_height_m
-    levels = {name: replayed.spread(v) for name, v in baseline_levels(data, series.tower, replayed).items()}
+    """Offset, RMSE, correlation, intervals, baselines and alternatives of one tower and channel."""
+    levels = _Levels.of(data, series, replayed)
+    clock, settings = replayed.clock, data.settings.rss
     result = rss.compare_rss(
         series.time,
-        measured,
-        simulated,
-        baselines=levels,
-        posed=posed,
+        levels.measured_db,
+        levels.simulated_db,
+        baselines=levels.baselines,
+        posed=levels.posed,
         step_db=settings.step_db,
         span_db=settings.span_db,
         replicates=max(settings.bootstrap, 1),
         lag_s=float("nan") if clock is None else clock.shift_s,
-        fitted_on_scored=("lag",) if clock is not None and clock.applied == "estimated and applied" else (),
+        fitted_on_scored=("lag_s",) if clock is not None and clock.applied == "estimated and applied" else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    position = geometry.pop("position_m")
+    alternatives = {name: replayed.spread(level) for name, level in rss_alternatives(data, replayed).items()}
+    quantities = {**levels.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
+    tables = rss.residual_tables(result.residual_db, quantities)
     panel = report.RssPanel(
         tower=series.tower,
         channel=series.channel,
         unit=series.unit,
         time=series.time,
-        measured_db=np.where(posed, measured, np.nan),
-        simulated_dbm=np.where(posed, simulated, np.nan),
-        measured_out_of_coverage=posed & ~np.isfinite(measured),
-        simulated_out_of_coverage=posed & ~np.isfinite(simulated),
-        offset_db=result.offset_db,
-        rmse_db=result.rmse_db,
-        correlation=result.correlation,
-        n=result.n,
-        n_out_of_coverage=result.n_out_of_coverage,
-        at_search_edge=result.at_edge,
-        rmse_ci95_db=result.rmse_ci95_db,
-        offset_ci95_db=result.intervals.offset_db,
-        correlation_ci95=result.intervals.correlation,
-        n_effective=result.intervals.memory.n_effective,
-        lag_s=result.lag_s,
-        lag_verdict="" if clock is None else clock.verdict,
-        fitted=("offset", *result.fitted_on_scored),
+        measured_db=levels.measured_db,
+        simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
+        measured_out_of_coverage=levels.posed & ~np.isfinite(levels.measured_db),
+        simulated_out_of_coverage=levels.posed & ~np.isfinite(levels.simulated_db),
+        **_headline_numbers(result, clock),
         baselines=tuple(
-            report.Baseline(
-                name=name,
-                level_dbm=levels[name],
-                offset_db=result.baselines[name].offset_db,
-                rmse_db=result.baselines[name].rmse_db,
-            )
-            for name in levels
+            report.Baseline(name=name, level_dbm=level, offset_db=fit.offset_db, rmse_db=fit.rmse_db)
+            for (name, level), fit in zip(levels.baselines.items(), result.baselines.values(), strict=True)
         ),
         offset_curve=report.OffsetCurve(
             **dict(
                 zip(
                     ("offset_db", "rmse_db"),
                     offsets.offset_curve(
-                        np.where(posed, measured, np.nan), simulated, step_db=settings.step_db, span_db=settings.span_db
+                        levels.measured_db, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db
                     ),
                     strict=True,
                 )
             )
         ),
-        east_m=position[:, 0],
-        north_m=position[:, 1],
-        up_m=position[:, 2],
-        geometry=geometry,
+        east_m=levels.position_m[:, 0],
+        north_m=levels.position_m[:, 1],
+        up_m=levels.position_m[:, 2],
+        geometry=levels.geometry,
         line_of_sight=direct == 1.0,
-        worst=_worst(series, result, position, geometry, direct),
-        extra={**{k: v for k, v in result.as_dict().items() if k in EXTRA_RSS}, "clock": _clock_entry(clock)},
+        worst=_worst(series.time, result.residual_db, levels, direct),
+        variants=_variants(settings, levels, alternatives),
+        extra={
+            **{k: v for k, v in result.as_dict().items() if k in EXTRA_RSS},
+            "n_too_low": int((replayed.valid & ~levels.posed).sum()),
+            "n_no_pose": int((~replayed.valid).sum()),
+            "clock": _clock_entry(clock),
+            **_further_numbers(data, series, replayed, levels, result.offset_db),
+            **({"foliage": found} if (found := foliage_rss_difference(alternatives)) else {}),
+            "explained_by": {name: table.explained for name, table in tables.items()},
+        },
     )
-    return Compared(panel, _rss_warnings(series, result, clock))
+    only_metrics = {"residual_by": {name: table.as_dict() for name, table in tables.items()}}
+    return Compared(
+        panel, _rss_warnings(series, result, clock), {"rss": {series.tower: {series.channel: only_metrics}}}
+    )
 
 
-EXTRA_RSS = ("identifiable_db", "trimmed", "n_no_pose", "n_measured_out", "n_simulated_out", "block_length")
+@dataclass(frozen=True, slots=True)
+class _Levels:
+    """One series at its samples (n,): measured, simulated and baseline levels [dB], and the geometry of the link.
+
+    ``posed`` are the samples with a known pose above the lowest height; ``measured_db`` is NaN elsewhere.
+    """
+
+    measured_db: FloatArray
+    simulated_db: FloatArray
+    baselines: Mapping[str, FloatArray]
+    posed: BoolArray
+    position_m: FloatArray
+    geometry: dict[str, FloatArray]
+
+    @classmethod
+    def of(cls, data: FlightData, series: RssSeries, replayed: Replayed) -> _Levels:
+        settings = data.settings.rss
+        level = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
+        simulated, measured = replayed.spread(level[:, 0]), series.measured_db
+        if settings.window_s > 0:
+            measured = rss.local_mean_db(series.time, measured, settings.window_s)
+            if settings.field == "local_mean":
+                simulated = rss.local_mean_db(series.time, simulated, settings.window_s)
+        geometry = _geometry(data, series.tower, replayed)
+        posed = replayed.valid.copy()
+        if settings.minimum_height_m is not None:
+            with np.errstate(invalid="ignore"):
+                posed &= geometry["altitude_m"] >= settings.minimum_height_m
+        baselines = {name: replayed.spread(v) for name, v in baseline_levels(data, series.tower, replayed).items()}
+        position = geometry.pop("position_m")
+        return cls(np.where(posed, measured, np.nan), simulated, baselines, posed, position, geometry)
+
+
+def _headline_numbers(result: rss.RssComparison, clock: Clock | None) -> dict[str, Any]:
+    """What every panel states."""
+    return {
+        "offset_db": result.offset_db,
+        "rmse_db": result.rmse_db,
+        "correlation": result.correlation,
+        "n": result.n,
+        "n_out_of_coverage": result.n_out_of_coverage,
+        "at_search_edge": result.at_edge,
+        "rmse_ci95_db": result.rmse_ci95_db,
+        "offset_ci95_db": result.intervals.offset_db,
+        "correlation_ci95": result.intervals.correlation,
+        "n_effective": result.intervals.memory.n_effective,
+        "lag_s": result.lag_s,
+        "lag_verdict": "" if clock is None else clock.verdict,
+        "fitted": result.fitted_on_scored,
+    }
+
+
+def _variants(settings: RssSettings, levels: _Levels, alternatives: Mapping[str, FloatArray]) -> tuple[Any, ...]:
+    """Each alternative over the samples it has, with an offset of its own."""
+    out = []
+    for name, level in alternatives.items():
+        both = np.isfinite(levels.measured_db) & np.isfinite(level)
+        measured, simulated = levels.measured_db[both], level[both]
+        fit = offsets.grid_offset(measured, simulated, step_db=settings.step_db, span_db=settings.span_db)
+        bounds = statistics.error_intervals(measured, simulated, replicates=max(settings.bootstrap, 1))
+        out.append(report.Variant(name=name, offset_db=fit.offset_db, rmse_db=fit.rmse_db, rmse_ci95_db=bounds.rmse_db))
+    return tuple(out)
+
+
+FOOTING_WINDOWS_S = (0.0, 1.0, 4.0)
+"""Both sides are averaged over these windows to see how much of the error is fading."""
+
+PASSES_WITHIN_M = 3.0
+"""Two passes of one place, first and second half of a flight, come this near."""
+
+
+def _further_numbers(
+    data: FlightData, series: RssSeries, replayed: Replayed, levels: _Levels, offset_db: float
+) -> dict[str, Any]:
+    """Same footing, offset with censored samples, expected offset, repeatability."""
+    settings = data.settings.rss
+    found: dict[str, Any] = {}
+    simulations = {
+        "coherent": replayed.spread(replayed.replay.rss_dbm[:, 0]),
+        "power_sum": replayed.spread(replayed.replay.rss_power_dbm[:, 0]),
+    }
+    footing = rss.same_footing(
+        series.time, levels.measured_db, simulations, windows_s=FOOTING_WINDOWS_S, step_db=settings.step_db,
+        span_db=settings.span_db,
+    )  # fmt: skip
+    found["same_footing"] = {
+        name: {f"{window:g} s": {"offset_db": f.offset_db, "rmse_db": f.rmse_db} for window, f in fits.items()}
+        for name, fits in footing.items()
+    }
+    measured, simulated = levels.measured_db[levels.posed], levels.simulated_db[levels.posed]
+    if len(measured) and not (np.isfinite(measured) & np.isfinite(simulated)).all():
+        found["censored"] = _censored(settings, measured, simulated)
+    expected = expected_offset(data, series)
+    if expected:
+        found["expected_offset"] = {**expected, "fitted_minus_expected_db": offset_db - expected["expected_db"]}
+    found["repeatability"] = _repeatability(series.time, levels)
+    return found
+
+
+def _censored(settings: RssSettings, measured: FloatArray, simulated: FloatArray) -> dict[str, Any]:
+    """Offset when samples without a signal, or without a path, count as "below the weakest level seen"."""
+    floors = [float(np.min(side, where=np.isfinite(side), initial=np.inf)) for side in (measured, simulated)]
+    if not np.isfinite(floors).all():
+        return {"n": 0}
+    fit = offsets.censored_offset(
+        measured,
+        simulated,
+        # the weakest level itself was heard: it is no "below"
+        measured_floor_db=floors[0] - 1e-9,
+        simulated_floor_db=floors[1] - 1e-9,
+        step_db=settings.step_db,
+        span_db=settings.span_db,
+    )
+    return {
+        "offset_db": fit.offset_db,
+        "sigma_db": fit.sigma_db,
+        "n": fit.n,
+        "n_measured_below": fit.n_measured_below,
+        "n_simulated_below": fit.n_simulated_below,
+        "at_search_edge": fit.at_edge,
+    }
+
+
+def _repeatability(time: Any, levels: _Levels) -> dict[str, Any]:
+    """How well the measurement repeats where the second half of the flight passes places of the first."""
+    elapsed = rss.seconds(time)
+    with np.errstate(invalid="ignore"):
+        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
+    heading = levels.geometry.get("heading_deg")
+    found = {}
+    for name, by_heading in (("same_heading", True), ("any_heading", False)):
+        if by_heading and heading is None:
+            continue
+        turned = heading if by_heading else None
+        fit = statistics.repeatability(
+            levels.position_m[~late],
+            levels.measured_db[~late],
+            levels.position_m[late],
+            levels.measured_db[late],
+            radius_m=PASSES_WITHIN_M,
+            heading_deg=None if turned is None else turned[~late],
+            other_heading_deg=None if turned is None else turned[late],
+        )
+        found[name] = {"rmse_db": fit.rmse_db, "rmse_ci95_db": list(fit.interval_db), "n": fit.n}
+    return found
+
+
+def pairs_of(panels: Sequence[Any]) -> list[Compared]:
+    """Every two channels of a tower against each other, where they have instants in common."""
+    out = []
+    for one, two in combinations(panels, 2):
+        if one.tower != two.tower:
+            continue
+        here, there = _same_instants(one.time, two.time)
+        if not len(here):
+            continue
+        first, second = one.calibrated_db[here], two.calibrated_db[there]
+        position = np.stack([one.east_m, one.north_m, one.up_m], axis=-1)[here]
+        context = {"height_m": position[:, 2], "elevation_deg": one.geometry["elevation_deg"][here]}
+        if "heading_deg" in one.geometry:
+            context["heading_deg"] = one.geometry["heading_deg"][here]
+        result = rss.channel_difference(one.time[here], first, second, position_m=position, context=context)
+        panel = report.ChannelPair(
+            tower=one.tower,
+            first=one.channel,
+            second=two.channel,
+            time=one.time[here],
+            difference_db=first - second,
+            simulated_difference_db=one.simulated_dbm[here] - two.simulated_dbm[there],
+            limit_db=rss.PART_DB,
+            apart=_report_spans(one.time[here], result.spans),
+        )
+        numbers = {one.tower: {f"{one.channel} - {two.channel}": result.as_dict()}}
+        out.append(Compared(panel, metrics={"pairs": numbers}))
+    return out
+
+
+def _same_instants(one: Any, two: Any) -> tuple[IntArray, IntArray]:
+    """Samples of two series that were taken within half a sampling interval of each other."""
+    if len(one) == len(two) and (one == two).all():
+        return np.arange(len(one)), np.arange(len(two))
+    if len(one) < 2 or not len(two):
+        return np.arange(0), np.arange(0)
+    order = np.argsort(two, kind="stable")
+    ahead = np.clip(np.searchsorted(two[order], one), 0, len(two) - 1)
+    before = np.maximum(ahead - 1, 0)
+    nearer = np.abs(two[order[before]] - one) < np.abs(two[order[ahead]] - one)
+    nearest = order[np.where(nearer, before, ahead)]
+    limit = 0.5 * np.median(np.abs(np.diff(one)))
+    here = np.flatnonzero(np.abs(two[nearest] - one) <= limit)
+    return here, nearest[here]
+
+
+def metrics_beyond_panels(compared: Sequence[Compared]) -> dict[str, Any]:
+    """Numbers for metrics.json alone, of all comparisons."""
+    from .report.export import merge
+
+    found: dict[str, Any] = {}
+    for one in compared:
+        merge(found, one.metrics)
+    return found
+
+
+EXTRA_RSS = ("identifiable_db", "trimmed", "n_measured_out", "n_simulated_out", "block_length")
 """Numbers of the comparison that metrics.json holds besides those of the panel."""
 
 
@@ -151,6 +343,11 @@ def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, Flo
         "azimuth_deg": np.degrees(np.arctan2(in_frame[:, 1], in_frame[:, 0])),
         "altitude_m": position[:, 2],
     }
+    seen = rss.link_geometry(
+        place.position_m, replayed.poses.position_m, replayed.poses.rotation, uav_mount=replayed.link.uav_array.mount
+    )
+    for name in ("uav_azimuth_deg", "uav_elevation_deg"):
+        out[name] = replayed.spread(seen[name])
     if replayed.track is not None:
         out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)
     if len(data.site.trees) and data.settings.rt.foliage != "none":
@@ -158,24 +355,23 @@ def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, Flo
     return out
 
 
-def _worst(
-    series: RssSeries,
-    result: rss.RssComparison,
-    position: FloatArray,
-    geometry: dict[str, FloatArray],
-    direct: FloatArray,
-) -> tuple[Any, ...]:
+def _worst(time: Any, residual_db: FloatArray, levels: _Levels, direct: FloatArray) -> tuple[Any, ...]:
     """The spans of largest error, with place and likely cause."""
     context: dict[str, Any] = {
         "los": direct,
-        "elevation_deg": geometry["elevation_deg"],
-        "height_m": geometry["altitude_m"],
+        "elevation_deg": levels.geometry["elevation_deg"],
+        "height_m": levels.geometry["altitude_m"],
     }
     for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
-        if ours in geometry:
-            context[theirs] = geometry[ours]
-    spans = rss.error_spans(series.time, result.residual_db, position_m=position, context=context, largest=6)
-    start = series.time.min() if len(series.time) else np.datetime64(0, "ns")
+        if ours in levels.geometry:
+            context[theirs] = levels.geometry[ours]
+    spans = rss.error_spans(time, residual_db, position_m=levels.position_m, context=context, largest=6)
+    return _report_spans(time, spans)
+
+
+def _report_spans(time: Any, spans: Sequence[rss.ErrorSpan]) -> tuple[Any, ...]:
+    """Spans with instants instead of seconds since the first sample."""
+    start = time.min() if len(time) else np.datetime64(0, "ns")
     return tuple(
         report.ErrorSpan(
             start=start + np.timedelta64(round(span.start_s * 1e9), "ns"),
@@ -220,6 +416,10 @@ def _rss_warnings(series: RssSeries, result: rss.RssComparison, clock: Clock | N
     return tuple(out)
 
 
+PANEL_RANK = ("measured", "simulated", "best_k", "best_k_ci95")
+"""Numbers of the rank comparison that the panel holds already."""
+
+
 def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed) -> Compared:
     """Measured against simulated rank for each K."""
     settings = data.settings.rank
@@ -241,6 +441,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
         replicates=max(settings.bootstrap, 1),
     )
+    foliage = foliage_rank_difference(data, replayed, np.flatnonzero(keep[replayed.valid]))
     sigma = ranks.singular_values(h)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio_db = 20.0 * np.log10(sigma[:, 1:] / sigma[:, :1])
@@ -262,7 +463,8 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
         stale=~result.staleness.fresh,
         extra={
-            k: v for k, v in result.as_dict().items() if k not in ("measured", "simulated", "best_k", "best_k_ci95")
+            **{k: v for k, v in result.as_dict().items() if k not in PANEL_RANK},
+            **({"foliage": foliage} if foliage else {}),
         },
     )
     return Compared(panel, _rank_warnings(series, result, len(series.rank) - len(rows)))

@@ -19,11 +19,11 @@ from .records import Kind
 from .replay.arrays import (
     TOWER_PORTS_M,
     Array,
-    Isotropic,
     Link,
     Pattern,
     rotation_from_yaw_pitch_roll,
 )
+from .site.antennas import Isotropic
 from .units import FloatArray, wavelength_m
 from .yamlfile import load_yaml
 
@@ -43,6 +43,17 @@ class AntennaSettings(Settings):
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
+    polarised: bool = True
+    """Use both field components of a text pattern; false: its total gain on the element's slant."""
+    installed_db: list[float] = []
+    """Gain that mast or airframe adds: cosine and sine of 1, 2, ... times the azimuth [dB], fitted on other flights."""
+
+    @field_validator("installed_db")
+    @classmethod
+    def _pairs(cls, value: list[float]) -> list[float]:
+        if len(value) % 2:
+            raise ValueError("installed_db must hold pairs: cosine and sine of 1, 2, ... times the azimuth")
+        return value
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
@@ -115,6 +126,13 @@ class ArraySettings(Settings):
 
 def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
     """The element pattern of the settings; files resolve against ``folder``."""
+    from .site.installed import InstalledPattern
+
+    alone = _pattern_alone(settings, folder)
+    return InstalledPattern(alone, tuple(settings.installed_db)) if settings.installed_db else alone
+
+
+def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
     from .site import antennas
 
     if settings.model == "dipole":
@@ -122,7 +140,7 @@ def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        return antennas.read_pattern_text(folder / str(settings.file))
+        return antennas.read_pattern_text(folder / str(settings.file), polarised=settings.polarised)
     if settings.model == "gain_grid":
         if settings.variable is None:
             raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
@@ -280,7 +298,7 @@ class RtSettings(Settings):
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
     samples: Annotated[int, Field(ge=1, le=100_000_000)] = 1_000_000
-    batch: Annotated[int, Field(ge=1, le=1000)] = 50
+    batch: Annotated[int, Field(ge=1, le=100)] = 50
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
@@ -296,6 +314,31 @@ class RtSettings(Settings):
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
+
+
+class PortSettings(Settings):
+    """One USRP port of the table of reference powers, and what lies between it and the antenna."""
+
+    node: str
+    channel: str = "ch0"
+    gain_db: float
+    amplifier: bool = False
+    extra_gain_db: float = 0.0
+    """Amplifiers, minus cables, that the table does not contain."""
+
+
+class ReferencePowers(Settings):
+    """A link budget: the offset it predicts is shown beside the fitted one."""
+
+    file: str
+    """CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``."""
+    receivers: dict[str, PortSettings]
+    """By channel of the RSS logs."""
+    transmitter: PortSettings | None = None
+    """Without one, the link's transmit power is taken as true."""
+    transmit_amplitude_dbfs: float = 0.0
+    receiver_gain_removed: bool = True
+    """The sounder logs dB re full scale minus its gain setting."""
 
 
 class RssSettings(Settings):
@@ -314,6 +357,7 @@ class RssSettings(Settings):
     """Samples below this height are left out of the comparison, and counted."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
     waypoint_labels: bool = True
+    reference_powers: ReferencePowers | None = None
 
     @field_validator("span_db")
     @classmethod

@@ -217,6 +217,12 @@ def _text(stream: Stream, key: str) -> str | None:
 
 
 def _check_overlap(data: FlightData) -> None:
+    if not data.rss and not data.rank:
+        raise UsageError(
+            "none of the logs holds RSS or rank",
+            expected="at least one radio log under 'logs'",
+            cause="'skip', or a log left out",
+        )
     needs_track = [("RSS", s.tower, s.time) for s in data.rss] + [
         ("rank", s.tower, s.time) for s in data.rank if s.position_m is None
     ]

@@ -187,8 +187,8 @@ def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
         position, valid = rank_positions(series, data.track)
         track = None if series.position_m is not None else _track_poses(data, series.time)
         rotation = np.broadcast_to(np.eye(3), (len(position), 3, 3))
-        if track is not None and data.settings.rt.attitude != "ignored":
-            rotation = _attitude(data, track)
+        if track is not None:
+            rotation = attitude_rotation(track, data.settings.rt.attitude)
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         out.append(Replayed(link, poses, valid, _replay(data, link, poses), track))
@@ -200,18 +200,18 @@ def _track_poses(data: FlightData, time: Any) -> TrackPoses:
     return data.track.pose_at(time)
 
 
-def _attitude(data: FlightData, track: TrackPoses) -> FloatArray:
-    """Body rotations (n, 3, 3) as ``rt.attitude`` wants them."""
-    if data.settings.rt.attitude == "ignored":
+def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
+    """Body rotations (n, 3, 3) as a value of ``rt.attitude`` wants them."""
+    if mode == "ignored":
         return np.broadcast_to(np.eye(3), (len(track), 3, 3))
-    if data.settings.rt.attitude == "logged":
+    if mode == "logged":
         return track.rotation
     heading = np.where(track.valid, track.heading_deg, 0.0)
     return rotation_from_aircraft(np.zeros_like(heading), np.zeros_like(heading), heading)
 
 
 def _poses(data: FlightData, track: TrackPoses) -> Poses:
-    rotation = np.ascontiguousarray(_attitude(data, track)[track.valid])
+    rotation = np.ascontiguousarray(attitude_rotation(track, data.settings.rt.attitude)[track.valid])
     return Poses(track.position_m[track.valid], rotation)
 
 
@@ -231,18 +231,22 @@ def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
     )
 
 
-def foliage_loss(data: FlightData, carrier_hz: float) -> Loss | None:
-    """The foliage loss per path that ``rt.foliage`` asks for; None without."""
+def foliage_loss(
+    data: FlightData, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
+) -> Loss | None:
+    """The foliage loss per path that ``rt.foliage`` and ``rt.leaves`` (or the arguments) ask for; None without."""
     rt = data.settings.rt
-    if rt.foliage == "none" or len(data.site.trees) == 0:
+    foliage, leaves = foliage or rt.foliage, leaves or rt.leaves
+    if foliage == "none" or len(data.site.trees) == 0:
         return None
-    name = rt.foliage_model if rt.foliage == "attenuating" else rt.foliage
+    name = rt.foliage_model if foliage == "attenuating" else foliage
+    own = leaves == rt.leaves  # numbers of the flight file belong to its own season
     model = foliage_model(
         name,
         carrier_hz,
-        in_leaf=rt.leaves == "in",
-        gamma_db_per_m=rt.gamma_db_per_m,
-        maximum_db=rt.maximum_loss_db,
+        in_leaf=leaves == "in",
+        gamma_db_per_m=rt.gamma_db_per_m if own else None,
+        maximum_db=rt.maximum_loss_db if own else None,
     )
     index = CrownIndex(data.site.trees)
 

@@ -117,11 +117,17 @@ def run_report(
         ]
     with stages("audit"):
         engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    speed: tuple[Any, ...] = ()
+    if settings.report.speed_table and settings.rt.audit_links:
+        with stages("speed"):
+            from .speed import speed_rows
+
+            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
     with stages("report"):
         from .report.export import metrics as metrics_of
         from .report.export import write_report
 
-        record = _report_data(data, rss, rank, engine_record, stages)
+        record = _report_data(data, rss, rank, engine_record, speed, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -143,13 +149,16 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
     return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
 
 
-def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any, stages: Stages) -> Any:
-    from .comparison import inputs_of, track_of, versions, waypoints_of
+def _report_data(
+    data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
+) -> Any:
+    from .comparison import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
 
     settings = data.settings
     warnings = list(data.warnings)
     warnings += [w for result in (*rss, *rank) for w in result.warnings]
+    pairs = pairs_of([r.panel for r in rss])
     return ReportData(
         title=settings.report.title or settings.flight.title or settings.flight.name,
         flight=settings.flight.name,
@@ -161,7 +170,10 @@ def _report_data(data: FlightData, rss: list[Any], rank: list[Any], engine: Any,
         waypoints=waypoints_of(data),
         rss=tuple(r.panel for r in rss),
         rank=tuple(r.panel for r in rank),
+        pairs=tuple(p.panel for p in pairs),
+        extra_metrics=metrics_beyond_panels([*rss, *rank, *pairs]),
         engine=engine,
+        speed=speed,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*settings.flight.notes, *data.site.notes),

@@ -112,7 +112,8 @@ def main() -> None:
         return
     one, two, three = result["two_channels"], result["sample"], result["second_report"]
     print(
-        f"report of {one['flight']}: {one['report_s']:.1f} s, {one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s"
+        f"report of {one['flight']}: {one['report_s']:.1f} s, "
+        f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s"
     )
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
     print(

@@ -87,6 +87,8 @@ def test_bad_logs(run: Run, name: str, files: dict[str, bytes | str | None], cod
         (("reader: sounder_log", "reader: sounder_lug"), "sounder_log"),
         (("channel: USRP1", "chanel: USRP1"), "'channel'"),
         (("audit_links: 0", "audit_links: many"), "audit_links"),
+        (("  - {path: power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}\n", ""), "RSS or rank"),
+        (("  - {path: vehicleOut.txt, reader: vehicle_out}\n", ""), "no telemetry"),
         (("rt: {audit_links: 0}", "rt: {audit_links: 0, max_depth: 9}"), "max_depth"),
     ],
 )

@@ -244,7 +244,7 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     Parameters
     ----------
     time_s : array_like, (n,)
-        Increasing instants [s] (or datetime64).
+        Instants [s] (or datetime64) in any order.
     level_db : array_like, (n,)
         Levels [dB]; NaN does not take part and stays NaN.
     window_s : float
@@ -260,12 +260,14 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     result = np.full(len(level), np.nan)
     if not known.any():
         return result
-    t, x = time[known], level[known]
+    rows = np.flatnonzero(known)
+    rows = rows[np.argsort(time[rows], kind="stable")]
+    t, x = time[rows], level[rows]
     top = x.max()
     power = power_from_db(x - top)
     first = np.searchsorted(t, t - 0.5 * window_s, side="left")
     last = np.searchsorted(t, t + 0.5 * window_s, side="right")
-    result[known] = db_from_power(_window_sums(power, first, last) / (last - first)) + top
+    result[rows] = db_from_power(_window_sums(power, first, last) / (last - first)) + top
     return result
 
 

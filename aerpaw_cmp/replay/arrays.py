@@ -13,6 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
+from ..site.antennas import Isotropic as Isotropic
 from ..units import ComplexArray, FloatArray
 
 
@@ -31,18 +32,6 @@ class Pattern(Protocol):
     def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
         """Complex field components (theta, phi)."""
         ...
-
-
-@dataclass(frozen=True, slots=True)
-class Isotropic:
-    """Unit gain in all directions, polarised along theta (vertical)."""
-
-    name: str = "iso"
-
-    def field(self, theta_rad: FloatArray, phi_rad: FloatArray) -> tuple[ComplexArray, ComplexArray]:
-        """(1, 0) everywhere."""
-        shape = np.broadcast_shapes(np.shape(theta_rad), np.shape(phi_rad))
-        return np.ones(shape, dtype=np.complex128), np.zeros(shape, dtype=np.complex128)
 
 
 @dataclass(frozen=True, slots=True)

@@ -15,6 +15,7 @@ Guards against what Sionna RT 2.2.0 does silently:
 
 from __future__ import annotations
 
+import gc
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -56,17 +57,23 @@ def load_variant(prefer: str | None = None) -> str:
     CheckError
         If no LLVM serves.
     """
+    kinds = (prefer,) if prefer else ("cuda", "llvm")
+    without_llvm: CheckError | None = None
+    if "llvm" in kinds:
+        try:
+            prepare_llvm()  # before Dr.Jit looks for one by itself
+        except CheckError as error:
+            without_llvm = error  # a GPU may do without
     import mitsuba as mi
 
     current = mi.variant()
-    kinds = (prefer,) if prefer else ("cuda", "llvm")
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)
     import drjit as dr
 
     for kind in kinds:
-        if kind == "llvm":
-            prepare_llvm()  # before Dr.Jit looks for one by itself
+        if kind == "llvm" and without_llvm:
+            raise without_llvm
         if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
             mi.set_variant(f"{kind}_ad_mono_polarized")
             return str(mi.variant())
@@ -225,6 +232,23 @@ class _Finder:
 
         self.built.scene.sources, self.built.scene.targets = sources, targets
 
+    def __enter__(self) -> _Finder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Free the scene.
+
+        Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may then
+        define a function twice and abort the process. Scene and finder refer to each other: collect them now.
+        """
+        scene = self.built.scene
+        del scene.sources, scene.targets
+        for name in (*scene.transmitters, *scene.receivers, *scene.objects):
+            scene.remove(name)
+        self.built, self.solver = None, None  # type: ignore[assignment]
+        del scene
+        gc.collect()
+
     def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
         """Sionna's paths of one batch, padded."""
         self.targets = targets.padded(self.batch).arguments(self.synthetic)
@@ -307,15 +331,16 @@ def find_paths(
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
         built = _build(faces, chosen, reach, carrier_hz)
-        finder = _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch)
-        for start in range(0, len(poses), batch):
-            some = poses[start : start + batch]
-            raw = finder.solve(targets_m[some], max_depth, samples)
-            _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-            pose, tower, sequence = _sequences(raw, finder.built.face_of, some, towers, max_depth)
-            pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m))
-            if progress:
-                progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
+        with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch) as finder:
+            for start in range(0, len(poses), batch):
+                some = poses[start : start + batch]
+                raw = finder.solve(targets_m[some], max_depth, samples)
+                _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
+                pose, tower, sequence = _sequences(raw, built.face_of, some, towers, max_depth)
+                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m))
+                if progress:
+                    progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
+        del built
     found = merge(pieces, max_depth, faces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
 
@@ -359,15 +384,16 @@ def own_channels(
         mounts = np.stack([arrays[t].mount for t in towers])
         sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
         built = _build(faces, chosen, reach, link.carrier_hz)
-        finder = _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit)
-        for start in range(0, len(poses), batch):
-            rows = slice(start, start + batch)
-            targets = _Ends(
-                poses.position_m[rows], poses.rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m
-            )
-            a, _ = finder.trace(targets, max_depth, samples).cir(normalize_delays=False, out_type="numpy")
-            mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
-            h[rows, towers] = np.moveaxis(mixed, 2, 1)
+        with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
+            for start in range(0, len(poses), batch):
+                rows = slice(start, start + batch)
+                targets = _Ends(
+                    poses.position_m[rows], poses.rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m
+                )
+                a, _ = finder.trace(targets, max_depth, samples).cir(normalize_delays=False, out_type="numpy")
+                mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
+                h[rows, towers] = np.moveaxis(mixed, 2, 1)
+        del built
     return np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
 
 

@@ -28,6 +28,8 @@ GEOMETRY = {
     "azimuth_deg": "Azimuth of the UAV in the frame of the tower antenna [deg]",
     "heading_deg": "UAV heading [deg clockwise from north]",
     "altitude_m": "Height of the UAV above ground [m]",
+    "uav_azimuth_deg": "Azimuth of the tower,\nUAV antenna frame [deg]",
+    "uav_elevation_deg": "Elevation of the tower,\nUAV antenna frame [deg]",
     "foliage_depth_m": "Path length inside tree crowns [m]",
 }
 """Quantities that residuals are drawn against, and their axis labels."""

@@ -783,7 +783,7 @@ def rank_histograms(panel: RankPanel) -> Figure:
     ax.set_xlabel("Channel rank")
     ax.set_ylabel("Share of the samples in coverage [%]")
     ax.grid(axis="x", visible=False)
-    ax.legend(loc="upper right")
+    legend_below(ax)
     return fig
 
 

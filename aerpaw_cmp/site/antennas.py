@@ -210,7 +210,9 @@ class _Rows:
     frequency_hz: float | None = None
 
 
-def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azimuth | None = None) -> MeasuredPattern:
+def read_pattern_text(
+    path: str | Path, *, name: str | None = None, azimuth: Azimuth | None = None, polarised: bool = True
+) -> MeasuredPattern:
     """An AERPAW antenna text file: complex E_phi and E_theta over phi x theta.
 
     Parameters
@@ -225,6 +227,8 @@ def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azi
         from all sides: that shows whether E_phi points along increasing phi. Where it points against it, as in
         AERPAW's files, phi is the angle of a turntable and azimuth is -phi (``rad_pat.mat`` lists the same
         measurement so). Poles that radiate too little to tell are taken for AERPAW's.
+    polarised : bool
+        False keeps the total gain only, all of it in E_theta, as the gain grids have it.
 
     Returns
     -------
@@ -248,7 +252,11 @@ def read_pattern_text(path: str | Path, *, name: str | None = None, azimuth: Azi
         e_theta, e_phi = _mirrored(e_theta), _mirrored(e_phi)
     if clockwise == along:
         e_phi = -e_phi
-    pattern = MeasuredPattern(name or path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
+    if polarised:
+        pattern = MeasuredPattern(name or path.stem, e_theta.T, e_phi.T, rows.frequency_hz)
+    else:
+        total = np.hypot(np.abs(e_theta), np.abs(e_phi)).astype(np.complex128)
+        pattern = MeasuredPattern(name or path.stem, total.T, None, rows.frequency_hz)
     _check_power(pattern, path)
     return pattern
 

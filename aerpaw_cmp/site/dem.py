@@ -6,6 +6,7 @@ stands on it and cuts lines of sight.
 
 from __future__ import annotations
 
+import warnings
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -224,9 +225,11 @@ def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
             "a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)", path=path
         ) from None
     try:
-        with rasterio.open(path) as image:
-            band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
-            transform, crs = image.transform, image.crs
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # our own message says it
+            with rasterio.open(path) as image:
+                band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
+                transform, crs = image.transform, image.crs
     except rasterio.errors.RasterioError as error:
         raise InputError(f"not a GeoTIFF ({error})", path=path) from None
     if crs is None or transform.b or transform.d or transform.a <= 0 or transform.e >= 0:

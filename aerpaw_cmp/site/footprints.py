@@ -462,6 +462,8 @@ def import_site(
     model = site_model(base)
     found = import_footprints(files, SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg), **options)
     content = model.model_dump()
+    if model.dem is not None:  # the new file may lie in another folder
+        content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     content |= {
         "buildings": [
             {**_outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}

@@ -14,7 +14,7 @@ from typing import Annotated, Any, Literal
 
 import numpy as np
 import shapely
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 from shapely.geometry import Point, Polygon
 
 from ..errors import UsageError
@@ -45,6 +45,27 @@ NotNegative = Annotated[float, Field(ge=0)]
 Ground = Literal["flat", "offsets", "dem"]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
+
+
+def _known_material(name: str) -> str:
+    try:
+        material(name)
+    except UsageError as error:
+        raise ValueError(str(error)) from None  # pydantic adds the place
+    return name
+
+
+MaterialName = Annotated[str, AfterValidator(_known_material)]
+
+
+def _problem(shape: Polygon) -> str | None:
+    """What is wrong with an outline."""
+    if len(set(shape.exterior.coords)) < 3:
+        return "has fewer than 3 distinct points"
+    if not shape.is_valid or shape.area < 1e-3:
+        reason = shapely.is_valid_reason(shape) if not shape.is_valid else "no area"
+        return f"is not a simple outline ({reason}); 'aerpaw-cmp site import' repairs outlines"
+    return None
 
 
 class HeightModel(StrictModel):
@@ -115,23 +136,20 @@ class PolygonModel(StrictModel):
             raise ValueError("give polygon_m (east, north) or polygon_deg (latitude, longitude)")
         if (self.holes_m and self.polygon_m is None) or (self.holes_deg and self.polygon_deg is None):
             raise ValueError("holes and outline must both be in metres or both in degrees")
+        if self.polygon_m is not None and (problem := _problem(Polygon(self.polygon_m, self.holes_m))):
+            raise ValueError(f"the polygon of '{self.name}' {problem}")
         return self
 
     def polygon(self, frame: SiteFrame) -> Polygon:
-        """In the site frame [m]; ValueError when it is not a simple polygon."""
+        """In the site frame [m]; UsageError when it is not a simple polygon near the site."""
         if self.polygon_m is not None:
             shape = Polygon(self.polygon_m, self.holes_m)
         else:
             rings = [self.polygon_deg or [], *self.holes_deg]
             local = [_ring_from_degrees(ring, frame, self.name) for ring in rings]
             shape = Polygon(local[0], local[1:])
-        if len(set(shape.exterior.coords)) < 3:
-            raise UsageError(f"the polygon of '{self.name}' has fewer than 3 distinct points")
-        if not shape.is_valid or shape.area < 1e-3:
-            raise UsageError(
-                f"the polygon of '{self.name}' is not a simple outline ({shapely.is_valid_reason(shape)})",
-                cause="it crosses itself or its points coincide; 'aerpaw-cmp site import' repairs outlines",
-            )
+        if problem := _problem(shape):
+            raise UsageError(f"the polygon of '{self.name}' {problem}")
         return shapely.normalize(shape)
 
 
@@ -140,7 +158,7 @@ class BuildingModel(PolygonModel):
 
     height_m: Positive
     base_m: float = 0.0
-    material: str = "concrete"
+    material: MaterialName = "concrete"
     source: str = ""
 
 
@@ -202,7 +220,7 @@ class SiteModel(StrictModel):
     coordinates: str | None = None
     tower_ground: Ground | None = None
     dem: DemModel | None = None
-    ground_material: str = "medium_dry_ground"
+    ground_material: MaterialName = "medium_dry_ground"
     area_m: tuple[float, float, float, float] | None = None
     buildings: list[BuildingModel] = Field(default_factory=list)
     forests: list[ForestModel] = Field(default_factory=list)
@@ -277,7 +295,6 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     dem = _dem(model, frame, folder or Path())
     datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
-    material(model.ground_material)
     notes = list(model.notes)
     towers = {name: _tower(name, tower, model, frame, datum, dem, notes) for name, tower in model.towers.items()}
     area = _area(model.area_m, towers)
@@ -410,7 +427,6 @@ def _chosen_position(
 
 
 def _building(model: BuildingModel, frame: SiteFrame, dem: Dem | None) -> Building:
-    material(model.material)
     footprint = model.polygon(frame)
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle

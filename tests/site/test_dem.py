@@ -145,3 +145,43 @@ def test_bad_grids(tmp_path: Path) -> None:
     path.write_bytes(b"II*\x00" + b"0" * 100)
     with pytest.raises((UsageError, InputError), match=r"needs rasterio|not a GeoTIFF"):
         read_dem(path, FRAME)
+
+
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rasterio's own
+@pytest.mark.filterwarnings("ignore:Dataset has no geotransform")
+def test_geotiff_equals_the_ascii_grid(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio", reason="rasterio comes with the extra aerpaw-cmp[geo]")
+    from pyproj import Transformer
+
+    x0, y0 = Transformer.from_crs("EPSG:4326", "EPSG:32617", always_xy=True).transform(-78.696, 35.7275)
+    west, south, cell = x0 - 300, y0 - 250, 10.0
+    height = np.random.default_rng(3).uniform(60, 90, (50, 60))
+    height[0, 0] = np.nan
+    path = tmp_path / "d.tif"
+    profile = {"driver": "GTiff", "width": 60, "height": 50, "count": 1, "dtype": "float64", "nodata": -9999.0}
+    place = rasterio.transform.from_origin(west, south + 50 * cell, cell, cell)
+    with rasterio.open(path, "w", crs="EPSG:32617", transform=place, **profile) as image:
+        image.write(np.where(np.isnan(height), -9999.0, height)[::-1], 1)
+    text = read_dem(asc(tmp_path / "d.asc", height, west, south, cell), FRAME, crs="EPSG:32617")
+    tiff = read_dem(path, FRAME)
+    east, north = np.random.default_rng(4).uniform(-350, 350, (2, 400))
+    np.testing.assert_allclose(tiff.absolute_m(east, north), text.absolute_m(east, north), atol=1e-6)
+    assert np.isfinite(tiff.absolute_m(east, north)).sum() > 100
+    with rasterio.open(path, "w", **profile) as image:
+        image.write(height, 1)
+    with pytest.raises(InputError, match="not georeferenced"):
+        read_dem(path, FRAME)
+
+
+def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
+    from aerpaw_cmp.site.footprints import import_site, write_site_yaml
+
+    (tmp_path / "base").mkdir()
+    asc(tmp_path / "base" / "d.asc", plane(-500, -300, 10, (60, 100)), -500, -300, 10)
+    (tmp_path / "base" / "site.yaml").write_text(SITE)
+    tree = tmp_path / "tree.osm"
+    tree.write_text('<osm><node id="1" lat="35.728" lon="-78.6962"><tag k="natural" v="tree"/></node></osm>')
+    model, _ = import_site([tree], base=tmp_path / "base" / "site.yaml")
+    write_site_yaml(model, tmp_path / "new.yaml")
+    site = load_site(tmp_path / "new.yaml")
+    assert site.trees.ground_m[0] == pytest.approx(0.03 * site.trees.east_m[0] - 0.02 * site.trees.north_m[0], abs=1e-6)

@@ -1,0 +1,329 @@
+"""RMSE of simple to detailed models on the two real RSS flights around LW1 (needs the field logs).
+
+The UAV transmits at 3.3 GHz and LW1 receives on two channels, at 40 m and at 70 m. Every model has its own best
+offset per flight and channel and nothing else fitted, but for the azimuths of the three antennas (the UAV's, and one
+per channel at the tower) in the rows that say so: those are fitted on one flight and scored on the other. The last rows
+also learn, on the other flight, how much gain mast and airframe add per azimuth (compare/installed.py). Both flights
+follow one route, so such a correction may learn the place together with the antenna.
+Each model is scored twice: samples as they are, and both sides averaged in power over four seconds.
+
+    AERPAW_CMP_FIELD_DATA=DIR python benchmarks/field_models.py [--quick] [--json]
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import sys
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from aerpaw_cmp.compare.heldout import HeldOutFit, fit_held_out
+from aerpaw_cmp.compare.installed import InstalledFit, LinkAngles, fit_installed
+from aerpaw_cmp.compare.offset import grid_offset
+from aerpaw_cmp.compare.rss import local_mean_db
+from aerpaw_cmp.config import load_flight
+from aerpaw_cmp.flight import FlightData, gather, read_logs
+from aerpaw_cmp.replay.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
+from aerpaw_cmp.replay.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.replay.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.replay.replay import replay
+from aerpaw_cmp.site.antennas import read_gain_grid
+from aerpaw_cmp.site.installed import InstalledPattern
+from aerpaw_cmp.units import FloatArray
+
+TOWER = "LW1"
+CARRIER_HZ = 3.3e9
+WINDOW_S = 4.0
+SPAN_DB = (-100.0, 100.0)
+PAPER = {"uav": 315.0, "tower": 45.0}
+"""Azimuths that arXiv 2502.10324 states for its arrays [deg, counter-clockwise from east]."""
+FLIGHTS = {
+    name: Path(__file__).parents[1] / "tests" / "field" / f"{name}.yaml" for name in ("dataset12_40m", "dataset12_70m")
+}
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Flight:
+    """Samples above the flight file's lowest height: seconds (n,), poses, level [dB] by channel."""
+
+    data: FlightData
+    time_s: FloatArray
+    poses: Poses
+    measured_db: Mapping[str, FloatArray]
+
+    def thinned(self, step: int) -> Flight:
+        """Every ``step``-th sample."""
+        poses = Poses(self.poses.position_m[::step], self.poses.rotation[::step])
+        return Flight(self.data, self.time_s[::step], poses, {c: m[::step] for c, m in self.measured_db.items()})
+
+
+@dataclasses.dataclass(frozen=True, slots=True)
+class Patterns:
+    """Measured gain of the antennas."""
+
+    tower: Pattern
+    uav: Pattern
+
+
+Model = Callable[[Flight, str], FloatArray]
+"""``model(flight, channel) -> level_db`` (n,)."""
+
+
+def read_flight(path: Path, root: Path) -> Flight:
+    """One flight; both channels share their instants."""
+    settings = load_flight(path)
+    data = gather(settings, path.parent, read_logs(settings, path.parent, root), root)
+    assert data.track is not None
+    time_stamp = data.rss[0].time
+    pose = data.track.pose_at(time_stamp)
+    with np.errstate(invalid="ignore"):
+        keep = pose.valid & (pose.position_m[:, 2] >= settings.rss.minimum_height_m)
+    return Flight(
+        data,
+        ((time_stamp - time_stamp[0]) / np.timedelta64(1, "s"))[keep],
+        Poses(pose.position_m[keep], pose.rotation[keep]),
+        {series.channel: series.measured_db[keep] for series in data.rss},
+    )
+
+
+def yaw_deg(angle: float) -> FloatArray:
+    """Mount turned by an azimuth."""
+    return rotation_from_yaw_pitch_roll(np.radians(angle), 0.0, 0.0)  # type: ignore[arg-type]
+
+
+def traced(
+    flight: Flight,
+    tower: tuple[Pattern, float] = (Isotropic(), 0.0),
+    uav: tuple[Pattern, float] = (Isotropic(), 0.0),
+    *,
+    depth: int = 0,
+    attitude: bool = True,
+    trees: bool = False,
+    power: bool = False,
+) -> FloatArray:
+    """Level (n,) [dBm] by the image engine with a pattern and a mount azimuth at each end."""
+    site = flight.data.site
+    link = Link(
+        CARRIER_HZ, {TOWER: single_element(tower[0], yaw_deg(tower[1]))}, single_element(uav[0], yaw_deg(uav[1]))
+    )
+    rotation = flight.poses.rotation if attitude else np.broadcast_to(np.eye(3), flight.poses.rotation.shape)
+    loss = None
+    if trees:
+        crowns, leafy = CrownIndex(site.trees), foliage_model("attenuating", CARRIER_HZ)
+
+        def loss(paths: Any, sources: FloatArray, targets: FloatArray) -> FloatArray:
+            return foliage_loss_db(sources[paths.tower], paths.vertices_m, targets[paths.pose], crowns, leafy)
+
+    found = replay(site, link, Poses(flight.poses.position_m, rotation), max_depth=depth, loss=loss)
+    return (found.rss_power_dbm if power else found.rss_dbm)[:, 0]
+
+
+def baseline(formula: Callable[..., FloatArray]) -> Model:
+    """Free space or two-ray."""
+
+    def level(flight: Flight, _channel: str) -> FloatArray:
+        ends = flight.data.site.towers[TOWER].position_m[None, :], flight.poses.position_m
+        return formula(*ends, CARRIER_HZ)[:, 0]
+
+    return level
+
+
+def fixed_models(patterns: Patterns) -> dict[str, Model]:
+    """Models in which nothing but the offset is fitted."""
+    tower, uav = (patterns.tower, PAPER["tower"]), (patterns.uav, PAPER["uav"])
+    nose = (patterns.uav, 0.0)
+
+    def model(*ends: tuple[Pattern, float], **options: Any) -> Model:
+        return lambda flight, _channel: traced(flight, *ends, **options)
+
+    return {
+        "free space": baseline(free_space_dbm),
+        "two-ray, closed form": baseline(two_ray_dbm),
+        "isotropic, line of sight + ground, coherent": model(depth=1),
+        "isotropic, line of sight + ground, power sum": model(depth=1, power=True),
+        "measured patterns at the paper's azimuths": model(tower, uav, attitude=False),
+        "measured patterns + attitude (UAV forward)": model(tower, nose),
+        "measured patterns + attitude + ground, coherent": model(tower, nose, depth=1),
+        "measured patterns + attitude + ground, power sum": model(tower, nose, depth=1, power=True),
+        "measured patterns + attitude + illustrative trees": model(tower, nose, trees=True),
+    }
+
+
+def fit_mount(flights: Mapping[str, Flight], patterns: Patterns, train: str, test: str, step_deg: float) -> HeldOutFit:
+    """Azimuths of the UAV antenna and of each channel's tower antenna, fitted on ``train``."""
+    thin = {name: flight.thinned(4) for name, flight in flights.items()}
+    kept: dict[tuple[str, str, float, float], FloatArray] = {}
+
+    def residual(flight: str, channel: str, tower: float, uav: float) -> FloatArray:
+        key = (flight, channel, tower, uav)
+        if key not in kept:
+            level = traced(thin[flight], (patterns.tower, tower), (patterns.uav, uav))
+            for name, measured in thin[flight].measured_db.items():
+                kept[flight, name, tower, uav] = (measured - level) - np.mean(measured - level)
+        return kept[key]
+
+    def objective(angles: Mapping[str, float], flight: str) -> FloatArray:
+        channels = thin[flight].measured_db
+        return np.concatenate([residual(flight, c, angles[c], angles["uav"]) for c in channels])
+
+    grid = np.arange(0.0, 360.0, step_deg)
+    names = ["uav", *next(iter(flights.values())).measured_db]
+    start = {"uav": 0.0, **dict.fromkeys(names[1:], PAPER["tower"])}
+    return fit_held_out(objective, dict.fromkeys(names, grid), [train], [test], start=start, largest_grid=60_000)
+
+
+def transferred_models(patterns: Patterns, mounts: Mapping[str, HeldOutFit]) -> dict[str, Model]:
+    """Models with the mount fitted on the other flight; ``mounts`` by the flight to be scored."""
+
+    def model(**options: Any) -> Model:
+        def level(flight: Flight, channel: str) -> FloatArray:
+            angles = mounts[flight.data.settings.flight.name].parameters
+            return traced(flight, (patterns.tower, angles[channel]), (patterns.uav, angles["uav"]), **options)
+
+        return level
+
+    return {
+        "patterns + attitude + mount of the other flight": model(),
+        "the same, attitude ignored but for heading": _level_flight(model()),
+        "the same + ground, power sum": model(depth=1, power=True),
+        "the same + ground, coherent": model(depth=1),
+        "the same + illustrative trees": model(trees=True),
+    }
+
+
+def angles_of(flight: Flight, tower_deg: float, uav_deg: float) -> LinkAngles:
+    """Directions of both ends in each other's device frame."""
+    ray = flight.poses.position_m - flight.data.site.towers[TOWER].position_m
+    at_tower = ray @ yaw_deg(tower_deg)
+    at_uav = np.einsum("nji,nj->ni", flight.poses.rotation @ yaw_deg(uav_deg), -ray)
+
+    def of(v: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return np.arctan2(v[:, 1], v[:, 0]), np.arctan2(np.hypot(v[:, 0], v[:, 1]), v[:, 2])
+
+    return LinkAngles(*of(at_uav), *of(at_tower))
+
+
+def fit_added_gain(flight: Flight, patterns: Patterns, mount: Mapping[str, float]) -> InstalledFit:
+    """Added gain per azimuth of both ends from one flight, with a mount fitted on that same flight."""
+    residual, angles = {}, {}
+    for channel, measured in flight.measured_db.items():
+        level = traced(flight, (patterns.tower, mount[channel]), (patterns.uav, mount["uav"]))
+        residual[channel] = measured - level
+        angles[channel] = angles_of(flight, mount[channel], mount["uav"])
+    return fit_installed(residual, angles)
+
+
+def installed_model(patterns: Patterns, mounts: Mapping[str, HeldOutFit], gains: Mapping[str, InstalledFit]) -> Model:
+    """Mount and added gain, both of the other flight."""
+
+    def level(flight: Flight, channel: str) -> FloatArray:
+        name = flight.data.settings.flight.name
+        mount, gain = mounts[name].parameters, gains[name]
+        tower = InstalledPattern(patterns.tower, gain.tower_db[channel])
+        uav = InstalledPattern(patterns.uav, gain.uav_db)
+        return traced(flight, (tower, mount[channel]), (uav, mount["uav"]))
+
+    return level
+
+
+def _level_flight(model: Model) -> Model:
+    def level(flight: Flight, channel: str) -> FloatArray:
+        nose = flight.poses.rotation[:, :, 0]
+        heading = np.arctan2(nose[:, 1], nose[:, 0])
+        flat = rotation_from_yaw_pitch_roll(heading, np.zeros_like(heading), np.zeros_like(heading))
+        return model(dataclasses.replace(flight, poses=Poses(flight.poses.position_m, flat)), channel)
+
+    return level
+
+
+def score(flights: Mapping[str, Flight], model: Model) -> dict[str, Any]:
+    """RMSE [dB] per flight and channel, and their means, on both footings."""
+    result: dict[str, Any] = {}
+    for footing, window in (("as_logged", 0.0), ("mean_4s", WINDOW_S)):
+        cells = {}
+        for name, flight in flights.items():
+            for channel, measured in flight.measured_db.items():
+                level = model(flight, channel)
+                pair = (local_mean_db(flight.time_s, side, window) for side in (measured, level))
+                cells[f"{name} {channel}"] = grid_offset(*pair, span_db=SPAN_DB).rmse_db
+        result[footing] = {**cells, "mean": float(np.mean(list(cells.values())))}
+    return result
+
+
+def table(root: Path, step_deg: float) -> dict[str, Any]:
+    """All models on both flights."""
+    antennas = root / "antennas" / "rad_pat.mat"
+    patterns = Patterns(read_gain_grid(antennas, "RMWB3300_normal"), read_gain_grid(antennas, "SA3300"))
+    flights = {name: read_flight(path, root) for name, path in FLIGHTS.items()}
+    rows = {name: score(flights, model) for name, model in fixed_models(patterns).items()}
+    one, two = FLIGHTS
+    mounts = {test: fit_mount(flights, patterns, train, test, step_deg) for train, test in ((one, two), (two, one))}
+    rows |= {name: score(flights, model) for name, model in transferred_models(patterns, mounts).items()}
+    gains = {
+        test: fit_added_gain(flights[train], patterns, mounts[test].parameters)
+        for train, test in ((one, two), (two, one))
+    }
+    rows["patterns + attitude + mount + added gain of the other flight"] = score(
+        flights, installed_model(patterns, mounts, gains)
+    )
+    iso = Patterns(Isotropic(), Isotropic())
+    control = {
+        test: fit_added_gain(flights[train], iso, mounts[test].parameters) for train, test in ((one, two), (two, one))
+    }
+    rows["control: isotropic + added gain of the other flight"] = score(flights, installed_model(iso, mounts, control))
+    own = {one: mounts[two], two: mounts[one]}
+    rows["(patterns + attitude + mount fitted on what is scored)"] = score(
+        flights, transferred_models(patterns, own)["patterns + attitude + mount of the other flight"]
+    )
+    added = {test: dataclasses.asdict(fit) for test, fit in gains.items()}
+    return {
+        "rows": rows,
+        "added_gain": added,
+        "mounts": {test: fit.as_dict() for test, fit in mounts.items()},
+        "grid_step_deg": step_deg,
+    }
+
+
+def _rounded(values: tuple[float, ...]) -> str:
+    return "[" + ", ".join(f"{v:.2f}" for v in values) + "]"
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--quick", action="store_true", help="azimuths on a grid of 30 degrees")
+    parser.add_argument("--json", action="store_true")
+    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA"))
+    arguments = parser.parse_args()
+    if arguments.logs_root is None or not Path(arguments.logs_root).is_dir():
+        print("field_models: AERPAW_CMP_FIELD_DATA names no folder of real logs; nothing measured", file=sys.stderr)
+        return
+    begin = time.process_time()
+    found = table(Path(arguments.logs_root), 30.0 if arguments.quick else 10.0)
+    found["cpu_s"] = time.process_time() - begin
+    if arguments.json:
+        print(json.dumps(found))
+        return
+    columns = [c for c in next(iter(found["rows"].values()))["as_logged"] if c != "mean"]
+    print("RMSE [dB] after the best offset; last columns: mean of four, samples as logged / 4 s means on both sides")
+    print(" " * 64 + " ".join(f"{c.removeprefix('dataset12_'):>10s}" for c in columns) + "       mean   mean 4 s")
+    for name, row in found["rows"].items():
+        cells = " ".join(f"{row['as_logged'][c]:10.2f}" for c in columns)
+        print(f"{name:64s}{cells} {row['as_logged']['mean']:10.2f} {row['mean_4s']['mean']:10.2f}")
+    for test, fit in found["mounts"].items():
+        angles = ", ".join(f"{name} {value:.0f} deg" for name, value in fit["parameters"].items())
+        print(f"mount applied to {test}, fitted on {fit['fitted_on'][0]}: {angles}")
+    for test, fit in found["added_gain"].items():
+        tower = "; ".join(f"{c} {_rounded(v)}" for c, v in fit["tower_db"].items())
+        print(f"added gain applied to {test}: order {fit['order']}, UAV {_rounded(fit['uav_db'])}; {tower}")
+    print(f"{found['cpu_s']:.1f} s of processor time")
+
+
+if __name__ == "__main__":
+    main()

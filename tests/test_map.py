@@ -224,12 +224,30 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     assert (states["paper"], states["ours"]) == ("36 x 71 = 2556", "6 x 11 = 66")
 
 
+def test_the_paper_page_has_the_rows_that_a_run_prints(made):
+    page = (Path(__file__).parents[1] / "docs" / "paper.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    numbers = {tuple(row[:3]) for row in rows if len(row) == 5}
+    printed = {(row["where"], row["what"], row["paper"]) for row in made[1]["paper"]}
+    assert printed <= numbers
+    figures = {row[0] for row in rows}
+    assert {"Table I", "Table II", "Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Fig. 5, 6"} <= figures
+    assert {f"Fig. {n}" for n in range(7, 16)} <= figures
+
+
 def test_netcdf_is_written_where_its_library_is(made):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")
     with xarray.open_dataset(made[0] / "maps.nc") as data:
         assert data["rank_k10_h030m_LW3_opaque"].shape == (11, 6)
         assert data.attrs["Conventions"].startswith("CF-")
+
+
+def test_geotiff_is_written_where_its_library_is(made):
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(made[0] / "maps.tif") as data:
+        assert data.shape == (11, 6)
+        assert data.count > 10
 
 
 @pytest.mark.parametrize(

@@ -514,7 +514,7 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
         return
     sizes = np.array(outcome.honest.learning_sizes)
     for name, mae in {"Kriging": outcome.honest.learning_mae, **outcome.learning}.items():
-        mean = np.nanmean(mae.reshape(len(sizes), -1), axis=1)
+        mean = np.array([_mean(row) for row in mae.reshape(len(sizes), -1)])
         yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
 

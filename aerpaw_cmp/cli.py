@@ -39,8 +39,26 @@ def main(arguments: list[str]) -> int:
 
 
 def _say(text: str) -> None:
-    """Progress goes to standard error, so that standard output stays clean."""
-    print(text, file=sys.stderr, flush=True)
+    """Progress goes to standard error, so that standard output stays clean; "... 40 %" becomes a bar.
+
+    On a terminal the bar is redrawn in place; elsewhere only every quarter is a line.
+    """
+    name, _, share = text.removesuffix(" %").rpartition(" ")
+    if not (text.endswith(" %") and share.isdigit()):
+        print(text, file=sys.stderr, flush=True)
+        return
+    percent = int(share)
+    if sys.stderr.isatty():
+        filled = percent * 30 // 100
+        end = "\n" if percent >= 100 else ""
+        print(f"\r\033[K{name} [{'#' * filled}{'.' * (30 - filled)}] {percent} %", end=end, file=sys.stderr, flush=True)
+    elif percent // 25 != _said.get(name, 0):
+        _said[name] = percent // 25
+        print(text, file=sys.stderr, flush=True)
+
+
+_said: dict[str, int] = {}
+"""Quarter that was last said of each stage."""
 
 
 def _print_json(value: dict[str, Any]) -> None:

@@ -102,6 +102,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             "n_too_low": int((replayed.valid & ~levels.posed).sum()),
             "n_no_pose": int((~replayed.valid).sum()),
             "clock": _clock_entry(clock),
+            "baseline_rmse_ci95_db": {name: list(bounds) for name, bounds in result.baseline_intervals.items()},
             **_further_numbers(data, series, replayed, levels, result.offset_db),
             **({"foliage": found} if (found := foliage_rss_difference(alternatives)) else {}),
             "explained_by": {name: table.explained for name, table in tables.items()},
@@ -464,6 +465,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         stale=~result.staleness.fresh,
         extra={
             **{k: v for k, v in result.as_dict().items() if k not in PANEL_RANK},
+            "kappa_ci95": {f"{k:g}": list(fit.kappa_ci95) for k, fit in result.simulated.items()},
             **({"foliage": foliage} if foliage else {}),
         },
     )

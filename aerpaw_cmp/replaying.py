@@ -53,9 +53,13 @@ class Replayed:
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values per replayed pose, put back at their samples (n,)."""
-        out = np.full(len(self.valid), fill, dtype=np.result_type(values.dtype, np.float64))
-        out[self.valid] = values
-        return out
+        return _spread(self.valid, values, fill)
+
+
+def _spread(valid: BoolArray, values: FloatArray, fill: float = np.nan) -> FloatArray:
+    out = np.full(len(valid), fill, dtype=np.result_type(values.dtype, np.float64))
+    out[valid] = values
+    return out
 
 
 def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] | None = None) -> list[Replayed]:
@@ -97,34 +101,46 @@ def estimate_clocks(data: FlightData, progress: Progress) -> list[Clock | None]:
     if wanted == "off" or data.track is None:
         return [None] * len(data.rss)
     out: list[Clock | None] = []
+    predict = _Predictions(data)
     for series in data.rss:
         if isinstance(wanted, float):
             applied = np.full(len(series.time), wanted)
             out.append(Clock(wanted, (wanted, wanted), 0.0, "given", "", "given in flight.yaml", applied))
             continue
         progress(f"clock {series.tower} {series.channel}")
-        out.append(_estimated_clock(data, series, apply=wanted == "apply"))
+        out.append(_estimated_clock(data, series, predict, apply=wanted == "apply"))
     return out
 
 
-def _estimated_clock(data: FlightData, series: RssSeries, *, apply: bool) -> Clock:
+class _Predictions:
+    """Image-engine RSS along the track; channels with one link that were sampled together share the replay."""
+
+    def __init__(self, data: FlightData) -> None:
+        self._data = data
+        self._kept: dict[tuple[str, str, bytes], dict[str, FloatArray]] = {}
+
+    def __call__(self, series: RssSeries, field: str, times: Any) -> FloatArray:
+        """Level ``rss_dbm`` or ``rss_power_dbm`` at instants (n,) [dBm]; NaN without a pose or path."""
+        key = (series.tower, series.settings_key, np.asarray(times).tobytes())
+        if key not in self._kept:
+            data, track = self._data, _track_poses(self._data, times)
+            link, poses = series.link.build([series.tower], data.folder), _poses(data, track)
+            found = replay(data.site, link, poses, engine="image", max_depth=min(data.settings.rt.max_depth, 1))
+            self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
+            levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
+            self._kept[key] = {name: _spread(track.valid, level) for name, level in levels.items()}
+        return self._kept[key][field]
+
+
+def _estimated_clock(data: FlightData, series: RssSeries, predictions: _Predictions, *, apply: bool) -> Clock:
     """Lag by the coherent replay and by its power sum; the one that leaves the smaller residual decides.
 
     Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
     (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
     """
-    link = series.link.build([series.tower], data.folder)
 
     def predictor(field: str) -> Callable[[Any], FloatArray]:
-        def predict(times: Any) -> FloatArray:
-            track = _track_poses(data, times)
-            level = np.full(len(track), np.nan)
-            depth = min(data.settings.rt.max_depth, 1)
-            result = replay(data.site, link, _poses(data, track), engine="image", max_depth=depth)
-            level[track.valid] = getattr(result, field)[:, 0]
-            return level
-
-        return predict
+        return lambda times: predictions(series, field, times)
 
     measured = series.measured_db
     if data.settings.rss.minimum_height_m is not None:

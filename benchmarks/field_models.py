@@ -191,10 +191,10 @@ def transferred_models(patterns: Patterns, mounts: Mapping[str, HeldOutFit]) -> 
 
     return {
         "patterns + attitude + mount of the other flight": model(),
-        "the same, attitude ignored but for heading": _level_flight(model()),
-        "the same + ground, power sum": model(depth=1, power=True),
-        "the same + ground, coherent": model(depth=1),
-        "the same + illustrative trees": model(trees=True),
+        "mount of the other flight, heading only": _level_flight(model()),
+        "mount of the other flight + ground, power sum": model(depth=1, power=True),
+        "mount of the other flight + ground, coherent": model(depth=1),
+        "mount of the other flight + illustrative trees": model(trees=True),
     }
 
 
@@ -270,16 +270,14 @@ def table(root: Path, step_deg: float) -> dict[str, Any]:
         test: fit_added_gain(flights[train], patterns, mounts[test].parameters)
         for train, test in ((one, two), (two, one))
     }
-    rows["patterns + attitude + mount + added gain of the other flight"] = score(
-        flights, installed_model(patterns, mounts, gains)
-    )
+    rows["mount and added gain of the other flight"] = score(flights, installed_model(patterns, mounts, gains))
     iso = Patterns(Isotropic(), Isotropic())
     control = {
         test: fit_added_gain(flights[train], iso, mounts[test].parameters) for train, test in ((one, two), (two, one))
     }
     rows["control: isotropic + added gain of the other flight"] = score(flights, installed_model(iso, mounts, control))
     own = {one: mounts[two], two: mounts[one]}
-    rows["(patterns + attitude + mount fitted on what is scored)"] = score(
+    rows["mount of the same flight (fitted on what is scored)"] = score(
         flights, transferred_models(patterns, own)["patterns + attitude + mount of the other flight"]
     )
     added = {test: dataclasses.asdict(fit) for test, fit in gains.items()}

@@ -291,7 +291,7 @@ def test_alternatives_change_only_what_they_name(tmp_path: Path) -> None:
         "attitude ignored",
     }
     assert rmse["heading only"] == pytest.approx(panel.rmse_db, abs=1e-9)  # this flight is level
-    assert abs(rmse["attitude ignored"] - panel.rmse_db) > 0.1  # but heads elsewhere than the site's east
+    assert abs(rmse["attitude ignored"] - panel.rmse_db) > 0.02  # but heads elsewhere than the site's east
     (tmp_path / "iso").mkdir()
     plain = compared_rss(flight(tmp_path / "iso", rss={"USRP1": (at, free_space_db(at))}))[0].panel
     assert rmse["isotropic antennas"] == pytest.approx(plain.rmse_db, abs=1e-9)

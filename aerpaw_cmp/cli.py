@@ -456,6 +456,7 @@ def map_(
     carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
     engine: Annotated[Optional[str], typer.Option(help="image or sionna.")] = None,  # noqa: UP045
     max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
+    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
     flight: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
@@ -489,6 +490,7 @@ def map_(
         carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
         engine=engine,
         max_depth=max_depth,
+        samples=samples,
         threshold_dbm=threshold_dbm,
         study=study,
     )

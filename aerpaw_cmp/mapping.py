@@ -9,6 +9,7 @@ share of the transmit power, which gives the beam broadside to the array; it is 
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
@@ -80,6 +81,10 @@ class MapSettings:
         Side of the blocks that are left out whole.
     study : bool
         Correlation, interpolation and their errors, too.
+    threshold_dbm : float
+        A level below it is out of coverage in the RSS maps.
+    seed : int
+        Of random samples.
     """
 
     foliage: tuple[str, ...] = FOLIAGE
@@ -98,6 +103,7 @@ class MapSettings:
     radius_m: float = 150.0
     block_m: float = 300.0
     study: bool = True
+    threshold_dbm: float = -np.inf
     seed: int = 0
 
     def __post_init__(self) -> None:
@@ -174,11 +180,13 @@ class SiteChannels:
             loss = self._loss_db(mode, found.paths, poses)
             one = self._shaded(siso, found, poses, self.siso, loss)
             many = self._shaded(mimo, found, poses, self.mimo, loss)
-            power = s.transmit_power_dbm
-            result[mode] = Evaluation(
-                rss_dbm(beam_power(one), power), rss_dbm(beam_power(many), power), singular_values(many)
-            )
+            result[mode] = Evaluation(self._rss_dbm(one), self._rss_dbm(many), singular_values(many))
         return result
+
+    def _rss_dbm(self, h: ComplexArray) -> FloatArray:
+        level = rss_dbm(beam_power(h), self.settings.transmit_power_dbm)
+        with np.errstate(invalid="ignore"):
+            return np.asarray(np.where(level >= self.settings.threshold_dbm, level, np.nan))
 
     def _above_ground(self, position_m: FloatArray) -> FloatArray:
         if self.site.dem is None:
@@ -196,7 +204,8 @@ class SiteChannels:
     def _matrices(
         self, found: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None
     ) -> ComplexArray:
-        return channel_matrices(paths, found.faces, self.sources_m, poses, link, loss_db).h
+        h: ComplexArray = channel_matrices(paths, found.faces, self.sources_m, poses, link, loss_db).h
+        return h
 
     def _shaded(
         self, clear: ComplexArray, found: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
@@ -210,7 +219,7 @@ class SiteChannels:
         # a path of infinite loss is an obstacle, not a weak path
         again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
         h[touched] = self._matrices(found, paths.select(again), poses, link, loss_db[again])[touched]
-        return h
+        return np.asarray(h)
 
 
 def beam_power(h: ComplexArray) -> FloatArray:
@@ -224,7 +233,11 @@ def beam_power(h: ComplexArray) -> FloatArray:
 
 @dataclass(slots=True)
 class MapOutcome:
-    """Everything that one run found; ``maps`` by foliage mode, ``studies`` by how Z counts (missing, zero)."""
+    """Everything that one run found.
+
+    ``maps`` by foliage mode. ``studies``: positions out of coverage as no sample ("missing"), as rank 0 ("zero"), and
+    as rank 0 with M random samples within the radius in place of the M nearest ("random").
+    """
 
     site: Site
     settings: MapSettings
@@ -253,6 +266,10 @@ class MapOutcome:
     def shown(self) -> MapResult:
         """The maps of the paper's mode."""
         return self.maps[self.settings.shown]
+
+    def ordered(self) -> list[tuple[str, MapResult]]:
+        """Modes and maps, the paper's mode first."""
+        return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
 
 def make_maps(site: Site, settings: MapSettings, report: Report) -> MapOutcome:
@@ -291,6 +308,7 @@ def study_maps(outcome: MapOutcome, report: Report) -> None:
     with outcome.stage("leave one out", report):
         outcome.studies["missing"] = rank_study(result, **local)
         outcome.studies["zero"] = rank_study(result, out_of_coverage="zero", **local)
+        outcome.studies["random"] = rank_study(result, out_of_coverage="zero", selection="random", **local)
     with outcome.stage("correlation", report):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {
@@ -325,9 +343,7 @@ def tower_round(site: Site) -> tuple[FloatArray, str]:
     """A round over the first three towers and back, every 5 m: the shape of the paper's RSS flight."""
     corners = np.array([tower.position_m[:2] for tower in list(site.towers.values())[:3]])
     corners = np.vstack([corners, corners[:1]])
-    legs = [
-        np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5.0))) for a, b in zip(corners[:-1], corners[1:], strict=True)
-    ]
+    legs = [np.linspace(a, b, max(2, int(np.hypot(*(b - a)) / 5.0))) for a, b in itertools.pairwise(corners)]
     return np.concatenate(legs), "a round " + "-".join([*list(site.towers)[:3], next(iter(site.towers))])
 
 
@@ -339,8 +355,8 @@ def maps_record(outcome: MapOutcome, *, name: str, generated: str, versions: Map
     from .paper import paper_rows
 
     s, result = outcome.settings, outcome.shown
-    rss = tuple(one for mode, maps in outcome.maps.items() for one in _rss_maps(maps, mode))
-    rank = tuple(one for mode, maps in outcome.maps.items() for one in _rank_maps(maps, mode))
+    rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
+    rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
     return page.MapsData(
         title=f"Coverage and rank maps, {outcome.site.name}",
         name=name,
@@ -407,7 +423,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
             finite = np.where(np.isfinite(joint[row]), joint[row], np.nan)
             yield page.Layer(name=f"{name}, foliage {s.shown}", label=label, altitude_m=height, values=raster(finite))
     clear = outcome.maps.get("none")
-    for mode, maps in outcome.maps.items():
+    for mode, maps in outcome.ordered():
         if clear is None or mode == "none":
             continue
         change = foliage_difference(clear, maps)
@@ -416,7 +432,7 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
                 name=f"RSS lost by foliage, {mode}", label="RSS without minus with foliage [dB], arrays",
                 altitude_m=height, values=raster(change.rss_loss_db[row]), difference=True,
             )  # fmt: skip
-        for column, k in enumerate(maps.ks):
+        for column, k in enumerate(maps.ks if mode == s.shown else ()):
             for row, height in enumerate(maps.rank_altitudes_m):
                 seen = maps.ranks()[row, column] > 0
                 yield page.Layer(
@@ -460,6 +476,7 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
     tables: dict[str, dict[str, Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
         "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
+        "leave one out, Z as rank 0, random samples": _local(outcome.studies["random"].scores),
         f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": honest.blocked, **outcome.peers["blocks"]},
         "altitude left out": {"Kriging, 3-D": honest.altitude_held_out},
     }
@@ -476,6 +493,11 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
                     )  # fmt: skip
 
 
+def _local(scores: Mapping[str, Score]) -> dict[str, Score]:
+    """The interpolators that draw M samples at random when asked to."""
+    return {name: score for name, score in scores.items() if name in ("Kriging", "makima", "spline")}
+
+
 def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
     if outcome.honest is None or not outcome.honest.learning_sizes:
         return
@@ -486,8 +508,8 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
 
 
 def _warnings(outcome: MapOutcome) -> Iterator[str]:
-    for key, study in outcome.studies.items():
-        if study.fit.degenerate:
+    for key in ("zero", "missing"):
+        if key in outcome.studies and (study := outcome.studies[key]).fit.degenerate:
             yield f"Correlation fit (Z {key}): {study.fit.message}"
     if outcome.settings.spacing_m > cells.PAPER_SPACING_M:
         yield (
@@ -510,7 +532,10 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """What metrics.json holds beyond the tables of the page."""
     result: dict[str, Any] = {"paths": outcome.paths, "settings": asdict(outcome.settings)}
-    for key, study in outcome.studies.items():
+    for key in ("zero", "missing"):
+        if key not in outcome.studies:
+            continue
+        study = outcome.studies[key]
         result.setdefault("correlation", {})[f"z_{key}"] = {
             **{c: getattr(study.fit, c) for c in ("c1", "c2", "c3", "c4", "rmse", "degenerate", "message")},
             "positions": study.correlation.positions,
@@ -522,7 +547,7 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
         result["vertical_scale"] = outcome.honest.vertical_scale
         result["trajectory"] = outcome.trajectory_name
     clear = outcome.maps.get("none")
-    for mode, maps in outcome.maps.items():
+    for mode, maps in outcome.ordered():
         if clear is None or mode == "none":
             continue
         change = foliage_difference(clear, maps)
@@ -554,13 +579,15 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
     """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed."""
     site, grid = outcome.site, outcome.shown.grid
     joint, every = _all_layers(outcome, towers_too=False), _all_layers(outcome, towers_too=True)
+    names = {layer.name for layer in joint}
+    every = [layer for layer in every if layer.name in names or not layer.name.startswith(("spread", "condition"))]
     shown = [layer for layer in joint if not layer.name.startswith(("spread", "condition"))]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
     folder.mkdir(parents=True, exist_ok=True)
     written = [
         export.write_csv(folder / "layers.csv", grid, site.frame, every),
-        export.write_geojson(folder / "layers.geojson", grid, site.frame, joint, towers, borders),
+        export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),
         export.write_json(folder / "maps.json", grid, site.frame, joint, summary),
         export.write_kmz(folder / "maps.kmz", grid, site.frame, shown, towers, borders, title=site.name),
     ]
@@ -575,8 +602,12 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
 def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
     """Layers of all modes, with the mode in their names; the serving tower once."""
     result: list[cells.Layer] = []
-    for mode, maps in outcome.maps.items():
+    for mode, maps in outcome.ordered():
         serving, *others = layers_of(maps, towers_too=towers_too)
         result += [] if result else [serving]
-        result += [replace(one, name=f"{one.name}_{mode}", title=f"{one.title}, foliage {mode}") for one in others]
+        for one in others:
+            # a hundredth of a dB is more than the site's data hold, and a third of the bytes
+            values = one.values if one.classes else np.round(one.values, 2)
+            title = f"{one.title}, foliage {mode}"
+            result.append(replace(one, name=f"{one.name}_{mode}", title=title, values=values))
     return result

@@ -5,7 +5,7 @@ Every row quotes the paper on one side; the other side is computed here from the
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -150,7 +150,7 @@ def _rank(outcome: MapOutcome) -> Iterator[PaperRow]:
     if not result.rank_altitudes_m:
         return
     shares = result.rank_shares()
-    plate = f"rank_share{safe_name(f', foliage {outcome.settings.shown}')}"
+    plate = f"rank_share_{safe_name(f'foliage {outcome.settings.shown}')}"
     if 3.0 in result.rank_altitudes_m:
         row = result.rank_altitudes_m.index(3.0)
         yield PaperRow(
@@ -216,32 +216,52 @@ def _values(values: Any) -> str:
 
 def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
     s, heights = outcome.settings, rank_fields(outcome.shown)[0]
-    study: Study = outcome.studies["missing"]
-    plate = "mae_leave_one_out"
+    study: Study = outcome.studies["random"]
+    plate = "mae_leave_one_out_Z_as_rank_0_random_samples"
     yield PaperRow(
         where="section VII-C",
         what="samples M and radius r0",
         paper="20, 150 m",
         ours=f"{s.neighbours}, {s.reach_m:g} m",
     )
-    means = {name: float(np.nanmean(study.scores[name].mae)) for name in ("Kriging", "makima", "spline")}
-    yield PaperRow(
-        where="Fig. 14", what="MAE of Kriging, makima and spline, mean over heights and K",
-        paper="Kriging below both", ours=", ".join(f"{n} {m:.3f}" for n, m in means.items()), plate=plate,
-    )  # fmt: skip
-    kriging, makima, spline = (study.scores[name].mae for name in ("Kriging", "makima", "spline"))
-    wins = int(((kriging <= makima) & (kriging <= spline)).sum())
-    yield PaperRow(
-        where="Fig. 14", what="combinations of height and K at which Kriging is the best of the three",
-        paper="all", ours=f"{wins} of {kriging.size}", plate=plate,
-    )  # fmt: skip
+    for key, samples, where in (
+        ("random", "M random samples within r0", "mae_leave_one_out_Z_as_rank_0_random_samples"),
+        ("zero", "the M nearest samples", "mae_leave_one_out_Z_as_rank_0"),
+    ):
+        scores = outcome.studies[key].scores
+        for measure in ("mae", "rmse"):
+            means = {
+                name: float(np.nanmean(getattr(scores[name], measure))) for name in ("Kriging", "makima", "spline")
+            }
+            yield PaperRow(
+                where="Fig. 14",
+                what=f"{measure.upper()} of Kriging, makima, spline, mean over heights and K, {samples}",
+                paper="Kriging below both" if measure == "mae" else "not stated",
+                ours=", ".join(f"{n} {m:.3f}" for n, m in means.items()), plate=where,
+            )  # fmt: skip
+        kriging, makima, spline = (scores[name].mae for name in ("Kriging", "makima", "spline"))
+        wins = int(((kriging <= makima) & (kriging <= spline)).sum())
+        yield PaperRow(
+            where="Fig. 14", what=f"combinations of height and K at which Kriging has the least MAE, {samples}",
+            paper="all", ours=f"{wins} of {kriging.size}", plate=where,
+        )  # fmt: skip
+    kriging = study.scores["Kriging"].mae
     by_k = np.nanmean(kriging, axis=0)
     yield PaperRow(
-        where="Fig. 14", what="MAE of Kriging by K", paper="lowest for K1",
+        where="Fig. 14", what="MAE of Kriging by K, M random samples", paper="lowest for K1",
         ours=", ".join(f"K = {k_key(k)}: {m:.3f}" for k, m in zip(outcome.shown.ks, by_k, strict=True)), plate=plate,
     )  # fmt: skip
     worst = [heights[int(np.nanargmax(kriging[:, column]))] for column in range(kriging.shape[1])]
     yield PaperRow(
-        where="Fig. 14", what="height with the largest MAE of Kriging", paper="30 m for every K",
+        where="Fig. 14", what="height with the largest MAE of Kriging, M random samples", paper="30 m for every K",
         ours=", ".join(f"K = {k_key(k)}: {h:g} m" for k, h in zip(outcome.shown.ks, worst, strict=True)), plate=plate,
     )  # fmt: skip
+
+
+def paper_markdown(rows: Iterable[PaperRow]) -> str:
+    """The rows as a Markdown table."""
+    lines = ["| where | what | paper | here | figure |", "| --- | --- | --- | --- | --- |"]
+    for row in rows:
+        figure = f"`figures/{row.plate}.svg`" if row.plate else ""
+        lines.append(f"| {row.where} | {row.what} | {row.paper} | {row.ours} | {figure} |")
+    return "\n".join(lines) + "\n"

@@ -378,6 +378,7 @@ def run_map(
     """
     from . import mapping
     from .comparison import versions
+    from .paper import paper_markdown
     from .report.maps_html import maps_metrics, write_maps
     from .site.siteyaml import load_site
 
@@ -397,6 +398,8 @@ def run_map(
     progress("page")
     record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
     written = write_maps(record, folder)
+    written.append(folder / "paper.md")
+    written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     return MapsOutcome(folder, (*written, *files), maps_metrics(record))
 
 

@@ -36,7 +36,7 @@ def soak(simulated_s: float, speed: float, folder: Path) -> dict[str, object]:
             duration_s=duration_s,
             show_status=True,
             status_s=1.0 / speed,
-            log={"sync_interval_s": 1.0 / speed, "segment_s": 3600.0 / speed / 6},
+            log={"sync_interval_s": 1.0 / speed, "segment_s": 3600.0 / speed / 6, "patience_s": 0.25 / speed},
         )
         until = time.monotonic() + duration_s - 0.5
         while time.monotonic() < until and process.poll() is None:

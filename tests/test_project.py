@@ -39,7 +39,8 @@ def test_the_readme_names_every_command() -> None:
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: path.name)
 def test_links_between_documents_lead_somewhere(document: Path) -> None:
-    targets = re.findall(r"\]\(([^)#\s]+)", document.read_text())
+    prose = re.sub(r"`[^`]*`", "", document.read_text())  # brackets in code are no links
+    targets = re.findall(r"\]\(([^)#\s]+)", prose)
     missing = [target for target in targets if "://" not in target and not (document.parent / target).exists()]
     assert missing == []
 
@@ -65,3 +66,25 @@ def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].strip() == "sudo apt-get update && sudo apt-get install -y python3 python3-venv"
     assert not (tmp_path / "venv").exists()
+
+
+def test_the_keys_of_the_flight_file_page_are_real() -> None:
+    """docs/flight_yaml.md lists keys: each example must load, and each settings block must exist."""
+    from aerpaw_cmp import config
+
+    text = (ROOT / "docs" / "flight_yaml.md").read_text()
+    block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
+    assert block is not None
+    stated = {
+        "rt": config.RtSettings,
+        "rss": config.RssSettings,
+        "rank": config.RankSettings,
+        "report": config.ReportSettings,
+    }
+    for name, model in stated.items():
+        part = re.search(rf"^{name}:(.*?)(?=^\w|\Z)", block[1], re.DOTALL | re.MULTILINE)
+        assert part is not None, name
+        keys = set(re.findall(r"(?:^  |[{,(] ?)([a-z_]+):", part[1], re.MULTILINE))
+        known = set(model.model_fields) | set(config.Waypoint.model_fields)
+        assert keys <= known, (name, keys - known)
+        assert keys, name

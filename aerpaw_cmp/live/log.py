@@ -157,6 +157,8 @@ class LogSettings:
         What may wait in memory while the disk takes nothing.
     retry_s : float
         Pause between attempts on a faulty disk.
+    patience_s : float
+        Longest wait of the polling for a record to be written; then it goes on and records wait in memory.
     """
 
     sync_interval_s: float = 1.0
@@ -165,6 +167,7 @@ class LogSettings:
     backlog_records: int = 200_000
     backlog_bytes: int = 64 * 2**20
     retry_s: float = 1.0
+    patience_s: float = 0.25
 
 
 @dataclass(slots=True)

@@ -10,6 +10,7 @@ from __future__ import annotations
 import contextlib
 import errno
 import fcntl
+import fnmatch
 import grp
 import os
 import pwd
@@ -91,17 +92,26 @@ def _usb_of(tty: str, roots: Roots) -> tuple[str, str] | None:
     return None
 
 
+def _entries(folder: Path, pattern: str) -> list[Path]:
+    """Entries of a folder by name; none if it vanishes meanwhile, as /dev/serial/by-id does with its last device."""
+    try:
+        names = os.listdir(folder)  # noqa: PTH208 (Path.iterdir and glob are lazy: they may raise in the middle)
+    except OSError:
+        return []
+    return [folder / name for name in sorted(names) if fnmatch.fnmatchcase(name, pattern)]
+
+
 def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
     """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
     roots = roots or Roots()
     found: list[PortInfo] = []
     for interface in AT_INTERFACES:
-        for link in sorted((roots.dev / "serial/by-id").glob(f"*[Qq]uectel*-if{interface}*")):
+        for link in _entries(roots.dev / "serial/by-id", f"*[Qq]uectel*-if{interface}*"):
             if link.exists():
                 usb = _usb_of(link.resolve().name, roots)
                 found.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
     known = {port.device for port in found}
-    ttys = sorted((roots.sys / "class/tty").glob("ttyUSB*"), key=lambda p: (len(p.name), p.name))
+    ttys = sorted(_entries(roots.sys / "class/tty", "ttyUSB*"), key=lambda p: (len(p.name), p.name))
     for interface in AT_INTERFACES:
         for tty in ttys:
             usb = _usb_of(tty.name, roots)
@@ -137,8 +147,8 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     usb = _usb_of(path.resolve().name, roots) or _usb_of(path.name, roots)
     interface, product = (usb[1], usb[0]) if usb else (None, None)
     by_id = roots.dev / "serial/by-id"
-    if path.parent == roots.dev and by_id.is_dir():
-        for link in sorted(by_id.iterdir()):
+    if path.parent == roots.dev:
+        for link in _entries(by_id, "*"):
             if link.resolve() == path.resolve():
                 return PortInfo(link, path.resolve(), "by-id", interface, product)
     return PortInfo(path, path.resolve(), "given", interface, product)
@@ -165,11 +175,21 @@ def holders(path: Path) -> list[Holder]:
     return sorted(found.values(), key=lambda h: h.pid)
 
 
+def modem_manager() -> Holder | None:
+    """ModemManager if it runs; its name can be seen even where its open files cannot."""
+    for process in Path("/proc").iterdir():
+        if process.name.isdigit():
+            with contextlib.suppress(OSError):
+                if (process / "comm").read_text().strip() == "ModemManager":
+                    return Holder(int(process.name), "ModemManager")
+    return None
+
+
 def _busy(path: Path, others: list[Holder]) -> InputError:
     who = ", ".join(f"{h.name} (process {h.pid})" for h in others[:4]) or "a process that we may not look at"
     if len(others) > 4:
         who += f" and {len(others) - 4} more"
-    if any(h.name.startswith("ModemManager") for h in others):
+    if any(h.name == "ModemManager" for h in others) or (not others and modem_manager()):
         cause = (
             "ModemManager took it. Free it now with 'sudo systemctl stop ModemManager', for good with the udev rule "
             'ATTRS{idVendor}=="2c7c", ENV{ID_MM_DEVICE_IGNORE}="1"'

@@ -32,10 +32,10 @@ class PredictionWorker:
         self._thread = threading.Thread(target=self._run, name="tap-prediction", daemon=True)
         self._thread.start()
 
-    def ask(self, utc_ns: int, number: int, measured: int | None) -> None:
-        """Want the prediction for the answer with this record number."""
+    def ask(self, utc_ns: int, sent_utc_ns: int, measured: int | None) -> None:
+        """Want the prediction for the answer to the command sent then."""
         try:
-            self._wanted.put_nowait((utc_ns, number, measured))
+            self._wanted.put_nowait((utc_ns, sent_utc_ns, measured))
         except queue.Full:
             self.skipped += 1
 
@@ -56,8 +56,13 @@ class PredictionWorker:
 
     def _run(self) -> None:
         while (item := self._wanted.get()) is not None:
-            utc_ns, number, measured = item
-            result: dict[str, Any] = {"for_n": number, "at_utc_ns": utc_ns, "measured": measured, "predicted": None}
+            utc_ns, sent_utc_ns, measured = item
+            result: dict[str, Any] = {
+                "for_sent_utc_ns": sent_utc_ns,
+                "at_utc_ns": utc_ns,
+                "measured": measured,
+                "predicted": None,
+            }
             try:
                 predicted = self._predict(utc_ns)
                 result["predicted"] = None if predicted is None else int(predicted)

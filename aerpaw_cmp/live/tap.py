@@ -1,8 +1,8 @@
 """The tap: polls the modem, writes every answer down, survives what happens in a field.
 
-One thread, one command in flight. A record is in the kernel's hands before the next command goes out. The port may
-vanish and come back under another number, the disk may fill, the clock may step, signals may come: each leaves its
-own record, and the polling goes on.
+One polling thread, one command in flight. A record is in the kernel's hands before the next command goes out, unless
+the disk stalls (:mod:`~aerpaw_cmp.live.writer`). The port may vanish and come back under another number, the disk may
+fill, the clock may step, signals may come: each leaves its own record, and the polling goes on.
 """
 
 from __future__ import annotations
@@ -23,11 +23,13 @@ from ..errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
-from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port
+from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
 from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .stop import Stop
+from .teller import Teller
+from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
 
@@ -68,14 +70,14 @@ class Tap:
         clock: Clock | None = None,
     ) -> None:
         self._settings = settings
-        self._on_status = on_status
+        self._teller = None if on_status is None else Teller(on_status)
         self._stop = stop
         self._clock = clock or Clock()
         self._worker = None if predict is None else PredictionWorker(predict)
         self._session = uuid.uuid4().hex
         self._framer = Framer()
         self._redactor = Redactor()
-        self._log = SegmentLog(settings.folder, self._header, settings.log, self._clock, self._say)
+        self._log = LogWriter(SegmentLog(settings.folder, self._header, settings.log, self._clock))
         periods = {RI_QUERY: int(1e9 / settings.ri_hz)}
         if settings.other_hz > 0:
             periods |= {name: int(1e9 / settings.other_hz) for name in settings.queries}
@@ -108,8 +110,7 @@ class Tap:
         try:
             self._first_connection()
         except BaseException:
-            if self._worker is not None:
-                self._worker.close()
+            self._close_helpers()
             raise
         try:
             if not self._stop.count:
@@ -120,10 +121,18 @@ class Tap:
                 self._early.clear()
                 if clock_synchronised() is False:
                     self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
+                if modem_manager() and self._info is not None and self._info.how != "given":
+                    self._say("ModemManager runs and may take the port when the modem comes back; see docs/tap.md")
                 self._poll_until_stopped()
         finally:
             summary = self._finish()
         return summary
+
+    def _close_helpers(self) -> None:
+        if self._worker is not None:
+            self._worker.close()
+        if self._teller is not None:
+            self._teller.close()
 
     def _first_connection(self) -> None:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
@@ -175,9 +184,7 @@ class Tap:
             self._advise(decoded)
 
     def _finish(self) -> TapSummary:
-        if self._port is not None and self._csi_changed and self._csi_before is not None and self._stop.count < 2:
-            with contextlib.suppress(PortGoneError):
-                self._exchange("csi_ctrl", csi_write(*self._csi_before))
+        restored = self._restore_csi()
         self._close_port()
         if self._gap_open is not None:
             self._close_gap("the session ended in the gap")
@@ -198,15 +205,20 @@ class Tap:
             "gap_s": self._gap_ns / 1e9,
             "duration_s": duration_s,
             "redacted": self._redactor.count,
+            "csi_restored": restored,
             **self._now(),
         }
         if self._log_open:
             self._log.append(record)
             self._log.close()
+            for text in self._log.messages():
+                self._say(text)
+        if self._teller is not None:
+            self._teller.close()
         return TapSummary(
             reason=record["reason"],
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
-            segments=tuple(self._log.paths),
+            segments=self._log.paths,
             answers=answers,
             rates_hz=rates,
             missed=record["missed"],
@@ -218,6 +230,19 @@ class Tap:
             redacted=self._redactor.count,
             alarms=self._alarms,
         )
+
+    def _restore_csi(self) -> bool | None:
+        """Put CSI reporting back as it was; None if it was not changed."""
+        if not self._csi_changed:
+            return None
+        answer = None
+        if self._port is not None and self._csi_before is not None and self._stop.count < 2:
+            with contextlib.suppress(PortGoneError):
+                answer, _ = self._exchange("csi_ctrl", csi_write(*self._csi_before))
+        if answer is not None and answer.status == "ok":
+            return True
+        self._say("CSI reporting stays on: the modem could not be asked to switch it back")
+        return False
 
     # the port ---------------------------------------------------------------------------------------------
 
@@ -466,7 +491,7 @@ class Tap:
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(middle, record.get("n", -1), decoded.values.get("rank"))
+                    self._worker.ask(middle, record["sent_utc_ns"], decoded.values.get("rank"))
             elif answer.status in ("error", "cme"):
                 self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":
@@ -517,7 +542,8 @@ class Tap:
         """Regular duties: clock, disk, alarm, status, end of the set time."""
         now = self._clock.mono_ns()
         if self._log_open:
-            self._log.tick()
+            for text in self._log.messages():
+                self._say(text)
             self._log_predictions()
         offset = self._clock.utc_ns() - now
         if abs(offset - self._offset_ns) > CLOCK_STEP_NS:
@@ -552,7 +578,7 @@ class Tap:
     def _flush_noise(self) -> None:
         if self._noise["not_kept"]:
             self._record(
-                {"kind": "noise", "lines": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
+                {"kind": "noise", "count": self._noise["not_kept"], "bytes": self._noise["bytes"], **self._now()}
             )
         self._noise.clear()
 
@@ -576,7 +602,7 @@ class Tap:
         self._show(self._redactor.clean(text))
 
     def _show(self, message: str) -> None:
-        if self._on_status is None:
+        if self._teller is None:
             return
         now = self._clock.mono_ns()
         while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
@@ -592,17 +618,14 @@ class Tap:
             gaps=self._gaps,
             records=self._log.records,
             bytes_written=self._log.bytes_written,
-            disk_free_bytes=self._log.free_bytes(),
+            disk_free_bytes=self._log.free_bytes,
             missed=sum(self._schedule.missed.values()),
             predicted_rank=self._last["predicted"],
             predicts=self._worker is not None,
             alarm=self._alarm,
             message=message,
         )
-        try:
-            self._on_status(status)
-        except Exception:
-            self._on_status = None  # a broken terminal must not end the log
+        self._teller.tell(status)
 
     def _record(self, record: Record) -> None:
         if self._log_open:

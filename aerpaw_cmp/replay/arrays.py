@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..site.antennas import Isotropic
+from ..site.antennas import Isotropic as Isotropic
 from ..units import ComplexArray, FloatArray
 
 

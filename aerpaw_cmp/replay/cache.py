@@ -24,7 +24,7 @@ from .paths import PathSet
 if TYPE_CHECKING:
     from .replay import Scene, Settings
 
-LAYOUT = 1
+LAYOUT = 2
 """Raised whenever the entries or the search change."""
 
 _COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
@@ -59,17 +59,17 @@ class PathCache:
             digest.update(str(column.shape).encode() + np.ascontiguousarray(column).tobytes())
         return digest.hexdigest()
 
-    def load(self, key: str) -> PathSet | None:
-        """The entry, or None when it is missing or damaged."""
+    def load(self, key: str) -> tuple[PathSet, float] | None:
+        """Paths and the seconds that their search took; None when the entry is missing or damaged."""
         try:
             # in memory first: np.load leaves a damaged file open
             data = io.BytesIO((self.folder / f"{key}.npz").read_bytes())
             with np.load(data, allow_pickle=False) as entry:
-                return PathSet(*(entry[name] for name in _COLUMNS))
+                return PathSet(*(entry[name] for name in _COLUMNS)), float(entry["seconds"])
         except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
             return None
 
-    def save(self, key: str, paths: PathSet) -> None:
+    def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
@@ -77,5 +77,5 @@ class PathCache:
         except OSError:
             return  # a cache that cannot be written is no reason to fail
         with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, **{column: getattr(paths, column) for column in _COLUMNS})
+            np.savez(stream, seconds=seconds, **{column: getattr(paths, column) for column in _COLUMNS})
         Path(name).replace(self.folder / f"{key}.npz")

@@ -62,7 +62,6 @@ def channel_matrices(
     Parameters
     ----------
     paths : PathSet
-        Sorted by pose and tower.
     faces : Faces
         That the paths refer to.
     sources_m : (towers, 3)
@@ -121,6 +120,7 @@ def _chunks(paths: PathSet, towers: int, pairs: int) -> Iterator[tuple[IntArray,
     step = max(1, PAIRS_PER_CHUNK // pairs)
     for tower in range(towers):
         rows = np.flatnonzero(paths.tower == tower)
+        rows = rows[np.argsort(paths.pose[rows], kind="stable")]  # links are summed as runs of equal poses
         for start in range(0, len(rows), step):
             yield rows[start : start + step], tower
 

@@ -256,8 +256,8 @@ def _paths_of_level(
         for start in range(0, len(level.faces), sequence_step):
             part = slice(start, start + sequence_step)
             if depth:
-                row, column = _meets_last_face(
-                    faces, level.faces[part, -1], level.images_m[part, -1], targets[some], hiding
+                row, column = meets_last_face(
+                    faces, level.faces[part, -1], level.images_m[part, -1], targets[some], hiding.tolerance_m
                 )
             else:
                 row, column = np.zeros(len(some), np.int64), np.arange(len(some))
@@ -269,15 +269,14 @@ def _paths_of_level(
     return merge(pieces, max_depth, None)
 
 
-def _meets_last_face(
-    faces: Faces, last: IntArray, image: FloatArray, targets: FloatArray, hiding: Occlusion
+def meets_last_face(
+    faces: Faces, last: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray]:
     """(sequence, target) pairs whose line from the last image meets the bounds of the last face.
 
     The in-plane coordinates of the meeting point are linear in those of the target, which are shared by all
     sequences that end on the face.
     """
-    tolerance_m = hiding.tolerance_m
     used, position = np.unique(last, return_inverse=True)
     height = (faces.normal[used] @ targets.T - faces.offset_m[used, None])[position]
     below = np.einsum("ij,ij->i", faces.normal[last], image) - faces.offset_m[last]

@@ -1,10 +1,11 @@
 """Leave out face sequences that provably cannot change RSS by more than a stated amount.
 
 The field of a path over ``L`` metres is at most ``g_tower g_uav lambda / (4 pi L)``, with ``g`` the largest
-amplitude of an element's pattern, since no reflection gains. If the sequences left out of a link could together add at
-most ``B``, and what was kept gives ``F`` (the root mean square over element pairs), then the RSS of that link moves by
-less than ``relevance_db`` whenever ``B <= F (1 - 10^(-relevance_db / 20))``. This is checked link by link after the
-search; poses with a link that fails (fades, hidden poses) are searched again with everything. Nothing is guessed.
+amplitude of an element's pattern, since no reflection gains. Which paths a link could have is known from the geometry,
+short of what hides them. If those left out could together add at most ``B``, and what was kept gives ``F`` (the root
+mean square over element pairs), then the RSS of that link moves by less than ``relevance_db`` whenever
+``B <= F (1 - 10^(-relevance_db / 20))``. This is checked link by link after the search; poses with a link that fails
+(fades, hidden poses) are searched again with everything. Nothing is guessed.
 
 Only mirrors are left out: every face goes on hiding what lies behind it.
 """
@@ -13,14 +14,12 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from itertools import pairwise
 
 import numpy as np
 
 from ..units import BoolArray, FloatArray, IntArray, wavelength_m
 from .arrays import Array, Link
-from .faces import corners
-from .image import Sequences
+from .image import CELLS_PER_CHUNK, Sequences, meets_last_face, scene_tolerance_m, trace_back
 from .paths import Faces
 
 FAILING_SHARE = 0.05
@@ -58,7 +57,7 @@ class Relevance:
 
     def __post_init__(self) -> None:
         arrays = list(self.link.tower_arrays.values())
-        self.bound = np.zeros(len(arrays))
+        self.bound = np.zeros((len(self.targets_m), len(arrays)))
         self.counts = [(0, 0)] * len(arrays)
         self.used = [np.zeros(len(self.faces), dtype=np.bool_) for _ in arrays]
         self._gain = largest_amplitude(self.link.uav_array) * np.array([largest_amplitude(a) for a in arrays])
@@ -71,53 +70,69 @@ class Relevance:
         return float(1.0 - 10.0 ** (-self.relevance_db / 20.0))
 
     def __call__(self, tower: int, levels: list[Sequences]) -> list[Sequences]:
-        """Drop the weakest sequences while their sum stays below what all but a few links bear."""
-        field_ = self.kept_field[:, tower]
-        bearable = self.allowed_share * float(np.quantile(field_, FAILING_SHARE)) if len(field_) else 0.0
-        bounds = [self._bounds(tower, level) for level in levels]
-        flat = np.concatenate(bounds)
-        order = np.argsort(flat)
-        dropped = np.zeros(len(flat), dtype=np.bool_)
-        sums = np.cumsum(flat[order])
-        dropped[order[sums <= bearable]] = True
-        self.bound[tower] = float(flat[dropped].sum())
-        self.counts[tower] = (int(dropped.sum()), len(flat))
-        result: list[Sequences] = []
-        start = 0
-        for level, bound in zip(levels, bounds, strict=True):
-            keep = ~dropped[start : start + len(bound)]
-            start += len(bound)
-            result.append(Sequences(level.faces[keep], level.images_m[keep]))
-            self.used[tower][np.unique(level.faces[keep])] = True
-        return result
-
-    def _bounds(self, tower: int, level: Sequences) -> FloatArray:
-        """Largest field (sequences,) of each sequence at any pose; infinite for those that are always kept."""
-        count, depth = level.faces.shape
-        always = (self.faces.solid[level.faces] < 0).all(axis=1)
-        if not depth or not len(self.targets_m):
-            return np.full(count, np.inf)
-        low, high = self.targets_m.min(axis=0), self.targets_m.max(axis=0)
-        image, last = level.images_m[:, -1], level.faces[:, -1]
-        straight = _box_gap(low, high, image, image)
-        box = corners(self.faces, 1e9)
-        face_low, face_high = box.min(axis=1), box.max(axis=1)
-        onward = _box_gap(low, high, face_low[last], face_high[last])
-        # the line from the image to the pose passes through the last face; each leg is as long as its faces are apart
-        length = np.maximum(straight, _face_distance(self.faces, last, image) + onward)
-        first, source = level.faces[:, 0], _mirrored(self.faces, level.faces[:, 0], level.images_m[:, 0])
-        legs = _face_distance(self.faces, first, source) + onward
-        for one, two in pairwise(level.faces.T):
-            legs += _box_gap(face_low[one], face_high[one], face_low[two], face_high[two])
-        length = np.maximum(length, legs)
-        length = np.maximum(length - self._extent_m[tower], 0.0)
+        """Drop the weakest sequences while all but a few links bear their sum."""
+        bearable = self.allowed_share * self.kept_field[:, tower]
+        most = FAILING_SHARE * np.count_nonzero(bearable)
+        parts = [self._bounds(tower, level) for level in levels]
+        start = np.cumsum([0, *(len(level.faces) for level in levels)])
+        sequence = np.concatenate([part[0] + first for part, first in zip(parts, start, strict=False)])
+        pose, field_ = (np.concatenate([part[k] for part in parts]) for k in (1, 2))
         with np.errstate(divide="ignore"):
-            amplitude = np.minimum(1.0, wavelength_m(self.link.carrier_hz) / (4.0 * np.pi * length))
-        return np.asarray(np.where(always, np.inf, amplitude * self._gain[tower]))
+            harm = field_ / bearable[pose]
+        worst = np.zeros(start[-1])
+        np.maximum.at(worst, sequence, np.where(np.isfinite(harm), harm, 0.0))
+        always = np.concatenate([(self.faces.solid[level.faces] < 0).all(axis=1) for level in levels])
+        dropped = np.zeros(start[-1], dtype=np.bool_)
+        order = np.argsort(sequence, kind="stable")
+        edges = np.searchsorted(sequence[order], np.arange(start[-1] + 1))
+        total = np.zeros(len(self.targets_m))
+        for number in np.argsort(worst, kind="stable"):
+            if always[number]:
+                continue
+            mine = order[edges[number] : edges[number + 1]]
+            more = total.copy()
+            np.add.at(more, pose[mine], field_[mine])
+            if np.count_nonzero((more > bearable) & (bearable > 0.0)) > most:
+                break
+            total, dropped[number] = more, True
+        self.bound[:, tower] = total
+        self.counts[tower] = (int(dropped.sum()), len(dropped))
+        kept = []
+        for level, first, last in zip(levels, start[:-1], start[1:], strict=True):
+            keep = ~dropped[first:last]
+            kept.append(Sequences(level.faces[keep], level.images_m[keep]))
+            self.used[tower][np.unique(level.faces[keep])] = True
+        return kept
+
+    def _bounds(self, tower: int, level: Sequences) -> tuple[IntArray, IntArray, FloatArray]:
+        """(sequence, pose, largest field) of all paths that would be there if nothing hid them."""
+        rows: list[IntArray] = []
+        columns: list[IntArray] = []
+        if level.faces.shape[1]:
+            tolerance_m = scene_tolerance_m(self.faces, self.targets_m)
+            step = max(1, CELLS_PER_CHUNK // max(1, len(self.targets_m)))
+            for first in range(0, len(level.faces), step):
+                part = slice(first, first + step)
+                row, column = meets_last_face(
+                    self.faces, level.faces[part, -1], level.images_m[part, -1], self.targets_m, tolerance_m
+                )
+                _, good = trace_back(
+                    self.faces, level.faces[part][row], level.images_m[part][row], self.targets_m[column], tolerance_m
+                )
+                rows.append(row[good] + first)
+                columns.append(column[good])
+        empty = np.zeros(0, dtype=np.int64)
+        row, column = (np.concatenate(x) if x else empty for x in (rows, columns))
+        if not len(row):
+            return empty, empty, np.zeros(0)
+        length = np.linalg.norm(self.targets_m[column] - level.images_m[row, -1], axis=1) - self._extent_m[tower]
+        with np.errstate(divide="ignore"):
+            amplitude = np.minimum(1.0, wavelength_m(self.link.carrier_hz) / (4.0 * np.pi * np.maximum(length, 0.0)))
+        return row, column, np.asarray(amplitude * self._gain[tower])
 
     def failing(self, field_: FloatArray) -> BoolArray:
         """Poses (poses,) with a link whose kept field (poses, towers) does not bear what was left out."""
-        return np.asarray((self.bound[None, :] > self.allowed_share * field_).any(axis=1))
+        return np.asarray((self.bound > self.allowed_share * field_).any(axis=1))
 
     def report(self, towers: Sequence[str], searched_again: int, poses: int) -> list[str]:
         """What was left out, in words."""
@@ -135,25 +150,6 @@ class Relevance:
                 lines.append(f"{label}: reflects nothing that matters; it still hides")
         lines.append(f"{searched_again} of {poses} poses were searched again with every sequence")
         return lines
-
-
-def _mirrored(faces: Faces, index: IntArray, point: FloatArray) -> FloatArray:
-    """Points (n, 3) mirrored at their faces."""
-    height = np.einsum("ij,ij->i", faces.normal[index], point) - faces.offset_m[index]
-    return np.asarray(point - 2.0 * height[:, None] * faces.normal[index])
-
-
-def _box_gap(low: FloatArray, high: FloatArray, other_low: FloatArray, other_high: FloatArray) -> FloatArray:
-    """Distance (n,) of axis-parallel boxes (3,) or (n, 3) from others (n, 3)."""
-    return np.asarray(np.linalg.norm(np.maximum(np.maximum(low - other_high, other_low - high), 0.0), axis=1))
-
-
-def _face_distance(faces: Faces, index: IntArray, point: FloatArray) -> FloatArray:
-    """Distance (n,) of points (n, 3) from the bounds of their faces."""
-    height = np.einsum("ij,ij->i", faces.normal[index], point) - faces.offset_m[index]
-    plane = np.stack([np.einsum("ij,ij->i", axis[index], point) for axis in (faces.along, faces.across)], axis=1)
-    beside = np.maximum(np.maximum(faces.lower[index] - plane, plane - faces.upper[index]), 0.0)
-    return np.asarray(np.sqrt(height**2 + (beside**2).sum(axis=1)))
 
 
 def largest_amplitude(array: Array) -> float:

@@ -43,14 +43,16 @@ class Replay:
     paths : PathSet
     faces : Faces
     seconds : float
-        Of path search and fields.
+        Of this call: path search (or reading the cache) and fields.
     search_seconds : float
-        Of the path search alone; nearly zero when the paths came from the cache.
+        Of the path search alone, when it was made: an entry of the cache remembers it.
     engine : str
     left_out : list of str
         What was not modelled, for the report.
     towers : tuple of str
         Order of the tower axis.
+    from_cache : bool
+        Nothing was searched.
     """
 
     rss_dbm: FloatArray
@@ -64,6 +66,7 @@ class Replay:
     engine: str
     towers: tuple[str, ...]
     left_out: list[str] = field(default_factory=list)
+    from_cache: bool = False
 
 
 def replay(
@@ -120,23 +123,30 @@ def replay(
     UsageError
         Unknown tower or engine, a scene too large for ``image``, ``relevance_db`` with ``sionna``.
     """
+    if engine not in ("image", "sionna"):
+        raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
     started = time.perf_counter()
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
+    left_out += _buried_towers(site, link)
     settings = Settings(engine, max_depth, samples, batch, variant)
-    if relevance_db is None:
-        paths = _search(scene, link, poses, settings, _cache(engine, cache_dir), progress)
-    elif engine == "image":
+    if relevance_db is not None:
         paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
         left_out += idle
+        search_seconds, from_cache = time.perf_counter() - started, False
     else:
-        raise UsageError(
-            "relevance_db with the sionna engine",
-            expected="engine 'image'",
-            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
-        )
-    searched = time.perf_counter()
-    return _evaluate(scene, link, poses, paths, engine, loss, left_out, started, searched)
+        cache = _cache(engine, cache_dir)
+        paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+    paths, blocked = _above_terrain(site, scene, poses, paths)
+    left_out += blocked
+    result = _evaluate(scene, link, poses, paths, engine, loss)
+    return replace(
+        result,
+        seconds=time.perf_counter() - started,
+        search_seconds=search_seconds,
+        left_out=left_out,
+        from_cache=from_cache,
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -193,6 +203,16 @@ class Scene:
         return cls(faces, sources, usable, excluded)
 
 
+def _buried_towers(site: Site, link: Link) -> list[str]:
+    """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
+    lines = []
+    for name in link.tower_arrays:
+        for building in site.buildings:
+            if inside_solids(replace(site, buildings=(building,)), site.towers[name].position_m[None]).any():
+                lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
+    return lines
+
+
 def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
     """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
     good = np.isfinite(poses.position_m).all(axis=1)
@@ -210,6 +230,12 @@ def _search_relevant(
     progress: Callable[[float], None] | None,
 ) -> tuple[PathSet, list[str]]:
     """Paths without the sequences that cannot matter; poses at which they might are searched with all."""
+    if settings.engine != "image":
+        raise UsageError(
+            "relevance_db with the sionna engine",
+            expected="engine 'image'",
+            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
+        )
     if not relevance_db > 0.0:
         raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
 
@@ -217,7 +243,7 @@ def _search_relevant(
         return np.sqrt(mean_pair_power(channel_matrices(paths, scene.faces, scene.sources_m, poses, link).h))
 
     ground = replace(scene, usable=scene.usable & (scene.faces.solid < 0))
-    kept = field_of(_search(ground, link, poses, settings, None, None))
+    kept = field_of(_search(ground, link, poses, settings, None))
     known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
     chooser = Relevance(scene.faces, poses.position_m[known], link, relevance_db, kept[known])
     paths = image.find_paths(
@@ -234,9 +260,30 @@ def _search_relevant(
     again[known] = chooser.failing(field_of(paths)[known])
     if again.any():
         all_of_them = replace(scene, excluded=scene.excluded | ~again)
-        full = _search(all_of_them, link, poses, settings, None, None)
+        full = _search(all_of_them, link, poses, settings, None)
         paths = image.merge([paths.select(~again[paths.pose]), full], settings.max_depth, None)
     return paths, chooser.report(tuple(link.tower_arrays), int(again.sum()), len(known))
+
+
+def _search_or_read(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    cache: PathCache | None,
+    progress: Callable[[float], None] | None,
+) -> tuple[PathSet, float, bool]:
+    """Paths, the seconds of their search, and whether they were read from the cache."""
+    key = cache.key(scene, poses.position_m, link.carrier_hz, settings) if cache else ""
+    kept = cache.load(key) if cache else None
+    if kept:
+        return *kept, True
+    started = time.perf_counter()
+    paths = _search(scene, link, poses, settings, progress)
+    seconds = time.perf_counter() - started
+    if cache:
+        cache.save(key, paths, seconds)
+    return paths, seconds, False
 
 
 def _search(
@@ -244,20 +291,11 @@ def _search(
     link: Link,
     poses: Poses,
     settings: Settings,
-    cache: PathCache | None,
     progress: Callable[[float], None] | None,
 ) -> PathSet:
-    """Paths, from the cache when it has them."""
-    if settings.engine not in ("image", "sionna"):
-        raise UsageError(f"unknown engine {settings.engine!r}", expected="'image' or 'sionna'")
-    key = ""
-    if cache is not None:
-        key = cache.key(scene, poses.position_m, link.carrier_hz, settings)
-        kept = cache.load(key)
-        if kept is not None:
-            return kept
+    """Paths by the engine that the settings name."""
     if settings.engine == "image":
-        paths = image.find_paths(
+        return image.find_paths(
             scene.faces,
             scene.sources_m,
             poses.position_m,
@@ -266,25 +304,21 @@ def _search(
             excluded=scene.excluded,
             progress=progress,
         )
-    else:
-        from . import sionna
+    from . import sionna
 
-        paths = sionna.find_paths(
-            scene.faces,
-            scene.sources_m,
-            poses.position_m,
-            carrier_hz=link.carrier_hz,
-            max_depth=settings.max_depth,
-            samples=settings.samples,
-            batch=settings.batch,
-            usable=scene.usable,
-            excluded=scene.excluded,
-            variant=settings.variant,
-            progress=progress,
-        )
-    if cache is not None:
-        cache.save(key, paths)
-    return paths
+    return sionna.find_paths(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        carrier_hz=link.carrier_hz,
+        max_depth=settings.max_depth,
+        samples=settings.samples,
+        batch=settings.batch,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        variant=settings.variant,
+        progress=progress,
+    )
 
 
 def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
@@ -295,17 +329,36 @@ def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
     return PathCache(Path(cache_dir)) if str(cache_dir) else None
 
 
-def _evaluate(
-    scene: Scene,
-    link: Link,
-    poses: Poses,
-    paths: PathSet,
-    engine: str,
-    loss: Loss | None,
-    left_out: list[str],
-    started: float,
-    searched: float,
-) -> Replay:
+def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tuple[PathSet, list[str]]:
+    """Paths that the site's elevation model lets through.
+
+    The traced ground is a plane per tower; the terrain only blocks. It is asked on the direct line between the ends,
+    whose shadow a ground reflection shares; a path over walls alone is asked on each of its segments.
+    """
+    if site.dem is None or len(paths) == 0:
+        return paths, []
+    source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
+    ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
+    over_ground = ground[paths.faces].any(axis=1)
+    straight = (paths.depth == 0) | over_ground
+    clear = np.ones(len(paths), dtype=np.bool_)
+    clear[straight] = site.dem.clear(source[straight], target[straight])
+    rows = np.flatnonzero(~straight)
+    start = source[rows]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        last = step == paths.vertices_m.shape[1]
+        corner = target[rows] if last else paths.vertices_m[rows, step]
+        end = np.where(np.isfinite(corner), corner, target[rows])
+        clear[rows] &= site.dem.clear(start, end)
+        start = end
+    lost = int((~clear).sum())
+    return paths.select(clear), [
+        f"{lost} of {len(paths)} paths end at the terrain of the elevation model"
+    ] if lost else []
+
+
+def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None) -> Replay:
+    """Fields of the paths; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
@@ -318,9 +371,8 @@ def _evaluate(
         has_path=has_path,
         paths=paths,
         faces=scene.faces,
-        seconds=time.perf_counter() - started,
-        search_seconds=searched - started,
+        seconds=0.0,
+        search_seconds=0.0,
         engine=engine,
         towers=tuple(link.tower_arrays),
-        left_out=left_out,
     )

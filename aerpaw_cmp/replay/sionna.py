@@ -57,17 +57,23 @@ def load_variant(prefer: str | None = None) -> str:
     CheckError
         If no LLVM serves.
     """
+    kinds = (prefer,) if prefer else ("cuda", "llvm")
+    without_llvm: CheckError | None = None
+    if "llvm" in kinds:
+        try:
+            prepare_llvm()  # before Dr.Jit looks for one by itself
+        except CheckError as error:
+            without_llvm = error  # a GPU may do without
     import mitsuba as mi
 
     current = mi.variant()
-    kinds = (prefer,) if prefer else ("cuda", "llvm")
     if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
         return str(current)
     import drjit as dr
 
     for kind in kinds:
-        if kind == "llvm":
-            prepare_llvm()  # before Dr.Jit looks for one by itself
+        if kind == "llvm" and without_llvm:
+            raise without_llvm
         if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
             mi.set_variant(f"{kind}_ad_mono_polarized")
             return str(mi.variant())

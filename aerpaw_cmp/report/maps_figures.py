@@ -164,7 +164,9 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
     options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
     if layers[0].difference:
-        reach = max(abs(low), abs(high), 1e-9)
+        reach = max(abs(low), abs(high))
+        if reach < 1e-6:  # few positions change: their own range
+            reach = max(float(np.abs(finite).max(initial=0.0)), 1e-6)
         options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
     image = None
     for ax, one in zip(axes, layers, strict=True):
@@ -229,10 +231,14 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
 
 
 def correlations(curves: Sequence[Correlation]) -> Figure:
-    """Correlation against distance and its model, a panel per kind."""
-    fig = figure((9.2, 3.2))
-    axes = fig.subplots(1, len(curves), squeeze=False)[0]
-    for ax, curve in zip(axes, curves, strict=True):
+    """Correlation against distance and its model, a panel per kind, at most three in a row."""
+    columns = min(len(curves), 3)
+    rows = -(-len(curves) // columns)
+    fig = figure((9.2, 0.2 + 3.0 * rows))
+    axes = fig.subplots(rows, columns, squeeze=False).ravel()
+    for ax in axes[len(curves) :]:
+        ax.set_visible(False)
+    for ax, curve in zip(axes[: len(curves)], curves, strict=True):
         ax.plot(
             curve.distance_m, curve.correlation, marker="o", markersize=5, linestyle="none", color="#0072B2",
             label="data",
@@ -351,7 +357,7 @@ def _rank_plates(data: MapsData) -> list[Plate]:
         words = f", foliage {foliage}" if foliage else ""
         result.append(
             Plate(
-                name=f"rank_share{safe_name(words) if words else ''}",
+                name=f"rank_share{f'_{safe_name(words)}' if words else ''}",
                 section="rank",
                 title=f"Rank against height{words}",
                 caption="Share of positions with each rank; Z is out of coverage.",

@@ -200,6 +200,37 @@ def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_pat
         process.wait()
 
 
+@pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
+def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem, tmp_path):
+    import fcntl
+    import termios
+
+    sim = modem()
+    program = tmp_path / "ModemManager"
+    program.write_bytes(Path(os.path.realpath("/bin/sleep")).read_bytes())
+    program.chmod(0o755)
+    sim.node.chmod(0o666)
+    code = (
+        "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
+        "from aerpaw_cmp.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
+        "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
+    with sim.node.open("rb", buffering=0) as node:
+        fcntl.ioctl(node, termios.TIOCEXCL)  # as ModemManager does
+        process = subprocess.Popen([program, "30"], stdin=node)
+        try:
+            done = subprocess.run(
+                [sys.executable, "-c", code, sim.node], env=environment, text=True, capture_output=True, check=False
+            )
+        finally:
+            process.kill()
+            process.wait()
+    assert done.returncode == 3, done.stderr
+    assert "a process that we may not look at" in done.stdout
+    assert "systemctl stop ModemManager" in done.stdout
+
+
 def test_ten_megabyte_line(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, huge_line_every=20))
     session = tap(sim.port, answer_timeout_s=5.0)
@@ -223,7 +254,7 @@ def test_rubbish_without_end_is_counted_not_kept(modem, tap, tools, tmp_path):
     session.end()
     records, _ = tools.records_of(tmp_path / "log")
     kept = sum(r["kind"] == "unsolicited" and r["lines"] == ["junk"] for r in records)
-    counted = sum(r["lines"] for r in records if r["kind"] == "noise")
+    counted = sum(r["count"] for r in records if r["kind"] == "noise")
     assert kept <= 200
     assert kept + counted == 5000
 

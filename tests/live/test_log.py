@@ -26,6 +26,7 @@ from aerpaw_cmp.live.log import (
     encode_record,
     read_log,
 )
+from aerpaw_cmp.live.writer import LogWriter
 from aerpaw_cmp.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 
@@ -213,6 +214,57 @@ def test_a_sync_that_fails_beside_the_polling_is_told_at_the_next_record(tmp_pat
     assert "failing disk or card" in said[0]
     assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == list(range(i + 1))
     assert sum(r["kind"] == "disk" for r in read_log(tmp_path)) == 1
+
+
+def test_a_disk_that_stalls_does_not_hold_the_polling(tmp_path, monkeypatch):
+    real, hang, written = os.write, threading.Event(), threading.Event()
+
+    def stalling(fd, data):
+        if threading.current_thread().name == "tap-log" and b'"i":3' in data:
+            written.set()
+            hang.wait(30)
+        return real(fd, data)
+
+    writer = LogWriter(SegmentLog(tmp_path, header, LogSettings(patience_s=0.2, backlog_records=40)))
+    writer.open()
+    assert all(writer.append({"kind": "x", "i": i}) for i in range(3))
+    monkeypatch.setattr(log_module.os, "write", stalling)
+    assert not writer.append({"kind": "x", "i": 3})  # waited for, in vain
+    assert written.is_set()
+    assert not any(writer.append({"kind": "x", "i": i}) for i in range(4, 34))
+    hang.set()
+    until = time.monotonic() + 10
+    while not writer.append({"kind": "y"}):
+        assert time.monotonic() < until
+        time.sleep(0.01)
+    writer.close()
+    assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == list(range(34))
+    assert writer.lost == 0
+
+
+def test_a_stall_beyond_memory_is_counted(tmp_path, monkeypatch):
+    real, hang = os.write, threading.Event()
+    monkeypatch.setattr(log_module.os, "write", lambda fd, data: (b'"i"' in data and hang.wait(30), real(fd, data))[1])
+    writer = LogWriter(SegmentLog(tmp_path, header, LogSettings(patience_s=0.05, backlog_records=10)))
+    writer.open()
+    for i in range(31):
+        writer.append({"kind": "x", "i": i})
+    hang.set()
+    writer.close()
+    kept = [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"]
+    assert kept == [0, *range(21, 31)]
+    assert writer.lost == 20
+
+
+def test_a_record_that_cannot_be_written_does_not_end_the_log(tmp_path):
+    writer = LogWriter(SegmentLog(tmp_path, header))
+    writer.open()
+    writer.append({"kind": "x", "bad": {1, 2}})
+    writer.append({"kind": "x", "i": 1})
+    writer.close()
+    assert [r["i"] for r in read_log(tmp_path) if r["kind"] == "x"] == [1]
+    assert "could not be written: TypeError" in writer.messages()[0]
+    assert writer.lost == 1
 
 
 def test_sync_interval(tmp_path, monkeypatch):

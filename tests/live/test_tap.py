@@ -17,7 +17,7 @@ from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.live.log import Clock, LogSettings
 from aerpaw_cmp.live.schedule import Schedule
 from aerpaw_cmp.live.simulator import Faults
-from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status
+from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
 from aerpaw_cmp.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER
 
@@ -148,6 +148,27 @@ def test_unplug_and_back_under_another_number(modem, tap, tools, tmp_path):
     assert {s.lines for s in sim.journal if s.command == CSI and s.read} <= logged
 
 
+def test_the_end_inside_a_gap(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port)
+    session.wait(lambda: len(sim.journal) > 8)
+    sim.unplug()
+    session.wait(lambda: any("lost" in text for text in session.said))
+    summary = session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    assert [r["kind"] for r in records[-2:]] == ["gap", "end"]
+    assert records[-2]["state"] == "closed"
+    assert summary.gap_s > 0
+    assert not session.statuses[-1].connected
+
+
+def test_the_end_before_a_port_came(tap, tmp_path):
+    session = tap(tmp_path / "nothing", wait_for_port_s=60.0)
+    time.sleep(0.3)
+    summary = session.end()
+    assert (summary.exit_code, summary.segments, summary.records) == (0, (), 0)
+
+
 def test_a_reset_modem_is_set_up_again(modem, tap, tools, tmp_path):
     sim = modem(csi_on=False, faults=Faults(latency_s=0.0))
     session = tap(sim.port, enable_csi=True)
@@ -157,6 +178,18 @@ def test_a_reset_modem_is_set_up_again(modem, tap, tools, tmp_path):
     session.wait(lambda: sim.csi == [1, 1])
     session.end()
     assert sim.csi == [0, 0]  # as it was before the tap
+    assert tools.records_of(tmp_path / "log")[0][-1]["csi_restored"] is True
+
+
+def test_csi_that_cannot_be_put_back_is_told(modem, tap, tools, tmp_path):
+    sim = modem(csi_on=False, faults=Faults(latency_s=0.0))
+    session = tap(sim.port, enable_csi=True)
+    session.wait(lambda: sim.csi == [1, 1] and len(sim.journal) > 10)
+    sim.unplug()
+    session.wait(lambda: any("lost" in text for text in session.said))
+    session.end()
+    assert any("CSI reporting stays on" in text for text in session.said)
+    assert tools.records_of(tmp_path / "log")[0][-1]["csi_restored"] is False
 
 
 def test_csi_is_left_alone_without_the_flag(modem, tap, tools, tmp_path):
@@ -306,12 +339,12 @@ def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):
     session.wait(lambda: len(served_and_read(sim, CSI)) >= 12)
     session.end()
     records, _ = tools.records_of(tmp_path / "log")
-    answers = {r["n"]: r for r in records if r["kind"] == "exchange"}
+    answers = {r["sent_utc_ns"]: r for r in records if r["kind"] == "exchange"}
     predictions = [r for r in records if r["kind"] == "prediction"]
     assert len(predictions) >= 5
     assert threads == {"tap-prediction"}
     for r in predictions:
-        assert answers[r["for_n"]]["decoded"]["rank"] == r["measured"] == 3
+        assert answers[r["for_sent_utc_ns"]]["decoded"]["rank"] == r["measured"] == 3
         assert r.get("residual") == (None if r["predicted"] is None else 1)
     assert "predicted" in format_status(session.statuses[-1])
 
@@ -330,14 +363,22 @@ def test_a_failing_prediction_does_not_end_the_log(modem, tap, tools, tmp_path):
 
 
 def test_a_broken_terminal_does_not_end_the_log(modem, tmp_path):
-    from aerpaw_cmp.live.tap import run_tap
-
     def broken(status):
         raise BrokenPipeError
 
     sim = modem(faults=Faults(latency_s=0.0))
     settings = TapSettings(tmp_path / "log", str(sim.port), duration_s=1.0, status_s=0.1)
     assert run_tap(settings, on_status=broken).reason == "duration"
+
+
+def test_a_hanging_terminal_does_not_hold_the_polling(modem, tap, tools, tmp_path):
+    sim = modem(faults=Faults(latency_s=0.0))
+    hang = threading.Event()
+    settings = TapSettings(tmp_path / "log", str(sim.port), ri_hz=20.0, pause_s=0.0, duration_s=2.0, status_s=0.1)
+    summary = run_tap(settings, on_status=lambda _status: hang.wait(60) and None)
+    hang.set()
+    assert summary.reason == "duration"
+    assert len(tools.all_kept(sim, tmp_path / "log")) >= 20
 
 
 def test_replay_of_an_earlier_log(modem, tap, tools, tmp_path):

@@ -200,6 +200,7 @@ def test_tower_inside_a_building_has_no_path(scenes):
     site = scenes.site([Building("barn", box(-10, -10, 10, 10), 12.0)])
     result = replay(site, scenes.link(site), scenes.poses([[40.0, 0.0, 30.0], [2.0, 0.0, 5.0]]))
     assert not result.has_path.any()
+    assert result.left_out == ["LW1: its antenna is inside barn, so it has no path at all"]
 
 
 def test_pose_on_a_wall_on_a_roof_and_on_the_ground(scenes):

@@ -55,7 +55,8 @@ def test_what_is_left_out_still_hides(scenes):
 
 
 def test_poses_in_fades_are_searched_again(scenes):
-    site = scenes.site([FAR], ground_material="metal")  # deep fades
+    tall = Building("far", FAR.footprint, 60.0)
+    site = scenes.site([tall], ground_material="metal")  # deep fades
     poses = scenes.poses(np.column_stack([np.linspace(100, 200, 150), np.zeros(150), np.full(150, 30.0)]))
     link = scenes.link(site)
     reduced = replay(site, link, poses, relevance_db=3.0)

@@ -60,6 +60,9 @@ def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
 
     monkeypatch.setattr("aerpaw_cmp.replay.image.find_paths", fail)
     second = replay(*case, cache_dir=tmp_path)
+    assert second.from_cache
+    assert not first.from_cache
+    assert second.search_seconds == first.search_seconds > 0
     assert (second.h == first.h).all()
     assert (second.paths.faces == first.paths.faces).all()
     # other arrays and attitudes use the same paths

@@ -9,6 +9,7 @@ from shapely.geometry import box
 from aerpaw_cmp.errors import CheckError, UsageError
 from aerpaw_cmp.replay import audit, replay
 from aerpaw_cmp.replay.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.replay.field import mean_pair_power, rss_dbm
 from aerpaw_cmp.replay.replay import Scene
 from aerpaw_cmp.site.site import Building
 from aerpaw_cmp.units import wavelength_m
@@ -110,6 +111,24 @@ def test_h_equals_sionnas_explicit_arrays_at_short_range(sionna, scenes, lone):
     assert np.median(error) < 1e-3
     assert (error < 5e-3).mean() > 0.9
     assert np.unique(ours.paths.depth).tolist() == [0, 1, 2]
+
+
+def test_rss_equals_sionnas_own_to_a_hundredth_of_a_decibel(sionna, scenes, lone):
+    """Isotropic elements, whole attenuation and reflection chain of Sionna on the paths that both have."""
+    site, poses = lone
+    near = scenes.poses(poses.position_m * [0.5, 0.5, 1.0])
+    link = scenes.link(site)
+    ours = replay(site, link, near)
+    scene = Scene.of(site, link, near)
+    h = sionna.own_channels(
+        scene.faces, scene.sources_m, near, link, explicit=False, samples=SAMPLES, batch=BATCH, usable=scene.usable
+    )
+    theirs = rss_dbm(mean_pair_power(h), link.transmit_power_dbm)
+    both = np.isfinite(ours.rss_dbm)
+    assert (np.isfinite(theirs) == both).all()
+    assert np.abs(theirs - ours.rss_dbm)[both].max() < 0.01
+    assert both.sum() > 30
+    assert (np.bincount(ours.paths.pose)[both[:, 0]] > 2).any()
 
 
 def test_plane_waves_make_every_line_of_sight_rank_1(sionna, scenes):

@@ -1,0 +1,108 @@
+"""The commands as a user types them, small: what they print with --json, and what they leave on disk."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.__main__ import main
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "sample_logs"
+
+
+def out_of(capsys: pytest.CaptureFixture[str], *arguments: str, code: int = 0) -> str:
+    capsys.readouterr()
+    assert main([str(a) for a in arguments]) == code, capsys.readouterr().err
+    return capsys.readouterr().out
+
+
+def test_ingest_takes_the_sample_folder(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    flight = tmp_path / "flight.h5"
+    options = ("--timezone", "America/New_York", "-o", flight)
+    summary = json.loads(out_of(capsys, "ingest", SAMPLE, *options, "--json"))
+    assert len(summary["files"]) == 12
+    for file in summary["files"]:
+        assert file["lines"] == file["accepted"] + file["rejected"] + file["blank"]
+        assert set(file["streams"][0]) == {"kind", "name", "rows", "start", "end", "rate_hz"}
+    assert {Path(s["path"]).name for s in summary["skipped"]} == {"flight.yaml", "truth.json"}
+    from aerpaw_cmp.store import read_flight
+
+    stored = {Path(f.path).as_posix(): f for f in read_flight(flight)}
+    for file in summary["files"]:
+        assert len(stored[file["path"]].result.rejected) == file["rejected"] > 0, "bad lines were planted in each log"
+    table = out_of(capsys, "ingest", SAMPLE, *options)
+    assert "quectel_ri" in table
+    assert "rejected" in table
+
+
+def test_ingest_without_a_zone_names_the_option(capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ingest", str(SAMPLE / "LW1")]) == 2
+    assert "timezone" in capsys.readouterr().err
+
+
+def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
+    from aerpaw_cmp.readers import catalogue
+
+    listed = json.loads(out_of(capsys, "formats", "--json"))["readers"]
+    assert {r["name"] for r in listed} == {r.name for r in catalogue()}
+    assert all(r["sample"] and r["kinds"] for r in listed)
+
+
+def test_doctor_json(capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    code = main(["doctor", "--json"])
+    checks = json.loads(capsys.readouterr().out)["checks"]
+    failed = [c for c in checks if c["status"] == "fail"]
+    assert code == (1 if failed else 0)
+    assert all(c["remedy"] for c in failed)
+    assert {"Python", "LLVM", "Readers"} <= {c["name"] for c in checks}
+
+
+def test_site_import_and_show(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    barn = [[-78.6975, 35.7280], [-78.6972, 35.7280], [-78.6972, 35.7282], [-78.6975, 35.7282], [-78.6975, 35.7280]]
+    wood = [[-78.6990, 35.7290], [-78.6980, 35.7290], [-78.6980, 35.7298], [-78.6990, 35.7298], [-78.6990, 35.7290]]
+    features = [
+        {"type": "Feature", "properties": {"building": "yes", "height": "7"}, "geometry": polygon(barn)},
+        {"type": "Feature", "properties": {"natural": "wood"}, "geometry": polygon(wood)},
+    ]
+    source = tmp_path / "map.geojson"
+    source.write_text(json.dumps({"type": "FeatureCollection", "features": features}))
+    site = tmp_path / "site.yaml"
+    out_of(capsys, "site", "import", source, "-o", site)
+    from aerpaw_cmp.site.siteyaml import load_site
+
+    loaded = load_site(site)
+    assert [b.height_m for b in loaded.buildings] == [7.0]
+    assert len(loaded.forests) == 1
+    assert len(loaded.trees) > 10
+    assert not loaded.illustrative
+    written = out_of(capsys, "site", "show", site, "-o", tmp_path / "show", "--export").split()
+    assert all(Path(path).stat().st_size > 100 for path in written)
+    assert {Path(path).suffix for path in written} >= {".html", ".png", ".svg", ".xml"}
+
+
+def polygon(ring: list[list[float]]) -> dict[str, object]:
+    return {"type": "Polygon", "coordinates": [ring]}
+
+
+def test_usage_errors_are_one_line_and_exit_code_2(capsys: pytest.CaptureFixture[str]) -> None:
+    for arguments in (["report"], ["report", "x.yaml", "--engine", "magic"], ["tap", "--export", "xml"], ["site"]):
+        capsys.readouterr()
+        assert main(arguments) in (2, 3), arguments
+        assert "Traceback" not in capsys.readouterr().err
+
+
+@pytest.mark.sionna
+def test_bench_json(capsys: pytest.CaptureFixture[str]) -> None:
+    result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json"))
+    wanted = {"engine", "samples", "arrays", "depth", "seconds", "links_per_s", "peak_mib", "missing_paths"}
+    wanted |= {"extra_paths", "rss_max_error_db", "rss_rms_error_db", "rank_disagreement"}
+    rows = result["replay"]["rows"]
+    assert all(wanted <= set(row) for row in rows)
+    assert {row["arrays"] for row in rows} == {"float64", "synthetic", "explicit"}
+    reference = next(row for row in rows if row["engine"] == "image" and row["depth"] == 2 and row["thinning"] == 1)
+    assert reference["rss_max_error_db"] == 0.0
+    assert any(row["engine"] == "sionna" and row["rss_max_error_db"] < 1.0 for row in rows)

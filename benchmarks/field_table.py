@@ -304,7 +304,7 @@ def further_table(models: dict[str, Any]) -> str:
             cells += [f"{fit['gain_on_itself_db']:+.2f}", f"{fit['gain_on_the_other_db']:+.2f}"]
         rows.append(cells)
     names = [fit["fitted_on"].removeprefix("dataset12_") for fit in next(iter(models["further"].values()))]
-    header = [f"{text} {name}" for name in names for text in ("lower RMSE [dB] on", "on the other, fitted on")]
+    header = [f"{text} {name}" for name in names for text in ("gain [dB] on", "gain on the other, fitted on")]
     return markdown(["also fitted", *header], rows)
 
 
@@ -409,8 +409,9 @@ How to read it:
   route with the nose held in one direction, so azimuth at the UAV, azimuth at the tower and place go together: this
   correction may partly be a memory of the place. Other routes or headings have to show it.
 - Neither the coherent ground reflection nor the illustrative trees help; the two-ray ripple is not in the measurement.
-- What else could be wrong was fitted on one flight too, beside its azimuths; the table below says what it brought to
-  that flight and to the other. What helps the first and hurts the second is no knowledge.
+- What else could be wrong was fitted on one flight too, beside its azimuths; the table below says by how much that
+  lowered the RMSE of that flight and of the other (negative: it rose). What helps the first and hurts the second is
+  no knowledge.
 - The passes of one place within a flight are few and near take-off; they bound repeatability loosely.
 
 {further}

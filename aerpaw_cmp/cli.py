@@ -319,8 +319,7 @@ def tap(
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
     source: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="What to play: a transcript, a tap log, or any log with ranks."),
+        Path | None, typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")
     ] = None,
     kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045

@@ -318,7 +318,9 @@ def tap(
 @app.command("modem-sim", help=COMMANDS["modem-sim"])
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
-    source: Annotated[Optional[Path], typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")] = None,  # noqa: UP045
+    source: Annotated[
+        Path | None, typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")
+    ] = None,
     kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
 ) -> int:
@@ -454,6 +456,7 @@ def map_(
     carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
     engine: Annotated[Optional[str], typer.Option(help="image or sionna.")] = None,  # noqa: UP045
     max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
+    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
     flight: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
@@ -487,6 +490,7 @@ def map_(
         carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
         engine=engine,
         max_depth=max_depth,
+        samples=samples,
         threshold_dbm=threshold_dbm,
         study=study,
     )

@@ -76,7 +76,7 @@ def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] 
         poses = [_poses(data, track) for track in tracks]
         joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
         progress(f"replay RSS {tower}: {len(joined)} poses")
-        whole = _replay(data, link, joined)
+        whole = _replay(data, link, joined, progress)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
             stop = start + len(part)
@@ -207,7 +207,7 @@ def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
             rotation = attitude_rotation(track, data.settings.rt.attitude)
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
-        out.append(Replayed(link, poses, valid, _replay(data, link, poses), track))
+        out.append(Replayed(link, poses, valid, _replay(data, link, poses, progress), track))
     return out
 
 
@@ -231,8 +231,9 @@ def _poses(data: FlightData, track: TrackPoses) -> Poses:
     return Poses(track.position_m[track.valid], rotation)
 
 
-def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
+def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> Replay:
     rt = data.settings.rt
+    name = f"{rt.engine} {'+'.join(link.tower_arrays)}"
     return replay(
         data.site,
         link,
@@ -244,6 +245,8 @@ def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
         loss=foliage_loss(data, link.carrier_hz),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        # the image engine is done before a bar could be seen
+        progress=(lambda share: progress(f"{name} {100 * share:.0f} %")) if rt.engine == "sionna" else None,
     )
 
 

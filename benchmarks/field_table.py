@@ -475,7 +475,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="100 replicates, azimuths on a grid of 30 degrees")
     parser.add_argument("--json", action="store_true", help="print table.json too")
-    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA"))
+    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA") or None)
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "reports" / "lake_wheeler")
     arguments = parser.parse_args()
     if arguments.logs_root is None or not Path(arguments.logs_root).is_dir():

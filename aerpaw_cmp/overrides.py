@@ -29,8 +29,9 @@ def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
     if not overrides:
         return settings
     plain = settings.model_dump(mode="python")
-    for key, value in overrides.items():
-        _set(plain, key, value)
+    # what copies are made of comes first, so that they have it, too
+    for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
+        _set(plain, key, overrides[key])
     try:
         return FlightFile.model_validate(plain)
     except ValidationError as error:

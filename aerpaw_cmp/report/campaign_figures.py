@@ -191,11 +191,12 @@ def settings_rmse(data: CampaignData) -> Figure:
             ax.plot(
                 [value, value], [at[0] - 0.6, at[-1] + 0.6], color=colour, linestyle=line, linewidth=1.5, label=label
             )
-        floors = [r.rmse_db for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}" == link]
-        floors = [f for f in floors if np.isfinite(f)]
+        floors = [r for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}".strip() == link]
+        floors = [r for r in floors if np.isfinite(r.rmse_db)]
         if floors:
-            floor = min(floors)
-            label = "two flights, same places" if index == 0 else None
+            best = max(floors, key=lambda r: r.n)
+            floor = best.rmse_db
+            label = f"two flights, same places ({100 * best.share:.0f} % of samples)" if index == 0 else None
             ax.plot([floor, floor], [at[0] - 0.6, at[-1] + 0.6], color="#888888", linewidth=3.5, alpha=0.7, label=label)
     ax.set_yticks(ticks, labels)
     ax.invert_yaxis()
@@ -240,7 +241,8 @@ def plates(data: CampaignData) -> list[Plate]:
                 section="result",
                 title="RMSE of every setting and flight",
                 caption="Each row has its own best offset. Lines: 95 % interval from blocks as long as the residual "
-                "remembers. The grey bar is what two flights differ by at the same places, where they have any.",
+                "remembers. The grey bar is what two flights differ by at the same "
+                "places (the pair with most of them); where few samples have a pair, it speaks for those places only.",
                 alt="RMSE per setting, flight and link, with baselines",
                 draw=lambda: settings_rmse(data),
             )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,12 @@ from .campaign_data import CampaignData, RankRow, RssRow
 from .export import json_safe, k_key, write_atomic
 from .figures import Picture
 from .html import CONTENT_POLICY, environment
+
+FEW_PAIRS = 0.25
+"""Below this share of samples with a pair, a repeatability floor is that of a few places."""
+
+OWN_FIGURES = re.compile(r"(settings_rmse|tracks|(distance|places|held_out)_[A-Za-z0-9._-]+)\.(svg|png)")
+"""Names of figures that an earlier campaign may have left in the folder."""
 
 ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
 """Fields of a row that are samples, not numbers of a table."""
@@ -190,6 +197,12 @@ def warnings(data: CampaignData) -> list[str]:
         if row.at_search_edge
     ]
     out += [
+        f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
+        f"{pair.second}; their repeatability speaks for those places, not for the flights."
+        for pair in data.repeats
+        if 0 < pair.share < FEW_PAIRS
+    ]
+    out += [
         f"Pooled offset {group.group}: its members are in different units ({', '.join(group.units)})."
         for group in data.pooled
         if len(group.units) > 1
@@ -233,5 +246,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
         drawn.append(picture)
         written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
         written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    for path in (folder / "figures").glob("*"):
+        if path not in written and OWN_FIGURES.fullmatch(path.name):
+            path.unlink()
     page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
     return [page, *written]

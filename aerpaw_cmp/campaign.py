@@ -45,7 +45,7 @@ class HeldOutSettings(Settings):
     """Parameters that are fitted on some flights and scored on all."""
 
     fit: Annotated[dict[str, list[float]], Field(min_length=1)]
-    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``."""
+    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``."""
     fit_on: list[str] | None = None
     """Names of the flights to fit on; without it each flight is left out once."""
     setting: str | None = None
@@ -91,8 +91,8 @@ def load_campaign(path: Path) -> CampaignFile:
     for key, values in (fit.fit if fit else {}).items():
         if not values or np.any(np.diff(values) <= 0):
             raise UsageError(f"held_out.fit.{key}: {values}", expected="increasing values", path=path)
-        if key.split(".")[0] not in ("link", "rt", "site"):
-            raise UsageError(f"held_out.fit.{key}", expected="a key below link, rt or site", path=path)
+        if key.split(".")[0] not in ("link", "rt", "site") and key != "rss.lag":
+            raise UsageError(f"held_out.fit.{key}", expected="a key below link, rt or site, or rss.lag", path=path)
     labels = list(campaign.settings) or [AS_WRITTEN]
     if fit and fit.setting is not None and fit.setting not in labels:
         near = nearest(fit.setting, labels)

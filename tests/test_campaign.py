@@ -225,6 +225,26 @@ def test_parameters_without_effect_and_at_a_bound_are_named(folder: Path) -> Non
     assert YAW in fold.at_bounds
 
 
+def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) -> None:
+    """Both radio clocks show 1.5 s too much; the fit on one flight says so, and the other flight agrees."""
+    for seed, name in enumerate(OFFSETS_DB, start=1):
+        settings = flight_settings(name, seed, YAW_DEG)
+        settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
+        (folder / f"late_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+        assert main(["simulate", str(folder / f"late_{name}.yaml"), "-o", str(folder / "late")]) == 0
+    path = write_campaign(
+        folder,
+        "late",
+        flights=["late_first.yaml", "late_second.yaml"],
+        held_out={"fit": {"rss.lag": [-1.5, 0.0, 0.5, 1.0, 1.5, 2.0]}, "fit_on": ["second"], "samples": 100},
+    )
+    (fold,) = run(load_campaign(path), folder, logs_root=folder / "late").held_out
+    assert fold.parameters == {"rss.lag": 1.5}
+    held = [r for r in fold.rows if not r.fitted_here]
+    assert len(held) == 2
+    assert all(r.rmse_db < r.start_rmse_db for r in held)
+
+
 def test_one_parameter_after_the_other_finds_what_all_combinations_find(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

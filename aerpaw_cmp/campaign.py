@@ -30,7 +30,17 @@ from .errors import AerpawCmpError, UsageError
 from .flight import FlightData, gather, read_logs
 from .overrides import Overrides, overridden
 from .replaying import estimate_clocks, replay_rank, replay_rss
-from .report.campaign_data import CampaignData, Failure, PooledOffset, RankRow, Repeat, RssRow, place_means
+from .report.campaign_data import (
+    CampaignData,
+    Failure,
+    FlownTrack,
+    PooledOffset,
+    RankRow,
+    RankTransfer,
+    Repeat,
+    RssRow,
+    place_means,
+)
 from .units import FloatArray
 from .yamlfile import load_yaml, nearest
 
@@ -122,6 +132,7 @@ class Outcome:
     rss: tuple[RssRow, ...] = ()
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
+    track: FlownTrack | None = None
 
 
 @lru_cache(maxsize=2)
@@ -165,18 +176,31 @@ def run_task(task: Task) -> Outcome:
         data = flight_data(task)
         clocks = estimate_clocks(data, silent)
         pairs = zip(data.rss, replay_rss(data, silent, clocks), strict=True)
-        rss = tuple(_rss_row(task, data, compare_rss_series(data, s, r).panel) for s, r in pairs)
-        rank = tuple(
-            row
-            for s, r in zip(data.rank, replay_rank(data, silent), strict=True)
-            for row in _rank_rows(task, compare_rank_series(data, s, r).panel)
-        )
+        rss = [compare_rss_series(data, s, r).panel for s, r in pairs]
+        ranked = zip(data.rank, replay_rank(data, silent), strict=True)
+        rank = [compare_rank_series(data, s, r).panel for s, r in ranked]
     except AerpawCmpError as error:
         return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=str(error)))
     except Exception as error:  # one flight's fault must not cost the others their numbers
         text = f"a fault of the program itself: {type(error).__name__}: {error}"
         return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
-    return Outcome(rss, rank)
+    return Outcome(
+        tuple(_rss_row(task, data, panel) for panel in rss),
+        tuple(row for panel in rank for row in _rank_rows(task, panel)),
+        track=_flown(task, [*rss, *rank][0]),
+    )
+
+
+def _flown(task: Task, panel: Any) -> FlownTrack:
+    return FlownTrack(flight=task.flight, time_s=_elapsed_s(panel.time), position_m=_positions_m(panel))
+
+
+def _elapsed_s(time: Any) -> FloatArray:
+    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def _positions_m(panel: Any) -> FloatArray:
+    return np.stack([panel.east_m, panel.north_m, panel.up_m], axis=-1)
 
 
 def _rss_row(task: Task, data: FlightData, panel: Any) -> RssRow:
@@ -192,8 +216,8 @@ def _rss_row(task: Task, data: FlightData, panel: Any) -> RssRow:
         baselines={b.name: b.rmse_db for b in panel.baselines},
         step_db=data.settings.rss.step_db,
         span_db=data.settings.rss.span_db,
-        time_s=(panel.time - panel.time[:1]) / np.timedelta64(1, "s"),
-        position_m=np.stack([panel.east_m, panel.north_m, panel.up_m], axis=-1),
+        time_s=_elapsed_s(panel.time),
+        position_m=_positions_m(panel),
         distance_m=panel.geometry["distance_m"],
         heading_deg=panel.geometry.get("heading_deg"),
         within=panel.extra.get("repeatability", {}),
@@ -383,6 +407,37 @@ def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
     )
 
 
+def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
+    """K chosen on the other flights, for every flight that has others with the same tower and K."""
+    out = []
+    for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
+        by: dict[str, dict[float, RankRow]] = {}
+        for row in rows:
+            if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
+                by.setdefault(row.flight, {})[row.k] = row
+        for flight, own in by.items():
+            others = [at for name, at in by.items() if name != flight]
+            common = [k for k in own if others and all(k in at for at in others)]
+            if not common:
+                continue
+            chosen = min(common, key=lambda k: _mean(at[k].total_variation for at in others))
+            best = min(own, key=lambda k: own[k].total_variation)
+            out.append(
+                RankTransfer(
+                    setting=setting,
+                    flight=flight,
+                    tower=tower,
+                    chosen_on=tuple(name for name in by if name != flight),
+                    k=chosen,
+                    total_variation=own[chosen].total_variation,
+                    kappa=own[chosen].kappa,
+                    own_k=best,
+                    own_total_variation=own[best].total_variation,
+                )
+            )
+    return out
+
+
 def run(
     campaign: CampaignFile,
     folder: Path,
@@ -438,6 +493,8 @@ def run(
             except AerpawCmpError as error:
                 trouble = str(error)
     good = [t for t, o in zip(tasks, outcomes, strict=True) if o.failure is None]
+    rank = tuple(row for o in outcomes for row in o.rank)
+    tracks = {o.track.flight: o.track for o in reversed(outcomes) if o.track is not None}
     return CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
@@ -447,7 +504,9 @@ def run(
         flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
         settings=settings,
         rss=tuple(rows),
-        rank=tuple(row for o in outcomes for row in o.rank),
+        rank=rank,
+        rank_transfers=tuple(transfer_ranks(rank)),
+        tracks=tuple(tracks[name] for name in files if name in tracks),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),

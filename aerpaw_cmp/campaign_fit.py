@@ -13,7 +13,7 @@ from .compare import rss
 from .compare.heldout import fit_held_out, rmse
 from .compare.offset import grid_offset
 from .config import FlightFile
-from .errors import UsageError
+from .errors import InputError, UsageError
 from .flight import FlightData, choose_site
 from .overrides import overridden
 from .replaying import Clock, estimate_clocks, replay_rss
@@ -160,6 +160,8 @@ def fit_all(
     ------
     UsageError
         No flight to fit on, or too few to leave one out.
+    InputError
+        A flight of the fit has no sample that could be compared.
     """
     names = list(flights)
     chosen = None if fit_on is None else [name for name in fit_on if name in names]
@@ -177,7 +179,14 @@ def fit_all(
     for train in [chosen] if chosen is not None else [[n for n in names if n != left] for left in names]:
         progress("held-out: fit on " + ", ".join(train))
         test = [name for name in names if name not in train]
-        found = search(few, grids, train, refine=refine)
+        try:
+            found = search(few, grids, train, refine=refine)
+        except ValueError as error:
+            raise InputError(
+                f"nothing can be fitted on {', '.join(train)}: {error}",
+                expected="samples that are measured and simulated under some of the values",
+                cause="no coverage, or values far off",
+            ) from None
         curves = _curves(few, grids, found.parameters)
         flat = [n for n, by in curves.items() if all(np.ptp(by[f][1]) < NO_EFFECT_DB for f in train)]
         folds.append(

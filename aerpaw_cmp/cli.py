@@ -511,9 +511,24 @@ def campaign(
 
 def _print_campaign_summary(outcome: Any) -> None:
     m = outcome.metrics
-    names = [f["flight"] for f in m["flights"]]
+    names = list(next(iter(m["mean_rmse_db"].values()), {}))
     rows = [[s, *[_number(by[f], "{:.2f}") for f in names]] for s, by in m["mean_rmse_db"].items()]
-    _table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), own offsets")
+    if names:
+        _table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), own offsets")
+    rows = [
+        [
+            r["setting"],
+            r["flight"],
+            r["tower"],
+            f"{r['k']:g}",
+            _number(r["total_variation"], "{:.3f}"),
+            _number(r["agreement"], "{:.2f}"),
+            _number(r["kappa"], "{:.2f}"),
+        ]
+        for r in m["rank"]
+    ]
+    if rows:
+        _table(["setting", "flight", "tower", "K", "total variation", "agreement", "kappa"], rows, "Rank")
     rows = [
         [g["setting"], g["group"], _number(g["offset_db"], "{:.1f}"), _number(g["spread_db"], "{:.2f}"),
          _number(g["own_rmse_db"], "{:.2f}"), _number(g["pooled_rmse_db"], "{:.2f}")]

@@ -15,10 +15,10 @@ import yaml
 
 from aerpaw_cmp import campaign_fit
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.campaign import RepeatSettings, load_campaign, overridden, pool_offsets, repeats, run
+from aerpaw_cmp.campaign import RepeatSettings, load_campaign, overridden, pool_offsets, repeats, run, transfer_ranks
 from aerpaw_cmp.config import FlightFile, load_flight
 from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.report.campaign_data import RssRow, place_means
+from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
@@ -398,6 +398,25 @@ def test_repeatability_is_the_noise_of_both_flights_after_one_constant() -> None
     assert pair.place_correlation == pytest.approx(1.0)
 
 
+def test_k_is_chosen_on_the_other_flights() -> None:
+    """Flight c alone likes K = 1000; what the others choose for it costs it, and that is what is told."""
+    errors = {"a": (0.1, 0.5), "b": (0.2, 0.4), "c": (0.6, 0.05)}
+    rows = [
+        RankRow(
+            flight=flight, setting="s", tower="LW1", k=k, n=9, n_out_of_coverage=0, agreement=0.5, agreement_ci95=None,
+            kappa=tv / 2, total_variation=tv, total_variation_ci95=None, wasserstein=0.0, best_k=k, best_k_ci95=None,
+        )
+        for flight, both in errors.items()
+        for k, tv in zip((10.0, 1000.0), both, strict=True)
+    ]  # fmt: skip
+    found = {t.flight: t for t in transfer_ranks(rows)}
+    assert found["c"].chosen_on == ("a", "b")
+    assert (found["c"].k, found["c"].total_variation, found["c"].kappa) == (10.0, 0.6, 0.3)
+    assert (found["c"].own_k, found["c"].own_total_variation) == (1000.0, 0.05)
+    assert (found["a"].k, found["a"].total_variation) == (1000.0, 0.5)  # (0.4 + 0.05) / 2 against (0.2 + 0.6) / 2
+    assert transfer_ranks([r for r in rows if r.flight == "a"]) == []
+
+
 def test_flights_that_never_meet_have_no_floor() -> None:
     low, high = row("a", "USRP1", np.zeros(50), np.zeros(50)), row("b", "USRP1", np.zeros(50), np.zeros(50))
     up = high.position_m + np.array([0.0, 0.0, 30.0])
@@ -413,6 +432,45 @@ def test_places_are_square_cells_with_mean_residuals() -> None:
     found = place_means(row("a", "c", [1.0, 3.0, np.nan, 9.0], [0.0] * 4, offset_db=0.0, position_m=np.array(
         [[1.0, 1.0, 10.0], [19.0, 19.0, 30.0], [5.0, 5.0, 5.0], [-1.0, 1.0, 7.0]])), 20.0)  # fmt: skip
     assert found == {(0, 0): (2.0, 20.0), (-1, 0): (9.0, 7.0)}
+
+
+def test_flights_without_a_sample_that_counts_give_no_number_and_end_nothing(folder: Path) -> None:
+    found = result(
+        folder,
+        "too_low",
+        "--strict",
+        settings={"as written": {}, "high": {"rss.minimum_height_m": 500}},
+        calibration="all",
+        held_out={"fit": {YAW: [0, 110]}, "fit_on": ["first"], "setting": "high"},
+        code=1,
+    )
+    rows = [r for r in found["rss"] if r["setting"] == "high"]
+    assert [(r["n"], r["offset_db"], r["pooled_rmse_db"]) for r in rows] == [(0, None, None)] * 4
+    assert "nothing can be fitted on first" in found["held_out"]["failure"]
+    assert found["mean_rmse_db"]["high"] == {"first": None, "second": None}
+    assert found["mean_rmse_db"]["as written"]["first"] > 4.0
+
+
+def test_a_campaign_of_rank_flights(folder: Path) -> None:
+    """Rank alone: no RSS tables, but rank rows, their transfer of K and the tracks."""
+    for seed, name in enumerate(OFFSETS_DB, start=1):
+        settings = flight_settings(name, seed, YAW_DEG)
+        settings["flight"]["name"] = f"rank_{name}"
+        settings["flight"]["plan"].update(rank_k=10, rank_interval_s=1.0)
+        settings["logs"] = [settings["logs"][0], {"path": f"{name}/ri.csv", "reader": "quectel_ri", "node": "LW1"}]
+        settings["rank"] = {"k": [10, 100], "bootstrap": 20}
+        (folder / f"rank_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+        assert main(["simulate", str(folder / f"rank_{name}.yaml")]) == 0
+    found = result(folder, "ranks", flights=["rank_first.yaml", "rank_second.yaml"])
+    assert found["rss"] == []
+    assert {(r["flight"], r["k"]) for r in found["rank"]} == {(f"rank_{n}", k) for n in OFFSETS_DB for k in (10, 100)}
+    for transfer in found["rank_transfers"]:
+        assert transfer["k"] == 10  # the simulated modem's
+        assert transfer["total_variation"] < 0.05
+    assert {p.stem for p in (folder / "ranks_out" / "figures").glob("*.svg")} == {"rank_tv", "tracks"}
+    page = (folder / "ranks_out" / "campaign.html").read_text(encoding="utf-8")
+    assert "Mean RMSE over towers" not in page
+    assert "K chosen on the other flights" in page
 
 
 FIELD = os.environ.get("AERPAW_CMP_FIELD_DATA", "")

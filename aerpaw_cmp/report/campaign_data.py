@@ -213,6 +213,34 @@ class HeldOutFold:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RankTransfer:
+    """Total variation of one flight at the K that the other flights would have chosen.
+
+    ``k`` has the least mean total variation on ``chosen_on`` among the K of the flight files; ``own_k`` on the
+    flight itself.
+    """
+
+    setting: str
+    flight: str
+    tower: str
+    chosen_on: tuple[str, ...]
+    k: float
+    total_variation: float
+    kappa: float
+    own_k: float
+    own_total_variation: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownTrack:
+    """Where one flight was sampled: ``time_s`` (n,) after its first sample, ``position_m`` (n, 3)."""
+
+    flight: str
+    time_s: FloatArray
+    position_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData:
     """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order."""
 
@@ -230,6 +258,8 @@ class CampaignData:
     repeats: tuple[Repeat, ...] = ()
     held_out: tuple[HeldOutFold, ...] = ()
     held_out_failure: str = ""
+    rank_transfers: tuple[RankTransfer, ...] = ()
+    tracks: tuple[FlownTrack, ...] = ()
     radius_m: float = 5.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0

@@ -10,7 +10,7 @@ import numpy as np
 from ..site.site import Site
 from ..units import FloatArray
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
-from .export import safe_name
+from .export import k_key, safe_name
 from .figures import (
     BASELINE,
     Plate,
@@ -35,10 +35,13 @@ FEWEST_PER_BIN = 8
 
 MAPS_PER_ROW = 3
 
+TALLEST = 40.0
+"""No figure is higher than this [inch], however many flights there are."""
+
 
 def look(number: int) -> dict[str, Any]:
     """Colour and line style of the flight with this number, told apart in grey by the dashes."""
-    return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[number % len(LINES)]}
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
 
 
 def binned(quantity: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -89,7 +92,8 @@ def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
 
 def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
     """All flights on the plan, and their heights over time."""
-    firsts = [rows[0] for rows in grouped(data.reference_rows, lambda r: r.flight).values()]
+    firsts = data.tracks
+    towers = dict.fromkeys([*(row.tower for row in data.rss), *(row.tower for row in data.rank)])
     fig = figure((9.2, 4.9))
     plan, height = fig.subplots(1, 2, width_ratios=(1.15, 1.0))
     draw_site(plan, site)
@@ -101,7 +105,7 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
         height.plot(*thinned(row.time_s, row.position_m[:, 2]), linewidth=1.4, label=row.flight, **look(number))
     east = np.concatenate([row.position_m[:, 0] for row in firsts])
     north = np.concatenate([row.position_m[:, 1] for row in firsts])
-    used = [site.towers[name] for name in dict.fromkeys(r.tower for r in data.reference_rows) if name in site.towers]
+    used = [site.towers[name] for name in towers if name in site.towers]
     east = np.concatenate([east, [t.east_m for t in used]])
     north = np.concatenate([north, [t.north_m for t in used]])
     frame_around(plan, east, north)
@@ -165,7 +169,7 @@ def settings_rmse(data: CampaignData) -> Figure:
     groups = list(grouped(data.rss, lambda r: (r.flight, r.link)).items())
     names = list(data.settings)
     step = len(names) + 1.0
-    fig = figure((9.2, 1.6 + 0.26 * step * len(groups)))
+    fig = figure((9.2, min(1.6 + 0.26 * step * len(groups), TALLEST)))
     ax = fig.subplots()
     ticks, labels = [], []
     for index, ((flight, link), rows) in enumerate(groups):
@@ -207,6 +211,38 @@ def settings_rmse(data: CampaignData) -> Figure:
     return fig
 
 
+def rank_tv(data: CampaignData) -> Figure:
+    """Total variation of every flight and K, settings side by side, with intervals."""
+    groups = list(grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items())
+    names = list(data.settings)
+    step = len(names) + 0.8
+    fig = figure((9.2, min(1.5 + 0.2 * step * len(groups), TALLEST)))
+    ax = fig.subplots()
+    shown: set[str] = set()
+    for index, (_key, rows) in enumerate(groups):
+        if index % 2:
+            ax.axhspan((index - 0.1) * step - 0.4, (index + 0.9) * step - 0.4, color="#F3F3F3", zorder=0)
+        for row in rows:
+            number = names.index(row.setting)
+            y = index * step + number
+            style: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)]}
+            ax.plot(row.total_variation_ci95 or (np.nan, np.nan), [y, y], linewidth=1.2, **style)
+            label = None if row.setting in shown else row.setting
+            shown.add(row.setting)
+            ax.plot(
+                row.total_variation, y, marker=MARKERS[number % len(MARKERS)], linestyle="none", label=label, **style
+            )
+    middle = (len(names) - 1) / 2
+    labels = [f"{flight}, {tower}, K = {k_key(k)}" for (flight, tower, k), _ in groups]
+    ax.set_yticks([index * step + middle for index in range(len(groups))], labels)
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+    ax.set_xlim(0.0, 1.02)
+    ax.set_xlabel("Total variation, measured against simulated rank")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return fig
+
+
 def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
     """RMSE of every flight along each parameter, the fitted value marked."""
     columns = min(len(fold.curves), 3)
@@ -232,7 +268,7 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
 
 def plates(data: CampaignData) -> list[Plate]:
     """Every figure that the campaign has numbers for."""
-    numbers = {name: number for number, name in enumerate(dict.fromkeys(r.flight for r in data.reference_rows))}
+    numbers = {track.flight: number for number, track in enumerate(data.tracks)}
     found: list[Plate] = []
     if data.rss:
         found.append(
@@ -245,6 +281,18 @@ def plates(data: CampaignData) -> list[Plate]:
                 "places (the pair with most of them); where few samples have a pair, it speaks for those places only.",
                 alt="RMSE per setting, flight and link, with baselines",
                 draw=lambda: settings_rmse(data),
+            )
+        )
+    if data.rank:
+        found.append(
+            Plate(
+                name="rank_tv",
+                section="result",
+                title="Total variation of rank, every setting and flight",
+                caption="Distance between the histograms of measured and simulated rank, 0 when equal, 1 when apart, "
+                "with 95 % intervals. Equal histograms do not mean that ranks agree pose by pose: see kappa.",
+                alt="Total variation per flight, K and setting",
+                draw=lambda: rank_tv(data),
             )
         )
     if numbers and data.site is not None:

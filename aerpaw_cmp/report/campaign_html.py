@@ -21,7 +21,7 @@ from .html import CONTENT_POLICY, environment
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
 
-OWN_FIGURES = re.compile(r"(settings_rmse|tracks|(distance|places|held_out)_[A-Za-z0-9._-]+)\.(svg|png)")
+OWN_FIGURES = re.compile(r"(settings_rmse|rank_tv|tracks|(distance|places|held_out)_[A-Za-z0-9._-]+)\.(svg|png)")
 """Names of figures that an earlier campaign may have left in the folder."""
 
 ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
@@ -32,12 +32,18 @@ def _entries(items: Iterable[Any], without: Sequence[str] = ()) -> list[dict[str
     return [{f.name: getattr(x, f.name) for f in dataclasses.fields(x) if f.name not in without} for x in items]
 
 
+def rss_flights(data: CampaignData) -> list[str]:
+    """Flights that have RSS, and those that failed: a flight with rank alone has no RMSE to miss."""
+    ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
+    return [name for name in data.flights if name not in ranked]
+
+
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
     """Mean RMSE over the links of each setting and flight [dB]; NaN where there is none."""
     table: dict[str, dict[str, float]] = {}
     for setting in data.settings:
         table[setting] = {}
-        for flight in data.flights:
+        for flight in rss_flights(data):
             values = [r.rmse_db for r in data.rss if r.setting == setting and r.flight == flight]
             known = [v for v in values if np.isfinite(v)]
             table[setting][flight] = float(np.mean(known)) if known else float("nan")
@@ -61,6 +67,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         "mean_rmse_db": mean_rmse(data),
         "rss": _entries(data.rss, ARRAYS),
         "rank": _entries(data.rank),
+        "rank_transfers": _entries(data.rank_transfers),
         "calibration": {"per": data.calibration, "groups": _entries(data.pooled)},
         "repeatability": {
             "radius_m": data.radius_m,
@@ -156,11 +163,20 @@ def headline(data: CampaignData) -> list[str]:
     means = {s: v for s, v in means.items() if len(v)}
     if means:
         best = min(means, key=lambda s: float(means[s].mean()))
+        spread = np.ptp([v.mean() for v in means.values()])
         out.append(
             "Mean RMSE over flights and links: "
             + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in means.items())
-            + (f". Least: {best}." if len(means) > 1 else ".")
+            + (f". Least: {best}." if spread > 0.005 else ".")
         )
+    for setting in data.settings:
+        moved = [t for t in data.rank_transfers if t.setting == setting]
+        if moved:
+            out.append(
+                f"Rank, {setting}: at the K that the other flights choose, the total variation is "
+                + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
+                + "."
+            )
     if data.repeats:
         pairs = [p for p in data.repeats if p.n > 0]
         if pairs:
@@ -226,7 +242,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         headline=headline(data),
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
-        k_key=k_key,
+        rss_flights=rss_flights(data),
         pretty=figures.pretty,
         files=files,
         content_policy=CONTENT_POLICY,

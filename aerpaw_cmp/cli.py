@@ -39,8 +39,26 @@ def main(arguments: list[str]) -> int:
 
 
 def _say(text: str) -> None:
-    """Progress goes to standard error, so that standard output stays clean."""
-    print(text, file=sys.stderr, flush=True)
+    """Progress goes to standard error, so that standard output stays clean; "... 40 %" becomes a bar.
+
+    On a terminal the bar is redrawn in place; elsewhere only every quarter is a line.
+    """
+    name, _, share = text.removesuffix(" %").rpartition(" ")
+    if not (text.endswith(" %") and share.isdigit()):
+        print(text, file=sys.stderr, flush=True)
+        return
+    percent = int(share)
+    if sys.stderr.isatty():
+        filled = percent * 30 // 100
+        end = "\n" if percent >= 100 else ""
+        print(f"\r\033[K{name} [{'#' * filled}{'.' * (30 - filled)}] {percent} %", end=end, file=sys.stderr, flush=True)
+    elif percent // 25 != _said.get(name, 0):
+        _said[name] = percent // 25
+        print(text, file=sys.stderr, flush=True)
+
+
+_said: dict[str, int] = {}
+"""Quarter that was last said of each stage."""
 
 
 def _print_json(value: dict[str, Any]) -> None:
@@ -240,6 +258,7 @@ def tap(
     no_csi_exit: Annotated[bool, typer.Option("--no-csi-exit", help="End with exit code 1 on that alarm.")] = False,
     sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk.")] = 1.0,
     duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
+    wait: Annotated[float, typer.Option(help="Wait so many seconds for the port to appear.")] = 0.0,
     replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
     export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
     flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
@@ -266,6 +285,7 @@ def tap(
         no_csi_alarm_s=no_csi_alarm,
         no_csi_exit=no_csi_exit,
         duration_s=duration,
+        wait_for_port_s=wait,
         replay=replay,
         log=LogSettings(sync_interval_s=sync_s),
     )
@@ -298,7 +318,9 @@ def tap(
 @app.command("modem-sim", help=COMMANDS["modem-sim"])
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
-    source: Annotated[Optional[Path], typer.Option(help="Transcript or tap log to play.")] = None,  # noqa: UP045
+    source: Annotated[
+        Path | None, typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")
+    ] = None,
     kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
 ) -> int:
@@ -434,6 +456,7 @@ def map_(
     carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
     engine: Annotated[Optional[str], typer.Option(help="image or sionna.")] = None,  # noqa: UP045
     max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
+    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
     flight: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
@@ -467,6 +490,7 @@ def map_(
         carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
         engine=engine,
         max_depth=max_depth,
+        samples=samples,
         threshold_dbm=threshold_dbm,
         study=study,
     )

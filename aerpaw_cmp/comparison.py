@@ -20,7 +20,7 @@ from .compare import rss, statistics
 from .config import RssSettings
 from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
-from .replaying import Clock, Replayed, direct_foliage_m
+from .replaying import Clock, Replayed, direct_foliage_m, foliage_loss
 from .report import data as report
 from .units import BoolArray, FloatArray, IntArray
 
@@ -62,7 +62,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         fitted_on_scored=("lag_s",) if clock is not None and clock.applied == "estimated and applied" else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    alternatives = {name: replayed.spread(level) for name, level in rss_alternatives(data, replayed).items()}
+    alternatives = {
+        name: _at_samples(data, series, replayed, level) for name, level in rss_alternatives(data, replayed).items()
+    }
     quantities = {**levels.geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     tables = rss.residual_tables(result.residual_db, quantities)
     panel = report.RssPanel(
@@ -102,6 +104,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             "n_too_low": int((replayed.valid & ~levels.posed).sum()),
             "n_no_pose": int((~replayed.valid).sum()),
             "clock": _clock_entry(clock),
+            "baseline_rmse_ci95_db": {name: list(bounds) for name, bounds in result.baseline_intervals.items()},
             **_further_numbers(data, series, replayed, levels, result.offset_db),
             **({"foliage": found} if (found := foliage_rss_difference(alternatives)) else {}),
             "explained_by": {name: table.explained for name, table in tables.items()},
@@ -131,19 +134,26 @@ class _Levels:
     def of(cls, data: FlightData, series: RssSeries, replayed: Replayed) -> _Levels:
         settings = data.settings.rss
         level = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
-        simulated, measured = replayed.spread(level[:, 0]), series.measured_db
+        measured = series.measured_db
         if settings.window_s > 0:
             measured = rss.local_mean_db(series.time, measured, settings.window_s)
-            if settings.field == "local_mean":
-                simulated = rss.local_mean_db(series.time, simulated, settings.window_s)
+        simulated = _at_samples(data, series, replayed, level[:, 0])
         geometry = _geometry(data, series.tower, replayed)
         posed = replayed.valid.copy()
         if settings.minimum_height_m is not None:
             with np.errstate(invalid="ignore"):
                 posed &= geometry["altitude_m"] >= settings.minimum_height_m
-        baselines = {name: replayed.spread(v) for name, v in baseline_levels(data, series.tower, replayed).items()}
+        simple = baseline_levels(data, series.tower, replayed)
+        baselines = {name: _at_samples(data, series, replayed, level) for name, level in simple.items()}
         position = geometry.pop("position_m")
         return cls(np.where(posed, measured, np.nan), simulated, baselines, posed, position, geometry)
+
+
+def _at_samples(data: FlightData, series: RssSeries, replayed: Replayed, level_db: FloatArray) -> FloatArray:
+    """A simulated level of the replayed poses at the samples (n,), averaged as ``rss.field: local_mean`` asks."""
+    settings = data.settings.rss
+    level = replayed.spread(level_db)
+    return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
 
 
 def _headline_numbers(result: rss.RssComparison, clock: Clock | None) -> dict[str, Any]:
@@ -464,6 +474,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         stale=~result.staleness.fresh,
         extra={
             **{k: v for k, v in result.as_dict().items() if k not in PANEL_RANK},
+            "kappa_ci95": {f"{k:g}": list(fit.kappa_ci95) for k, fit in result.simulated.items()},
             **({"foliage": foliage} if foliage else {}),
         },
     )
@@ -543,6 +554,8 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 max_depth=rt.max_depth,
                 samples=rt.samples,
                 batch=rt.batch,
+                loss=foliage_loss(data, replayed.link.carrier_hz),
+                cache_dir=None if rt.cache else "",
                 ks=data.settings.rank.k,
             )
         )

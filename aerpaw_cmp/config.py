@@ -359,6 +359,12 @@ class RssSettings(Settings):
     waypoint_labels: bool = True
     reference_powers: ReferencePowers | None = None
 
+    @model_validator(mode="after")
+    def _window_of_local_mean(self) -> RssSettings:
+        if self.field == "local_mean" and self.window_s <= 0:
+            raise ValueError("field: local_mean averages over window_s, which must be above 0")
+        return self
+
     @field_validator("span_db")
     @classmethod
     def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:

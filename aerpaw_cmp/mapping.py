@@ -23,7 +23,15 @@ from .compare.rank import singular_values
 from .errors import UsageError
 from .maps import export
 from .maps import grid as cells
-from .maps.evaluate import IntervalCoverage, Predictor, Score, along_trajectory, blocked, learning_curve
+from .maps.evaluate import (
+    IntervalCoverage,
+    Predictor,
+    Score,
+    along_trajectory,
+    altitude_held_out,
+    blocked,
+    learning_curve,
+)
 from .maps.grid import Grid
 from .maps.interpolate import InverseDistance, Nearest, ServingTowerMean
 from .maps.job import (
@@ -327,6 +335,9 @@ def study_maps(outcome: MapOutcome, report: Report) -> None:
         for name, peer in wide_peers(result, s.neighbours).items():
             outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
             outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
+            if not isinstance(peer, ServingTowerMean):  # knows no height
+                held = altitude_held_out(peer, result.grid.points_m, heights, rank)
+                outcome.peers.setdefault("altitude", {})[f"{name}, 3-D"] = held
             outcome.learning[name] = learning_curve(peer, result.grid.points_m, rank, sizes, seed=s.seed)
 
 
@@ -478,7 +489,7 @@ def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
         "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
         "leave one out, Z as rank 0, random samples": _local(outcome.studies["random"].scores),
         f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": honest.blocked, **outcome.peers["blocks"]},
-        "altitude left out": {"Kriging, 3-D": honest.altitude_held_out},
+        "altitude left out": {"Kriging, 3-D": honest.altitude_held_out, **outcome.peers["altitude"]},
     }
     if honest.trajectory is not None:
         name = f"trained along {outcome.trajectory_name}"
@@ -503,7 +514,7 @@ def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
         return
     sizes = np.array(outcome.honest.learning_sizes)
     for name, mae in {"Kriging": outcome.honest.learning_mae, **outcome.learning}.items():
-        mean = np.nanmean(mae.reshape(len(sizes), -1), axis=1)
+        mean = np.array([_mean(row) for row in mae.reshape(len(sizes), -1)])
         yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
 

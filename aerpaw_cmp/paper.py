@@ -214,6 +214,11 @@ def _values(values: Any) -> str:
     return ", ".join(f"{v:.3f}" for v in values)
 
 
+def _mean(values: Any) -> float:
+    finite = values[np.isfinite(values)]
+    return float(finite.mean()) if finite.size else float("nan")
+
+
 def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
     s, heights = outcome.settings, rank_fields(outcome.shown)[0]
     study: Study = outcome.studies["random"]
@@ -230,9 +235,7 @@ def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
     ):
         scores = outcome.studies[key].scores
         for measure in ("mae", "rmse"):
-            means = {
-                name: float(np.nanmean(getattr(scores[name], measure))) for name in ("Kriging", "makima", "spline")
-            }
+            means = {name: _mean(getattr(scores[name], measure)) for name in ("Kriging", "makima", "spline")}
             yield PaperRow(
                 where="Fig. 14",
                 what=f"{measure.upper()} of Kriging, makima, spline, mean over heights and K, {samples}",
@@ -246,12 +249,12 @@ def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
             paper="all", ours=f"{wins} of {kriging.size}", plate=where,
         )  # fmt: skip
     kriging = study.scores["Kriging"].mae
-    by_k = np.nanmean(kriging, axis=0)
+    by_k = [_mean(column) for column in kriging.T]
     yield PaperRow(
         where="Fig. 14", what="MAE of Kriging by K, M random samples", paper="lowest for K1",
         ours=", ".join(f"K = {k_key(k)}: {m:.3f}" for k, m in zip(outcome.shown.ks, by_k, strict=True)), plate=plate,
     )  # fmt: skip
-    worst = [heights[int(np.nanargmax(kriging[:, column]))] for column in range(kriging.shape[1])]
+    worst = [heights[int(np.nan_to_num(kriging[:, column], nan=-1.0).argmax())] for column in range(kriging.shape[1])]
     yield PaperRow(
         where="Fig. 14", what="height with the largest MAE of Kriging, M random samples", paper="30 m for every K",
         ours=", ".join(f"K = {k_key(k)}: {h:g} m" for k, h in zip(outcome.shown.ks, worst, strict=True)), plate=plate,

@@ -53,9 +53,13 @@ class Replayed:
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values per replayed pose, put back at their samples (n,)."""
-        out = np.full(len(self.valid), fill, dtype=np.result_type(values.dtype, np.float64))
-        out[self.valid] = values
-        return out
+        return _spread(self.valid, values, fill)
+
+
+def _spread(valid: BoolArray, values: FloatArray, fill: float = np.nan) -> FloatArray:
+    out = np.full(len(valid), fill, dtype=np.result_type(values.dtype, np.float64))
+    out[valid] = values
+    return out
 
 
 def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] | None = None) -> list[Replayed]:
@@ -72,7 +76,7 @@ def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] 
         poses = [_poses(data, track) for track in tracks]
         joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
         progress(f"replay RSS {tower}: {len(joined)} poses")
-        whole = _replay(data, link, joined)
+        whole = _replay(data, link, joined, progress)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
             stop = start + len(part)
@@ -97,34 +101,46 @@ def estimate_clocks(data: FlightData, progress: Progress) -> list[Clock | None]:
     if wanted == "off" or data.track is None:
         return [None] * len(data.rss)
     out: list[Clock | None] = []
+    predict = _Predictions(data)
     for series in data.rss:
         if isinstance(wanted, float):
             applied = np.full(len(series.time), wanted)
             out.append(Clock(wanted, (wanted, wanted), 0.0, "given", "", "given in flight.yaml", applied))
             continue
         progress(f"clock {series.tower} {series.channel}")
-        out.append(_estimated_clock(data, series, apply=wanted == "apply"))
+        out.append(_estimated_clock(data, series, predict, apply=wanted == "apply"))
     return out
 
 
-def _estimated_clock(data: FlightData, series: RssSeries, *, apply: bool) -> Clock:
+class _Predictions:
+    """Image-engine RSS along the track; channels with one link that were sampled together share the replay."""
+
+    def __init__(self, data: FlightData) -> None:
+        self._data = data
+        self._kept: dict[tuple[str, str, bytes], dict[str, FloatArray]] = {}
+
+    def __call__(self, series: RssSeries, field: str, times: Any) -> FloatArray:
+        """Level ``rss_dbm`` or ``rss_power_dbm`` at instants (n,) [dBm]; NaN without a pose or path."""
+        key = (series.tower, series.settings_key, np.asarray(times).tobytes())
+        if key not in self._kept:
+            data, track = self._data, _track_poses(self._data, times)
+            link, poses = series.link.build([series.tower], data.folder), _poses(data, track)
+            found = replay(data.site, link, poses, engine="image", max_depth=min(data.settings.rt.max_depth, 1))
+            self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
+            levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
+            self._kept[key] = {name: _spread(track.valid, level) for name, level in levels.items()}
+        return self._kept[key][field]
+
+
+def _estimated_clock(data: FlightData, series: RssSeries, predictions: _Predictions, *, apply: bool) -> Clock:
     """Lag by the coherent replay and by its power sum; the one that leaves the smaller residual decides.
 
     Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
     (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
     """
-    link = series.link.build([series.tower], data.folder)
 
     def predictor(field: str) -> Callable[[Any], FloatArray]:
-        def predict(times: Any) -> FloatArray:
-            track = _track_poses(data, times)
-            level = np.full(len(track), np.nan)
-            depth = min(data.settings.rt.max_depth, 1)
-            result = replay(data.site, link, _poses(data, track), engine="image", max_depth=depth)
-            level[track.valid] = getattr(result, field)[:, 0]
-            return level
-
-        return predict
+        return lambda times: predictions(series, field, times)
 
     measured = series.measured_db
     if data.settings.rss.minimum_height_m is not None:
@@ -191,7 +207,7 @@ def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
             rotation = attitude_rotation(track, data.settings.rt.attitude)
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
-        out.append(Replayed(link, poses, valid, _replay(data, link, poses), track))
+        out.append(Replayed(link, poses, valid, _replay(data, link, poses, progress), track))
     return out
 
 
@@ -215,8 +231,9 @@ def _poses(data: FlightData, track: TrackPoses) -> Poses:
     return Poses(track.position_m[track.valid], rotation)
 
 
-def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
+def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> Replay:
     rt = data.settings.rt
+    name = f"{rt.engine} {'+'.join(link.tower_arrays)}"
     return replay(
         data.site,
         link,
@@ -228,6 +245,8 @@ def _replay(data: FlightData, link: Link, poses: Poses) -> Replay:
         loss=foliage_loss(data, link.carrier_hz),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        # the image engine is done before a bar could be seen
+        progress=(lambda share: progress(f"{name} {100 * share:.0f} %")) if rt.engine == "sionna" else None,
     )
 
 

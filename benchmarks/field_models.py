@@ -191,11 +191,85 @@ def transferred_models(patterns: Patterns, mounts: Mapping[str, HeldOutFit]) -> 
 
     return {
         "patterns + attitude + mount of the other flight": model(),
-        "the same, attitude ignored but for heading": _level_flight(model()),
-        "the same + ground, power sum": model(depth=1, power=True),
-        "the same + ground, coherent": model(depth=1),
-        "the same + illustrative trees": model(trees=True),
+        "mount of the other flight, heading only": _level_flight(model()),
+        "mount of the other flight + ground, power sum": model(depth=1, power=True),
+        "mount of the other flight + ground, coherent": model(depth=1),
+        "mount of the other flight + illustrative trees": model(trees=True),
     }
+
+
+FURTHER: dict[str, dict[str, list[float]]] = {
+    "tilt of the UAV antenna": {"uav_pitch": [-15, -5, 0, 5, 15], "uav_roll": [-15, -5, 0, 5, 15]},
+    "tilt of the tower antennas": {"tower_pitch": [-15, -5, 0, 5, 15], "tower_roll": [-15, -5, 0, 5, 15]},
+    "path-loss exponent": {"exponent": [1.2, 1.6, 2.0, 2.4, 2.8]},
+    "clock of the radio": {"lag_s": [-2, -1, 0, 1, 2]},
+    "tower height and place": {"up": [0, 2, 5], "east": [-6, 0, 6], "north": [-6, 0, 6]},
+    "ground reflection, power sum, of any strength": {"ground": [0.0, 0.3, 0.6, 1.0]},
+}
+"""What could be wrong besides azimuths, with values to start from; the simplex goes on between them."""
+
+
+def with_parameter(flight: Flight, patterns: Patterns, mount: Mapping[str, float], channel: str,
+                   given: Mapping[str, float]) -> FloatArray:  # fmt: skip
+    """Line of sight (and ground) in closed form with one more parameter (n,) [dB]."""
+    place = flight.data.site.towers[TOWER].position_m + [given.get(axis, 0.0) for axis in ("east", "north", "up")]
+    target = flight.poses.position_m
+    tower = turned(mount[channel], given.get("tower_pitch", 0.0), given.get("tower_roll", 0.0))
+    uav = flight.poses.rotation @ turned(mount["uav"], given.get("uav_pitch", 0.0), given.get("uav_roll", 0.0))
+
+    def ray(leaves: FloatArray, arrives: FloatArray) -> FloatArray:
+        gain = gain_dbi(patterns.tower, leaves @ tower) + gain_dbi(patterns.uav, np.einsum("nji,nj->ni", uav, -arrives))
+        return gain - 10.0 * given.get("exponent", 2.0) * np.log10(np.linalg.norm(leaves, axis=1))
+
+    level = ray(target - place, target - place)
+    if given.get("ground", 0.0) > 0.0:
+        down = target * [1, 1, -1] - place
+        bounced = ray(down, down * [1, 1, -1]) + 20.0 * np.log10(given["ground"])
+        level = 10.0 * np.log10(10.0 ** (level / 10.0) + 10.0 ** (bounced / 10.0))
+    return np.interp(flight.time_s - given.get("lag_s", 0.0), flight.time_s, level)
+
+
+def gain_dbi(pattern: Any, direction: FloatArray) -> FloatArray:
+    """Gain towards directions (n, 3) in the device frame."""
+    across = np.hypot(direction[:, 0], direction[:, 1])
+    return pattern.gain_dbi(np.arctan2(across, direction[:, 2]), np.arctan2(direction[:, 1], direction[:, 0]))
+
+
+def turned(yaw: float, pitch: float, roll: float) -> FloatArray:
+    """Mount from angles in degrees."""
+    return rotation_from_yaw_pitch_roll(*np.radians([yaw, pitch, roll]))
+
+
+def further_parameters(
+    flights: Mapping[str, Flight], patterns: Patterns, mounts: Mapping[str, HeldOutFit]
+) -> dict[str, Any]:
+    """Each set of FURTHER fitted on one flight beside that flight's azimuths, scored on the other."""
+    thin = {name: flight.thinned(4) for name, flight in flights.items()}
+    found: dict[str, Any] = {}
+    for what, values in FURTHER.items():
+        rows = []
+        for test, mount in mounts.items():
+
+            def objective(given: Mapping[str, float], name: str, mount: HeldOutFit = mount) -> FloatArray:
+                flight = thin[name]
+                parts = [
+                    m - with_parameter(flight, patterns, mount.parameters, c, given)
+                    for c, m in flight.measured_db.items()
+                ]
+                return np.concatenate([part - part.mean() for part in parts])
+
+            start = {name: 2.0 if name == "exponent" else 0.0 for name in values}
+            fit = fit_held_out(objective, values, mount.fitted_on, [test], start=start)
+            rows.append(
+                {
+                    "fitted_on": fit.fitted_on[0],
+                    "parameters": dict(fit.parameters),
+                    "gain_on_itself_db": fit.start_rmse_db[fit.fitted_on[0]] - fit.train_rmse_db[fit.fitted_on[0]],
+                    "gain_on_the_other_db": fit.start_rmse_db[test] - fit.test_rmse_db[test],
+                }
+            )
+        found[what] = rows
+    return found
 
 
 def angles_of(flight: Flight, tower_deg: float, uav_deg: float) -> LinkAngles:
@@ -270,21 +344,20 @@ def table(root: Path, step_deg: float) -> dict[str, Any]:
         test: fit_added_gain(flights[train], patterns, mounts[test].parameters)
         for train, test in ((one, two), (two, one))
     }
-    rows["patterns + attitude + mount + added gain of the other flight"] = score(
-        flights, installed_model(patterns, mounts, gains)
-    )
+    rows["mount and added gain of the other flight"] = score(flights, installed_model(patterns, mounts, gains))
     iso = Patterns(Isotropic(), Isotropic())
     control = {
         test: fit_added_gain(flights[train], iso, mounts[test].parameters) for train, test in ((one, two), (two, one))
     }
     rows["control: isotropic + added gain of the other flight"] = score(flights, installed_model(iso, mounts, control))
     own = {one: mounts[two], two: mounts[one]}
-    rows["(patterns + attitude + mount fitted on what is scored)"] = score(
+    rows["mount of the same flight (fitted on what is scored)"] = score(
         flights, transferred_models(patterns, own)["patterns + attitude + mount of the other flight"]
     )
     added = {test: dataclasses.asdict(fit) for test, fit in gains.items()}
     return {
         "rows": rows,
+        "further": further_parameters(flights, patterns, mounts),
         "added_gain": added,
         "mounts": {test: fit.as_dict() for test, fit in mounts.items()},
         "grid_step_deg": step_deg,
@@ -322,6 +395,12 @@ def main() -> None:
     for test, fit in found["added_gain"].items():
         tower = "; ".join(f"{c} {_rounded(v)}" for c, v in fit["tower_db"].items())
         print(f"added gain applied to {test}: order {fit['order']}, UAV {_rounded(fit['uav_db'])}; {tower}")
+    print("what else was fitted on one flight: gain in RMSE [dB] on that flight, and on the other")
+    for what, fits in found["further"].items():
+        for fit in fits:
+            print(
+                f"  {what:46s} {fit['fitted_on']}: {fit['gain_on_itself_db']:+.2f}, {fit['gain_on_the_other_db']:+.2f}"
+            )
     print(f"{found['cpu_s']:.1f} s of processor time")
 
 

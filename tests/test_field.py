@@ -109,11 +109,11 @@ def test_vertical_elements_do_not(report: Report, name: str) -> None:
 
 
 @pytest.mark.parametrize("name", RANK)
-def test_histograms_agree_but_poses_hardly_do(report: Report, name: str) -> None:
-    """Which rank when is not predicted: agreement by pose stays near what independent draws would give."""
+def test_which_rank_when_is_predicted_little_better_than_by_chance(report: Report, name: str) -> None:
+    """Measured at K = 10: kappa 0.23 on both flights (0 is chance, 1 every pose right)."""
     at_10 = report(name)["rank"]["LW1"]["simulated"]["10"]
-    assert 0.5 < at_10["agreement"] < 0.8
-    assert abs(at_10["kappa"]) < 0.25
+    assert 0.6 < at_10["agreement"] < 0.75
+    assert 0.1 < at_10["kappa"] < 0.35
 
 
 def test_every_folder_is_read_and_accounted_for(everything: Ingested) -> None:

@@ -4,6 +4,7 @@ import json
 import os
 import runpy
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +20,7 @@ from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.replay.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.replay.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.replay.replay import replay
+from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from aerpaw_cmp.units import wavelength_m
 
@@ -76,6 +78,9 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
             rank = channel_rank(expected.h, k)
             np.testing.assert_array_equal(rank_of_singular_values(got.singular_values, [k])[..., 0], rank)
         assert np.array_equal(np.isfinite(got.rss_siso_dbm), expected.has_path)
+        with np.errstate(divide="ignore"):
+            beam = 40 + 10 * np.log10((np.abs(expected.h.sum(axis=-1)) ** 2 / 4).mean(axis=-1))
+        np.testing.assert_allclose(got.rss_mimo_dbm, np.where(expected.has_path, beam, np.nan), atol=1e-9)
     shaded = np.isnan(found["opaque"].rss_siso_dbm) & np.isfinite(found["none"].rss_siso_dbm)
     assert 0.1 < shaded.mean() < 0.6
     assert np.array_equal(np.isnan(found["attenuating"].rss_siso_dbm), np.isnan(found["none"].rss_siso_dbm))
@@ -123,6 +128,22 @@ def test_modes_share_one_search_and_nothing_is_kept(site):
     for mode in mapping.FOLIAGE:
         channels.of(mode)(position, ("A", "B"))
     assert not channels._kept
+
+
+def test_heights_are_above_the_ground_of_the_elevation_model():
+    frame = SiteFrame(35.7, -78.7)
+    east = np.arange(-1000.0, 1001.0, 10.0)
+    slope = Dem(np.tile(0.01 * east, (201, 1)), -1000.0, -1000.0, 10.0, 10.0, "local", frame)
+    flat = Site("flat", frame, {"A": tower("A", 0.0, 0.0)})
+    hilly = replace(flat, dem=slope)
+    line_of_sight = settings(max_depth=0, foliage=("none",))
+    there = np.array([[500.0, 40.0, 30.0]])
+    raised = there + np.array([0.0, 0.0, 5.0])  # 1 % over 500 m
+    found = mapping.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
+    expected = mapping.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
+    assert found.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
+    level = mapping.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
+    assert abs(found.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
 
 
 def test_a_threshold_puts_weak_positions_out_of_coverage(site):
@@ -224,12 +245,30 @@ def test_the_page_shows_every_figure_of_the_paper_rows(made):
     assert (states["paper"], states["ours"]) == ("36 x 71 = 2556", "6 x 11 = 66")
 
 
+def test_the_paper_page_has_the_rows_that_a_run_prints(made):
+    page = (Path(__file__).parents[1] / "docs" / "paper.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    numbers = {tuple(row[:3]) for row in rows if len(row) == 5}
+    printed = {(row["where"], row["what"], row["paper"]) for row in made[1]["paper"]}
+    assert printed <= numbers
+    figures = {row[0] for row in rows}
+    assert {"Table I", "Table II", "Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Fig. 5, 6"} <= figures
+    assert {f"Fig. {n}" for n in range(7, 16)} <= figures
+
+
 def test_netcdf_is_written_where_its_library_is(made):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")
     with xarray.open_dataset(made[0] / "maps.nc") as data:
         assert data["rank_k10_h030m_LW3_opaque"].shape == (11, 6)
         assert data.attrs["Conventions"].startswith("CF-")
+
+
+def test_geotiff_is_written_where_its_library_is(made):
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(made[0] / "maps.tif") as data:
+        assert data.shape == (11, 6)
+        assert data.count > 10
 
 
 @pytest.mark.parametrize(

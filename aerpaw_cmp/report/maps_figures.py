@@ -164,7 +164,9 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     low, high = np.percentile(finite, [1, 99]) if len(finite) else (0.0, 1.0)
     options: dict[str, Any] = {"cmap": "cividis", "vmin": low, "vmax": high}
     if layers[0].difference:
-        reach = max(abs(low), abs(high), 1e-9)
+        reach = max(abs(low), abs(high))
+        if reach < 1e-6:  # few positions change: their own range
+            reach = max(float(np.abs(finite).max(initial=0.0)), 1e-6)
         options = {"cmap": "cividis", "vmin": -reach, "vmax": reach}  # dark to light: signs differ in grey too
     image = None
     for ax, one in zip(axes, layers, strict=True):

@@ -90,7 +90,8 @@ def warnings(data: ReportData) -> list[str]:
     found = list(data.warnings)
     if data.synthetic:
         found.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
-    if data.site.illustrative:
+    trees = "" if data.engine is None else data.engine.settings.get("foliage", "")
+    if data.site.illustrative and (data.site.buildings or trees not in ("", "none")):
         found.append(
             f"Buildings and forests of {data.site.name} are illustrative, not surveyed: reflections and blockage "
             "show the method, not the place."

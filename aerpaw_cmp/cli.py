@@ -502,3 +502,95 @@ def map_(
     for path in outcome.files:
         if path.parent == outcome.folder:
             print(path)
+
+
+@app.command(help=COMMANDS["campaign"])
+def campaign(
+    campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    workers: Annotated[int, typer.Option(min=1, help="Processes that share the flights and settings.")] = 1,
+    cluster: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler, in place of processes.")] = None,  # noqa: UP045
+    strict: Annotated[
+        bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
+    ] = False,
+    as_json: Json = False,
+) -> int:
+    """Many flights and settings, with what can be said only of several flights."""
+    from . import run
+
+    outcome = run.run_campaign(
+        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, progress=_say
+    )
+    if as_json:
+        _print_json(outcome.metrics)
+    else:
+        _print_campaign_summary(outcome)
+    for check in outcome.failed_checks:
+        _say(f"failed: {check}")
+    if outcome.nothing_done:
+        return 3
+    return 1 if strict and outcome.failed_checks else 0
+
+
+def _print_campaign_summary(outcome: Any) -> None:
+    m = outcome.metrics
+    names = list(next(iter(m["mean_rmse_db"].values()), {}))
+    rows = [[s, *[_number(by[f], "{:.2f}") for f in names]] for s, by in m["mean_rmse_db"].items()]
+    if names:
+        _table(["setting", *names], rows, "Mean RMSE over towers and channels (dB), own offsets")
+    rows = [
+        [
+            r["setting"],
+            r["flight"],
+            r["tower"],
+            f"{r['k']:g}",
+            _number(r["total_variation"], "{:.3f}"),
+            _number(r["agreement"], "{:.2f}"),
+            _number(r["kappa"], "{:.2f}"),
+        ]
+        for r in m["rank"]
+    ]
+    if rows:
+        _table(["setting", "flight", "tower", "K", "total variation", "agreement", "kappa"], rows, "Rank")
+    rows = [
+        [g["setting"], g["group"], _number(g["offset_db"], "{:.1f}"), _number(g["spread_db"], "{:.2f}"),
+         _number(g["own_rmse_db"], "{:.2f}"), _number(g["pooled_rmse_db"], "{:.2f}")]
+        for g in m["calibration"]["groups"]
+    ]  # fmt: skip
+    if rows and m["calibration"]["per"] != "link":
+        header = ["setting", "group", "offset dB", "spread of own dB", "RMSE own dB", "RMSE shared dB"]
+        _table(header, rows, f"Offsets shared per {m['calibration']['per']}")
+    rows = [
+        [f"{p['tower']} {p['channel']}", f"{p['first']}, {p['second']}", str(p["n"]), _number(p["rmse_db"], "{:.2f}"),
+         _number(p["place_correlation"], "{:.2f}")]
+        for p in m["repeatability"]["pairs"]
+    ]  # fmt: skip
+    if rows:
+        _table(
+            ["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, "Same places, two flights"
+        )
+    rows = [
+        [", ".join(fold["fitted_on"]), r["flight"], f"{r['tower']} {r['channel']}",
+         "fitted here" if r["fitted_here"] else "transferred", _number(r["start_rmse_db"], "{:.2f}"),
+         _number(r["rmse_db"], "{:.2f}"), _number(r["transferred_rmse_db"], "{:.2f}")]
+        for fold in m["held_out"]["folds"]
+        for r in fold["scores"]
+    ]  # fmt: skip
+    if rows:
+        header = [
+            "fitted on",
+            "flight",
+            "link",
+            "parameters",
+            "as written dB",
+            "with the fit dB",
+            "offset transferred dB",
+        ]
+        _table(header, rows, "Held-out fit, RMSE")
+    for fold in m["held_out"]["folds"]:
+        print(
+            f"fitted on {', '.join(fold['fitted_on'])}: "
+            + ", ".join(f"{k} = {v:g}" for k, v in fold["parameters"].items())
+        )
+    print(f"report: {outcome.folder / 'campaign.html'}")

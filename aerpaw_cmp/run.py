@@ -417,3 +417,56 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
         raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
     line = np.column_stack([track.east_m, track.north_m])
     return line[np.isfinite(line).all(axis=1)], settings.flight.name
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignOutcome:
+    """What ``aerpaw-cmp campaign`` made: the folder, campaign.json as a dict, failures, and whether all failed."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    failed_checks: tuple[str, ...]
+    nothing_done: bool
+
+
+def run_campaign(
+    path: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
+    progress: Progress = _silent,
+) -> CampaignOutcome:
+    """Many flights and settings: replay, compare, pool, hold out, report.
+
+    Raises
+    ------
+    UsageError
+        A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
+    """
+    from dataclasses import replace
+
+    from .campaign import load_campaign
+    from .campaign import run as run_all
+    from .report.campaign_html import campaign_metrics, warnings, write_campaign
+
+    stages = Stages(progress)
+    data = run_all(
+        load_campaign(path),
+        path.parent,
+        logs_root=logs_root,
+        workers=workers,
+        cluster=cluster,
+        stage=stages,
+        progress=progress,
+    )
+    folder = out or Path("reports") / data.name
+    with stages("report"):
+        write_campaign(replace(data, stages_s=dict(stages.seconds)), folder)
+    edges = [text for text in warnings(data) if "edge of the searched span" in text]
+    failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
+    if data.held_out_failure:
+        failed.append(f"held-out fit: {data.held_out_failure}")
+    metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
+    return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))

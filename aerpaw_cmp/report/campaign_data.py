@@ -1,0 +1,279 @@
+"""What a campaign page is made of: finished numbers of many flights and settings, nothing to be computed."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..site.site import Site
+from ..units import FloatArray
+from .data import Interval
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssRow:
+    """RSS of one flight, setting, tower and channel.
+
+    ``offset_db`` and ``rmse_db`` come from this row's own samples; ``pooled_offset_db`` is shared as the campaign's
+    ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row. ``baselines`` are RMSE [dB] by name, each with
+    an offset of its own. Arrays (n,) are at the samples, NaN where a side is missing; ``span_db`` and ``step_db`` are
+    those of the offset search; ``within`` is the repeatability of the flight's two halves.
+    """
+
+    flight: str
+    setting: str
+    tower: str
+    channel: str
+    unit: str
+    offset_db: float
+    rmse_db: float
+    correlation: float
+    n: int
+    n_out_of_coverage: int
+    at_search_edge: bool
+    rmse_ci95_db: Interval | None
+    offset_ci95_db: Interval | None
+    correlation_ci95: Interval | None
+    n_effective: float
+    lag_s: float
+    lag_verdict: str
+    fitted: tuple[str, ...]
+    baselines: Mapping[str, float]
+    step_db: float
+    span_db: tuple[float, float]
+    time_s: FloatArray = field(repr=False)
+    measured_db: FloatArray = field(repr=False)
+    simulated_dbm: FloatArray = field(repr=False)
+    position_m: FloatArray = field(repr=False)
+    distance_m: FloatArray = field(repr=False)
+    heading_deg: FloatArray | None = field(repr=False, default=None)
+    within: Mapping[str, Any] = field(default_factory=dict)
+    pooled_offset_db: float = float("nan")
+    pooled_rmse_db: float = float("nan")
+
+    @property
+    def key(self) -> tuple[str, str, str]:
+        """Flight, tower, channel."""
+        return self.flight, self.tower, self.channel
+
+    @property
+    def link(self) -> str:
+        """Tower and channel as one label."""
+        return f"{self.tower} {self.channel}".strip()
+
+    @property
+    def residual_db(self) -> FloatArray:
+        """Measurement after this row's own offset, minus simulation (n,)."""
+        return self.measured_db + self.offset_db - self.simulated_dbm
+
+
+def place_means(row: RssRow, cell_m: float) -> dict[tuple[int, int], tuple[float, float]]:
+    """Mean residual [dB] and mean height [m] of each square cell of the plan that has a scored sample."""
+    good = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
+    cells = np.floor(row.position_m[good, :2] / cell_m).astype(np.int64)
+    found, which = np.unique(cells, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    count = np.bincount(which, minlength=len(found))
+    residual = np.bincount(which, weights=row.residual_db[good], minlength=len(found)) / np.maximum(count, 1)
+    height = np.bincount(which, weights=row.position_m[good, 2], minlength=len(found)) / np.maximum(count, 1)
+    return {
+        (int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(found, residual, height, strict=True)
+    }  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankRow:
+    """Rank of one flight, setting, tower and K."""
+
+    flight: str
+    setting: str
+    tower: str
+    k: float
+    n: int
+    n_out_of_coverage: int
+    agreement: float
+    agreement_ci95: Interval | None
+    kappa: float
+    total_variation: float
+    total_variation_ci95: Interval | None
+    wasserstein: float
+    best_k: float
+    best_k_ci95: Interval | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Failure:
+    """A flight (and setting) that gave no numbers, and why."""
+
+    flight: str
+    setting: str
+    message: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PooledOffset:
+    """One shared offset.
+
+    ``spread_db`` is the standard deviation of the members' own offsets (NaN for one member), ``range_db`` their
+    extremes; ``own_rmse_db`` and ``pooled_rmse_db`` are means over the members.
+    """
+
+    setting: str
+    group: str
+    members: tuple[str, ...]
+    offset_db: float
+    spread_db: float
+    range_db: Interval
+    own_rmse_db: float
+    pooled_rmse_db: float
+    at_search_edge: bool
+    units: tuple[str, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repeat:
+    """Two flights over the same places, one tower and channel.
+
+    Parameters
+    ----------
+    rmse_db : float
+        RMS difference of the two measurements after the best constant ``offset_db`` (second minus first) [dB].
+    share : float
+        Pairs over samples of the first flight: a few pairs near the launch pad speak for that place only.
+    single_db : float
+        ``rmse_db / sqrt(2)``: the share of one pass, if both err alike and independently.
+    residual_rmse_db : float
+        The same difference after the simulation's own difference has been taken off.
+    place_rmse_db : float
+        RMS difference of the mean residuals per cell of the plan, whatever the heights.
+    place_correlation : float
+        Correlation of the mean residuals per cell of the plan: near 1, the model errs the same way on both flights.
+    cells : int
+        Cells that both flights have.
+    height_difference_m : float
+        Median over those cells [m].
+    """
+
+    tower: str
+    channel: str
+    first: str
+    second: str
+    n: int
+    share: float
+    rmse_db: float
+    rmse_ci95_db: Interval | None
+    offset_db: float
+    single_db: float
+    residual_rmse_db: float
+    place_rmse_db: float
+    place_correlation: float
+    cells: int
+    height_difference_m: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutRow:
+    """One flight, tower and channel under one fit.
+
+    ``fitted_here`` says that the parameters were fitted on this very flight. ``start_rmse_db`` is with the parameters
+    as written, ``rmse_db`` with the fitted ones, both with an offset of the row's own samples;
+    ``transferred_rmse_db`` also takes the offset from the flights of the fit (NaN on those flights).
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    fitted_here: bool
+    n: int
+    start_rmse_db: float
+    rmse_db: float
+    transferred_offset_db: float
+    transferred_rmse_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class HeldOutFold:
+    """Parameters fitted on some flights and scored on all."""
+
+    setting: str
+    fitted_on: tuple[str, ...]
+    applied_to: tuple[str, ...]
+    parameters: Mapping[str, float]
+    at_bounds: tuple[str, ...]
+    evaluations: int
+    method: str
+    rows: tuple[HeldOutRow, ...]
+    without_effect: tuple[str, ...] = ()
+    """Parameters that change no flight of the fit by a hundredth of a dB: their values mean nothing."""
+    curves: Mapping[str, Mapping[str, tuple[FloatArray, FloatArray]]] = field(default_factory=dict)
+    """By parameter and flight: values tried, and RMSE [dB] with the other parameters as fitted."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankTransfer:
+    """Total variation of one flight at the K that the other flights would have chosen.
+
+    ``k`` has the least mean total variation on ``chosen_on`` among the K of the flight files; ``own_k`` on the
+    flight itself.
+    """
+
+    setting: str
+    flight: str
+    tower: str
+    chosen_on: tuple[str, ...]
+    k: float
+    total_variation: float
+    kappa: float
+    own_k: float
+    own_total_variation: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownTrack:
+    """Where one flight was sampled: ``time_s`` (n,) after its first sample, ``position_m`` (n, 3)."""
+
+    flight: str
+    time_s: FloatArray
+    position_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignData:
+    """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order."""
+
+    name: str
+    title: str
+    generated: str
+    versions: Mapping[str, str]
+    calibration: str
+    flights: tuple[str, ...]
+    settings: Mapping[str, Mapping[str, Any]]
+    rss: tuple[RssRow, ...] = ()
+    rank: tuple[RankRow, ...] = ()
+    failures: tuple[Failure, ...] = ()
+    pooled: tuple[PooledOffset, ...] = ()
+    repeats: tuple[Repeat, ...] = ()
+    held_out: tuple[HeldOutFold, ...] = ()
+    held_out_failure: str = ""
+    rank_transfers: tuple[RankTransfer, ...] = ()
+    tracks: tuple[FlownTrack, ...] = ()
+    radius_m: float = 5.0
+    heading_within_deg: float | None = 20.0
+    cell_m: float = 20.0
+    site: Site | None = None
+    synthetic: tuple[str, ...] = ()
+    stages_s: Mapping[str, float] = field(default_factory=dict)
+    workers: int = 1
+
+    @property
+    def reference(self) -> str:
+        """The setting that overlays and repeatability are drawn for: the first."""
+        return next(iter(self.settings), "")
+
+    @property
+    def reference_rows(self) -> tuple[RssRow, ...]:
+        """RSS rows of that setting."""
+        return tuple(row for row in self.rss if row.setting == self.reference)

@@ -1,0 +1,355 @@
+"""Figures of a campaign: flights laid over each other, settings side by side, fits of held-out parameters."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..site.site import Site
+from ..units import FloatArray
+from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
+from .export import k_key, safe_name
+from .figures import (
+    BASELINE,
+    Plate,
+    colour_bar,
+    draw_site,
+    figure,
+    frame_around,
+    plan_axes,
+    plan_shape,
+    pretty,
+    thinned,
+    thinned_plan,
+)
+from .maps_figures import COLOURS, LINES, MARKERS, grouped
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+DISTANCE_BINS = 30
+FEWEST_PER_BIN = 8
+"""Samples that a bin needs before it gets a median and a band."""
+
+MAPS_PER_ROW = 3
+
+TALLEST = 40.0
+"""No figure is higher than this [inch], however many flights there are."""
+
+
+def look(number: int) -> dict[str, Any]:
+    """Colour and line style of the flight with this number, told apart in grey by the dashes."""
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": LINES[(number + number // len(COLOURS)) % len(LINES)]}
+
+
+def binned(quantity: FloatArray, values: FloatArray, edges: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Percentiles 10, 50 and 90 of the values in each bin that has enough.
+
+    Returns
+    -------
+    (middle, percentiles) : (b,), (b, 3)
+        ``middle`` is the mean of the quantity in the bin.
+    """
+    good = np.isfinite(quantity) & np.isfinite(values)
+    which = np.digitize(quantity[good], edges)
+    middle, levels = [], []
+    for number in range(1, len(edges)):
+        inside = which == number
+        if inside.sum() >= FEWEST_PER_BIN:
+            middle.append(float(quantity[good][inside].mean()))
+            levels.append(np.percentile(values[good][inside], [10, 50, 90]))
+    return np.array(middle), np.array(levels).reshape(-1, 3)
+
+
+def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
+    """RSS after the offset against distance, and its difference to the simulation below, all flights on one axis."""
+    fig = figure((9.2, 6.4))
+    top, low = fig.subplots(2, 1, sharex=True, height_ratios=(1.5, 1.0))
+    reach = max((float(np.nanmax(r.distance_m)) for r in rows if np.isfinite(r.distance_m).any()), default=1.0)
+    edges = np.linspace(0.0, reach * 1.001, DISTANCE_BINS + 1)
+    for row in rows:
+        style = look(numbers[row.flight])
+        for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
+            middle, levels = binned(row.distance_m, values, edges)
+            ax.fill_between(middle, levels[:, 0], levels[:, 2], color=style["color"], alpha=0.15, linewidth=0)
+            ax.plot(middle, levels[:, 1], linewidth=1.8, label=f"{row.flight}, measured + offset", **style)
+        middle, levels = binned(
+            row.distance_m, np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan), edges
+        )
+        top.plot(
+            middle, levels[:, 1], linestyle="none", marker=MARKERS[numbers[row.flight] % len(MARKERS)], markersize=4.5,
+            markerfacecolor="white", color=style["color"], label=f"{row.flight}, ray tracing",
+        )  # fmt: skip
+    low.axhline(0.0, color="black", linewidth=0.8)
+    top.set_ylabel("Received power [dBm]")
+    low.set_ylabel("Measured - simulated [dB]")
+    low.set_xlabel("Distance tower to UAV [m]")
+    fig.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return fig
+
+
+def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
+    """All flights on the plan, and their heights over time."""
+    firsts = data.tracks
+    towers = dict.fromkeys([*(row.tower for row in data.rss), *(row.tower for row in data.rank)])
+    fig = figure((9.2, 4.9))
+    plan, height = fig.subplots(1, 2, width_ratios=(1.15, 1.0))
+    draw_site(plan, site)
+    for row in firsts:
+        number = numbers[row.flight]
+        east, north = thinned_plan(row.position_m[:, 0], row.position_m[:, 1])
+        width = 1.2 + 2.4 * (len(firsts) - 1 - number % len(firsts)) / max(len(firsts) - 1, 1)
+        plan.plot(east, north, linewidth=width, label=row.flight, zorder=4, **look(number))
+        height.plot(*thinned(row.time_s, row.position_m[:, 2]), linewidth=1.4, label=row.flight, **look(number))
+    east = np.concatenate([row.position_m[:, 0] for row in firsts])
+    north = np.concatenate([row.position_m[:, 1] for row in firsts])
+    used = [site.towers[name] for name in towers if name in site.towers]
+    east = np.concatenate([east, [t.east_m for t in used]])
+    north = np.concatenate([north, [t.north_m for t in used]])
+    frame_around(plan, east, north)
+    plan.set_title("Plan")
+    height.set_title("Height")
+    height.set_xlabel("Time after the first radio sample of each flight [s]")
+    height.set_ylabel("Height above ground [m]")
+    handles, labels = plan.get_legend_handles_labels()
+    fig.legend(handles, labels, loc="outside lower center", ncols=4)
+    return fig
+
+
+def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
+    """Mean residual per cell of the plan, flights side by side on one scale."""
+    means = [place_means(row, data.cell_m) for row in rows]
+    cells = np.array([cell for found in means for cell in found]).reshape(-1, 2)
+    values = np.array([mean for found in means for mean, _ in found.values()])
+    reach = float(np.percentile(np.abs(values), 98)) if len(values) else 1.0
+    east, north = (cells.T + 0.5) * data.cell_m
+    columns = min(len(rows), MAPS_PER_ROW)
+    lines = -(-len(rows) // columns)
+    shape = plan_shape(east, north)
+    width = 8.0 / columns
+    fig = figure((9.2, 0.9 + lines * min(width / shape + 0.5, 6.0)))
+    axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
+    mesh: Any = None
+    for ax in axes.ravel()[len(rows) :]:
+        ax.set_visible(False)
+    for ax, row, found in zip(axes.ravel(), rows, means, strict=False):
+        first, last = cells.min(axis=0), cells.max(axis=0)
+        image = np.full((last[1] - first[1] + 1, last[0] - first[0] + 1), np.nan)
+        for (e, n), (mean, _) in found.items():
+            image[n - first[1], e - first[0]] = mean
+        extent = np.array([first[0], last[0] + 1, first[1], last[1] + 1]) * data.cell_m
+        ax.set_facecolor("#F4F4F4")
+        mesh = ax.imshow(
+            image, origin="lower", extent=tuple(extent), cmap="cividis", vmin=-reach, vmax=reach, interpolation="none",
+            zorder=2,
+        )  # fmt: skip
+        tower = None if data.site is None else data.site.towers.get(row.tower)
+        if tower is not None:
+            ax.plot(
+                tower.east_m, tower.north_m, marker="^", markersize=9, color="#C1121F", markeredgecolor="white",
+                linestyle="none", zorder=5, label=f"tower {row.tower}",
+            )  # fmt: skip
+            east, north = np.append(east, tower.east_m), np.append(north, tower.north_m)
+        plan_axes(ax)
+        ax.set_title(row.flight)
+        ax.label_outer()
+    frame_around(axes[0][0], east, north, shape=shape)
+    if mesh is not None:
+        colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured - simulated [dB]")
+    handles, labels = axes[0][0].get_legend_handles_labels()
+    if handles:
+        fig.legend(handles, labels, loc="outside lower center")
+    return fig
+
+
+def settings_rmse(data: CampaignData) -> Figure:
+    """RMSE of every setting, flight and link with its interval; baselines and repeatability beside it."""
+    groups = list(grouped(data.rss, lambda r: (r.flight, r.link)).items())
+    names = list(data.settings)
+    step = len(names) + 1.0
+    fig = figure((9.2, min(1.6 + 0.26 * step * len(groups), TALLEST)))
+    ax = fig.subplots()
+    ticks, labels = [], []
+    for index, ((flight, link), rows) in enumerate(groups):
+        by = {row.setting: row for row in rows}
+        at = [index * step + number for number in range(len(names))]
+        ticks.append(float(np.mean(at)))
+        labels.append(f"{flight}\n{link}")
+        if index % 2:
+            ax.axhspan(at[0] - 1.0, at[-1] + 1.0, color="#F3F3F3", zorder=0)
+        for number, (name, y) in enumerate(zip(names, at, strict=True)):
+            row = by.get(name)
+            if row is None:
+                continue
+            low, high = row.rmse_ci95_db or (np.nan, np.nan)
+            ax.plot([low, high], [y, y], color=COLOURS[number % len(COLOURS)], linewidth=1.2)
+            ax.plot(
+                row.rmse_db, y, marker=MARKERS[number % len(MARKERS)], markersize=6, linestyle="none",
+                color=COLOURS[number % len(COLOURS)], label=name if index == 0 else None, zorder=3,
+            )  # fmt: skip
+        for name, value in rows[0].baselines.items():
+            colour, line = BASELINE.get(name, ("#777777", ":"))
+            label = f"{pretty(name)} (own offset)" if index == 0 else None
+            ax.plot(
+                [value, value], [at[0] - 0.6, at[-1] + 0.6], color=colour, linestyle=line, linewidth=1.5, label=label
+            )
+        floors = [r for r in data.repeats if flight in (r.first, r.second) and f"{r.tower} {r.channel}".strip() == link]
+        floors = [r for r in floors if np.isfinite(r.rmse_db)]
+        if floors:
+            best = max(floors, key=lambda r: r.n)
+            floor = best.rmse_db
+            label = f"two flights, same places ({100 * best.share:.0f} % of samples)" if index == 0 else None
+            ax.plot([floor, floor], [at[0] - 0.6, at[-1] + 0.6], color="#888888", linewidth=3.5, alpha=0.7, label=label)
+    ax.set_yticks(ticks, labels)
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+    ax.set_xlim(left=0.0)
+    ax.set_xlabel("RMSE after the row's own offset, with 95 % interval [dB]")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return fig
+
+
+def rank_tv(data: CampaignData) -> Figure:
+    """Total variation of every flight and K, settings side by side, with intervals."""
+    groups = list(grouped(data.rank, lambda r: (r.flight, r.tower, r.k)).items())
+    names = list(data.settings)
+    step = len(names) + 0.8
+    fig = figure((9.2, min(1.5 + 0.2 * step * len(groups), TALLEST)))
+    ax = fig.subplots()
+    shown: set[str] = set()
+    for index, (_key, rows) in enumerate(groups):
+        if index % 2:
+            ax.axhspan((index - 0.1) * step - 0.4, (index + 0.9) * step - 0.4, color="#F3F3F3", zorder=0)
+        for row in rows:
+            number = names.index(row.setting)
+            y = index * step + number
+            style: dict[str, Any] = {"color": COLOURS[number % len(COLOURS)]}
+            ax.plot(row.total_variation_ci95 or (np.nan, np.nan), [y, y], linewidth=1.2, **style)
+            label = None if row.setting in shown else row.setting
+            shown.add(row.setting)
+            ax.plot(
+                row.total_variation, y, marker=MARKERS[number % len(MARKERS)], linestyle="none", label=label, **style
+            )
+    middle = (len(names) - 1) / 2
+    labels = [f"{flight}, {tower}, K = {k_key(k)}" for (flight, tower, k), _ in groups]
+    ax.set_yticks([index * step + middle for index in range(len(groups))], labels)
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+    ax.set_xlim(0.0, 1.02)
+    ax.set_xlabel("Total variation, measured against simulated rank")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return fig
+
+
+def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
+    """RMSE of every flight along each parameter, the fitted value marked."""
+    columns = min(len(fold.curves), 3)
+    lines = -(-len(fold.curves) // columns)
+    fig = figure((9.2, 0.9 + 2.9 * lines))
+    axes = fig.subplots(lines, columns, squeeze=False)
+    for ax in axes.ravel()[len(fold.curves) :]:
+        ax.set_visible(False)
+    for ax, (name, flights) in zip(axes.ravel(), fold.curves.items(), strict=False):
+        for flight, (tried, error) in flights.items():
+            role = "fitted on it" if flight in fold.fitted_on else "held out"
+            number = numbers.get(flight, 0)
+            ax.plot(
+                tried, error, linewidth=1.6, label=f"{flight} ({role})", marker=MARKERS[number % len(MARKERS)],
+                markersize=3.5, **look(number),
+            )  # fmt: skip
+        ax.axvline(fold.parameters[name], color="#888888", linewidth=2.5, alpha=0.6, label="fitted value")
+        ax.set_xlabel(name, fontsize=8)
+        ax.set_ylabel("RMSE [dB]")
+    fig.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return fig
+
+
+def plates(data: CampaignData) -> list[Plate]:
+    """Every figure that the campaign has numbers for."""
+    numbers = {track.flight: number for number, track in enumerate(data.tracks)}
+    found: list[Plate] = []
+    if data.rss:
+        found.append(
+            Plate(
+                name="settings_rmse",
+                section="result",
+                title="RMSE of every setting and flight",
+                caption="Each row has its own best offset. Lines: 95 % interval from blocks as long as the residual "
+                "remembers. The grey bar is what two flights differ by at the same "
+                "places (the pair with most of them); where few samples have a pair, it speaks for those places only.",
+                alt="RMSE per setting, flight and link, with baselines",
+                draw=lambda: settings_rmse(data),
+            )
+        )
+    if data.rank:
+        found.append(
+            Plate(
+                name="rank_tv",
+                section="result",
+                title="Total variation of rank, every setting and flight",
+                caption="Distance between the histograms of measured and simulated rank, 0 when equal, 1 when apart, "
+                "with 95 % intervals. Equal histograms do not mean that ranks agree pose by pose: see kappa.",
+                alt="Total variation per flight, K and setting",
+                draw=lambda: rank_tv(data),
+            )
+        )
+    if numbers and data.site is not None:
+        site = data.site
+        found.append(
+            Plate(
+                name="tracks",
+                section="overlay",
+                title="The flights laid over each other",
+                caption="Where the radio was sampled.",
+                alt="Plan of all flights, and their heights over time",
+                draw=lambda: tracks(data, site, numbers),
+            )
+        )
+    for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
+        found += _link_plates(data, link, rows, numbers)
+    for number, fold in enumerate(data.held_out):
+        found.append(_fold_plate(fold, number, numbers))
+    return found
+
+
+def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[Plate]:
+    heard = [row for row in rows if row.n > 0]
+    if not heard:
+        return []
+    return [
+        Plate(
+            name=f"distance_{safe_name(link)}",
+            section="overlay",
+            title=f"{link}: RSS against distance, all flights",
+            caption=f"Setting: {data.reference}. "
+            f"Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
+            "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
+            alt=f"Medians of measured and simulated RSS of {link} against distance for each flight",
+            draw=lambda: against_distance(heard, numbers),
+        ),
+        Plate(
+            name=f"places_{safe_name(link)}",
+            section="overlay",
+            title=f"{link}: where the simulation errs, flight by flight",
+            caption=f"Mean residual in cells of {data.cell_m:g} m, all heights together, one colour scale. "
+            "A pattern that "
+            "comes back on another flight is an error of the model; one that does not is of that flight.",
+            alt=f"Maps of the mean residual of {link}, one per flight",
+            draw=lambda: places(data, heard),
+        ),
+    ]
+
+
+def _fold_plate(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> Plate:
+    on = ", ".join(fold.fitted_on)
+    return Plate(
+        name=f"held_out_{number + 1}",
+        section="held_out",
+        title=f"Fitted on {on}",
+        caption="RMSE along each parameter, the others as fitted; every point has its own offset. A flight whose least "
+        "RMSE lies elsewhere does not support the fit.",
+        alt=f"RMSE against each parameter, fitted on {on}",
+        draw=lambda: held_out_curves(fold, numbers),
+    )

@@ -1,0 +1,269 @@
+"""campaign.html, campaign.json and campaign.csv, with the figures beside them."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from . import campaign_figures, figures
+from .campaign_data import CampaignData, RankRow, RssRow
+from .export import json_safe, k_key, write_atomic
+from .figures import Picture
+from .html import CONTENT_POLICY, environment
+
+FEW_PAIRS = 0.25
+"""Below this share of samples with a pair, a repeatability floor is that of a few places."""
+
+OWN_FIGURES = re.compile(r"(settings_rmse|rank_tv|tracks|(distance|places|held_out)_[A-Za-z0-9._-]+)\.(svg|png)")
+"""Names of figures that an earlier campaign may have left in the folder."""
+
+ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
+"""Fields of a row that are samples, not numbers of a table."""
+
+
+def _entries(items: Iterable[Any], without: Sequence[str] = ()) -> list[dict[str, Any]]:
+    return [{f.name: getattr(x, f.name) for f in dataclasses.fields(x) if f.name not in without} for x in items]
+
+
+def rss_flights(data: CampaignData) -> list[str]:
+    """Flights that have RSS, and those that failed: a flight with rank alone has no RMSE to miss."""
+    ranked = {row.flight for row in data.rank} - {row.flight for row in data.rss}
+    return [name for name in data.flights if name not in ranked]
+
+
+def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
+    """Mean RMSE over the links of each setting and flight [dB]; NaN where there is none."""
+    table: dict[str, dict[str, float]] = {}
+    for setting in data.settings:
+        table[setting] = {}
+        for flight in rss_flights(data):
+            values = [r.rmse_db for r in data.rss if r.setting == setting and r.flight == flight]
+            known = [v for v in values if np.isfinite(v)]
+            table[setting][flight] = float(np.mean(known)) if known else float("nan")
+    return table
+
+
+def campaign_metrics(data: CampaignData) -> dict[str, Any]:
+    """The numbers of the page under stable names; what does not exist is None."""
+    failed = {f.flight for f in data.failures}
+    result = {
+        "campaign": data.name,
+        "title": data.title,
+        "generated": data.generated,
+        "versions": dict(sorted(data.versions.items())),
+        "flights": [
+            {"flight": name, "ok": name not in failed, "synthetic": name in data.synthetic} for name in data.flights
+        ],
+        "settings": data.settings,
+        "reference": data.reference,
+        "failures": _entries(data.failures),
+        "mean_rmse_db": mean_rmse(data),
+        "rss": _entries(data.rss, ARRAYS),
+        "rank": _entries(data.rank),
+        "rank_transfers": _entries(data.rank_transfers),
+        "calibration": {"per": data.calibration, "groups": _entries(data.pooled)},
+        "repeatability": {
+            "radius_m": data.radius_m,
+            "heading_within_deg": data.heading_within_deg,
+            "cell_m": data.cell_m,
+            "pairs": _entries(data.repeats),
+        },
+        "held_out": {
+            "failure": data.held_out_failure or None,
+            "folds": [
+                {**_entries([fold], ("rows", "curves"))[0], "scores": _entries(fold.rows)} for fold in data.held_out
+            ],
+        },
+        "workers": data.workers,
+        "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
+    }
+    safe: dict[str, Any] = json_safe(result)
+    return safe
+
+
+def campaign_frame(data: CampaignData) -> pd.DataFrame:
+    """One row per flight, setting, tower and channel (``kind`` rss) or K (``kind`` rank), and per failure."""
+    rows: list[dict[str, Any]] = [_rss_line(row) for row in data.rss]
+    rows += [_rank_line(row) for row in data.rank]
+    rows += [
+        {"kind": "failed", "flight": f.flight, "setting": f.setting, "message": f.message} for f in data.failures
+    ]  # fmt: skip
+    frame: pd.DataFrame = pd.DataFrame(rows, columns=CSV_COLUMNS)
+    return frame
+
+
+CSV_COLUMNS = [
+    "kind", "flight", "setting", "tower", "channel", "k", "offset_db", "offset_low_db", "offset_high_db", "rmse_db",
+    "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
+    "n_out_of_coverage", "correlation", "correlation_low", "correlation_high", "at_search_edge", "lag_s", "lag_verdict",
+    "fitted", "total_variation", "total_variation_low", "total_variation_high", "agreement", "agreement_low",
+    "agreement_high", "kappa", "wasserstein", "best_k", "message",
+]  # fmt: skip
+
+
+def _bounds(name: str, value: tuple[float, float] | None, end: str = "") -> dict[str, float]:
+    low, high = value or (float("nan"), float("nan"))
+    return {f"{name}_low{end}": low, f"{name}_high{end}": high}
+
+
+def _rss_line(row: RssRow) -> dict[str, Any]:
+    names = (
+        "flight", "setting", "tower", "channel", "offset_db", "rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
+        "n_out_of_coverage", "correlation", "at_search_edge", "lag_s", "lag_verdict",
+    )  # fmt: skip
+    return {
+        "kind": "rss",
+        **{name: getattr(row, name) for name in names},
+        **_bounds("offset", row.offset_ci95_db, "_db"),
+        **_bounds("rmse", row.rmse_ci95_db, "_db"),
+        **_bounds("correlation", row.correlation_ci95),
+        **{f"{name}_rmse_db": value for name, value in row.baselines.items()},
+        "fitted": " ".join(row.fitted),
+    }
+
+
+def _rank_line(row: RankRow) -> dict[str, Any]:
+    names = (
+        "flight", "setting", "tower", "k", "n", "n_out_of_coverage", "total_variation", "agreement", "kappa",
+        "wasserstein", "best_k",
+    )  # fmt: skip
+    return {
+        "kind": "rank",
+        **{name: getattr(row, name) for name in names},
+        **_bounds("total_variation", row.total_variation_ci95),
+        **_bounds("agreement", row.agreement_ci95),
+    }
+
+
+def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
+    """Each pair of flights with the RMSE of both under the reference setting."""
+    rmse = {row.key: row.rmse_db for row in data.reference_rows}
+    return [
+        (
+            pair,
+            rmse.get((pair.first, pair.tower, pair.channel), float("nan")),
+            rmse.get((pair.second, pair.tower, pair.channel), float("nan")),
+        )
+        for pair in data.repeats
+    ]
+
+
+def headline(data: CampaignData) -> list[str]:
+    """The result in a few sentences."""
+    out = []
+    table = mean_rmse(data)
+    means = {s: np.array([v for v in by.values() if np.isfinite(v)]) for s, by in table.items()}
+    means = {s: v for s, v in means.items() if len(v)}
+    if means:
+        best = min(means, key=lambda s: float(means[s].mean()))
+        spread = np.ptp([v.mean() for v in means.values()])
+        out.append(
+            "Mean RMSE over flights and links: "
+            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in means.items())
+            + (f". Least: {best}." if spread > 0.005 else ".")
+        )
+    for setting in data.settings:
+        moved = [t for t in data.rank_transfers if t.setting == setting]
+        if moved:
+            out.append(
+                f"Rank, {setting}: at the K that the other flights choose, the total variation is "
+                + ", ".join(f"{t.total_variation:.3f} on {t.flight} (K = {k_key(t.k)})" for t in moved)
+                + "."
+            )
+    if data.repeats:
+        pairs = [p for p in data.repeats if p.n > 0]
+        if pairs:
+            mean = float(np.mean([p.rmse_db for p in pairs]))
+            share = 100 * float(np.mean([p.share for p in pairs]))
+            out.append(
+                f"Two flights at the same places differ by {mean:.1f} dB RMS after one constant "
+                f"({sum(p.n for p in pairs):,} pairs, {share:.0f} % of the samples)."
+            )
+        else:
+            out.append("No two flights pass the same places within the radius, so there is no repeatability floor.")
+    for fold in data.held_out:
+        held = [r for r in fold.rows if not r.fitted_here]
+        if held:
+            out.append(
+                f"Fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} the mean RMSE goes from "
+                f"{np.mean([r.start_rmse_db for r in held]):.2f} to {np.mean([r.rmse_db for r in held]):.2f} dB."
+            )
+    return out
+
+
+def warnings(data: CampaignData) -> list[str]:
+    """What must be known before the numbers are believed."""
+    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
+    if data.held_out_failure:
+        out.append(f"Held-out fit: {data.held_out_failure}")
+    for fold in data.held_out:
+        on = ", ".join(fold.fitted_on)
+        out += [f"Fitted on {on}: {name} ended at a bound of its values." for name in fold.at_bounds]
+        out += [f"Fitted on {on}: {name} has no effect; its value means nothing." for name in fold.without_effect]
+    out += [
+        f"{row.flight}, {row.setting}, {row.link}: the best offset lies at the edge of the searched span."
+        for row in data.rss
+        if row.at_search_edge
+    ]
+    out += [
+        f"{pair.tower} {pair.channel}: only {100 * pair.share:.0f} % of the samples of {pair.first} have a pair on "
+        f"{pair.second}; their repeatability speaks for those places, not for the flights."
+        for pair in data.repeats
+        if 0 < pair.share < FEW_PAIRS
+    ]
+    out += [
+        f"Pooled offset {group.group}: its members are in different units ({', '.join(group.units)})."
+        for group in data.pooled
+        if len(group.units) > 1
+    ]
+    if data.synthetic:
+        out.append("Synthetic flights, made by simulation, that measure nothing: " + ", ".join(data.synthetic) + ".")
+    return list(dict.fromkeys(out))
+
+
+def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
+    """The whole page."""
+    sections: dict[str, list[Picture]] = {}
+    for picture in pictures:
+        sections.setdefault(picture.section, []).append(picture)
+    template = environment().get_template("campaign.html.jinja")
+    text: str = template.render(
+        data=data,
+        sections=sections,
+        mean_rmse=mean_rmse(data),
+        beside=repeatability_beside(data),
+        headline=headline(data),
+        warnings=warnings(data),
+        baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
+        rss_flights=rss_flights(data),
+        pretty=figures.pretty,
+        files=files,
+        content_policy=CONTENT_POLICY,
+    )
+    return text
+
+
+def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
+    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first."""
+    folder = Path(folder)
+    numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
+    written = [write_atomic(folder / "campaign.json", numbers), write_atomic(folder / "campaign.csv", table)]
+    drawn = []
+    for plate in campaign_figures.plates(data):
+        picture = figures.render(plate)
+        drawn.append(picture)
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
+        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    for path in (folder / "figures").glob("*"):
+        if path not in written and OWN_FIGURES.fullmatch(path.name):
+            path.unlink()
+    page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
+    return [page, *written]

@@ -69,7 +69,7 @@ class HeldOutSettings(Settings):
 class RepeatSettings(Settings):
     """When two samples count as taken at the same place, and how residuals are gathered by place."""
 
-    radius_m: Positive = 5.0
+    radius_m: Positive = 3.0
     heading_within_deg: Positive | None = 20.0
     """Headings of a pair agree within this; null: any heading."""
     cell_m: Positive = 20.0

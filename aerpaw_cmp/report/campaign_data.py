@@ -260,7 +260,7 @@ class CampaignData:
     held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
-    radius_m: float = 5.0
+    radius_m: float = 3.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0
     site: Site | None = None

@@ -155,6 +155,16 @@ def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
     ]
 
 
+def halves(data: CampaignData) -> list[tuple[RssRow, Any, Any]]:
+    """Rows whose first and second half pass the same places: with like headings, and with any."""
+    found = []
+    for row in data.reference_rows:
+        same, every = (row.within.get(name) or {} for name in ("same_heading", "any_heading"))
+        if every.get("n"):
+            found.append((row, same, every))
+    return found
+
+
 def headline(data: CampaignData) -> list[str]:
     """The result in a few sentences."""
     out = []
@@ -239,6 +249,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         sections=sections,
         mean_rmse=mean_rmse(data),
         beside=repeatability_beside(data),
+        halves=halves(data),
         headline=headline(data),
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),

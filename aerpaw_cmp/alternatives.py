@@ -110,13 +110,25 @@ def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, Any]:
     return found
 
 
-def foliage_rank_difference(data: FlightData, replayed: Replayed, keep: IntArray) -> dict[str, Any]:
-    """Poses at which trees change the rank, per K; ``keep`` picks replayed poses. Empty without a paired run."""
-    fields = foliage_alternatives(data, replayed)
-    if not fields:
+PairedRanks = dict[str, dict[float, IntArray]]
+"""Ranks (n,) per K of each run of a paired replay."""
+
+
+def foliage_ranks(data: FlightData, replayed: Replayed, keep: IntArray) -> PairedRanks:
+    """Ranks without trees, in leaf and out of leaf; ``keep`` picks replayed poses. Empty without a paired run."""
+    return {
+        name: _ranks(found.h[keep, 0], data.settings.rank.k)
+        for name, found in foliage_alternatives(data, replayed).items()
+    }
+
+
+def foliage_rank_difference(paired: PairedRanks) -> dict[str, Any]:
+    """Poses at which trees change the rank, per K; empty without a paired run."""
+    if not paired:
         return {}
-    ranks = {name: _ranks(found.h[keep, 0], data.settings.rank.k) for name, found in fields.items()}
+    ranks = dict(paired)
     bare = ranks.pop("without trees")
+    keep = next(iter(bare.values()))
     return {
         name.replace(" ", "_"): {
             f"{k:g}": {

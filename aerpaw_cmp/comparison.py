@@ -13,7 +13,13 @@ from typing import Any
 import numpy as np
 
 from . import __version__
-from .alternatives import expected_offset, foliage_rank_difference, foliage_rss_difference, rss_alternatives
+from .alternatives import (
+    expected_offset,
+    foliage_rank_difference,
+    foliage_ranks,
+    foliage_rss_difference,
+    rss_alternatives,
+)
 from .compare import offset as offsets
 from .compare import rank as ranks
 from .compare import rss, statistics
@@ -108,6 +114,11 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             **_further_numbers(data, series, replayed, levels, result.offset_db),
             **({"foliage": found} if (found := foliage_rss_difference(alternatives)) else {}),
             "explained_by": {name: table.explained for name, table in tables.items()},
+        },
+        per_sample={
+            f"simulated_{name.replace(' ', '_')}_dbm": level
+            for name, level in alternatives.items()
+            if name in FOLIAGE_RUNS
         },
     )
     only_metrics = {"residual_by": {name: table.as_dict() for name, table in tables.items()}}
@@ -326,6 +337,9 @@ def metrics_beyond_panels(compared: Sequence[Compared]) -> dict[str, Any]:
     return found
 
 
+FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
+"""Runs of ``rt.paired_foliage``; each is a column of rss.csv and, per K, of rank.csv."""
+
 EXTRA_RSS = ("identifiable_db", "trimmed", "n_measured_out", "n_simulated_out", "block_length")
 """Numbers of the comparison that metrics.json holds besides those of the panel."""
 
@@ -451,7 +465,8 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         sinr_db=series.sinr_db[rows] if np.isfinite(series.sinr_db[rows]).any() else None,
         replicates=max(settings.bootstrap, 1),
     )
-    foliage = foliage_rank_difference(data, replayed, np.flatnonzero(keep[replayed.valid]))
+    paired = foliage_ranks(data, replayed, np.flatnonzero(keep[replayed.valid]))
+    foliage = foliage_rank_difference(paired)
     sigma = ranks.singular_values(h)
     with np.errstate(divide="ignore", invalid="ignore"):
         ratio_db = 20.0 * np.log10(sigma[:, 1:] / sigma[:, :1])
@@ -476,6 +491,11 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             **{k: v for k, v in result.as_dict().items() if k not in PANEL_RANK},
             "kappa_ci95": {f"{k:g}": list(fit.kappa_ci95) for k, fit in result.simulated.items()},
             **({"foliage": foliage} if foliage else {}),
+        },
+        per_sample={
+            f"rank_{name.replace(' ', '_')}_k{k:g}": rank.astype(np.float64)
+            for name, per_k in paired.items()
+            for k, rank in per_k.items()
         },
     )
     return Compared(panel, _rank_warnings(series, result, len(series.rank) - len(rows)))

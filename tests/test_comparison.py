@@ -263,7 +263,14 @@ def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
     assert found["trees_in_leaf"]["mean_loss_db"] > found["trees_out_of_leaf"]["mean_loss_db"] > 0.0
     assert found["trees_in_leaf"]["share_above_1_db"] > 0.1
     (ranked,) = replay_rank(data, str)
-    changes = compare_rank_series(data, data.rank[0], ranked).panel.extra["foliage"]
+    per_pose = panel.per_sample
+    loss = per_pose["simulated_without_trees_dbm"] - per_pose["simulated_trees_in_leaf_dbm"]
+    assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"]["mean_loss_db"])
+    ranks = compare_rank_series(data, data.rank[0], ranked).panel
+    per_k = ranks.per_sample
+    changed = per_k["rank_trees_in_leaf_k10"] != per_k["rank_without_trees_k10"]
+    changes = ranks.extra["foliage"]
+    assert changed.mean() == pytest.approx(changes["trees_in_leaf"]["10"]["share_changed"])
     assert set(changes) == {"trees_in_leaf", "trees_out_of_leaf"}
     for by_k in changes.values():
         for one in by_k.values():

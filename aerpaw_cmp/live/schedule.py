@@ -5,8 +5,15 @@ from __future__ import annotations
 from collections import Counter
 
 
+CATCH_UP = 2
+"""A slot that is late by at most so many periods is still polled, at once; older ones are missed and counted."""
+
+
 class Schedule:
     """When to ask what. The first name goes first whenever it is due; the others by age.
+
+    After a short stall the polls that fell due meanwhile follow each other without a rest (each record has its true
+    times), so that a hiccup of the machine costs no answer; after a long one the schedule starts from now.
 
     Parameters
     ----------
@@ -32,9 +39,10 @@ class Schedule:
         return name, self._due[name]
 
     def started(self, name: str, now_ns: int) -> None:
-        """A poll begins; slots that passed meanwhile are missed."""
+        """A poll begins; slots that cannot be caught up any more are missed."""
         period = self._periods[name]
-        skipped = max(0, (now_ns - self._due[name]) // period)
+        late = max(0, (now_ns - self._due[name]) // period)
+        skipped = late if late > CATCH_UP else 0
         self.missed[name] += skipped
         self._due[name] += (skipped + 1) * period
 

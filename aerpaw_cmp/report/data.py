@@ -228,6 +228,8 @@ class RssPanel:
     worst: tuple[ErrorSpan, ...] = ()
     variants: tuple[Variant, ...] = ()
     extra: Mapping[str, Any] = field(default_factory=dict)
+    per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Further columns (n,) of rss.csv, by name with unit."""
 
     @property
     def name(self) -> str:
@@ -337,6 +339,8 @@ class RankPanel:
     sinr_db: FloatArray | None = None
     stale: BoolArray | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
+    per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Further columns (n,) of rank.csv, by name."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

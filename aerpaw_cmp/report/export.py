@@ -234,6 +234,7 @@ def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
 
     panels = list(panels)
     names = list(dict.fromkeys(b.name for panel in panels for b in panel.baselines))
+    further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
     frames = []
     for panel in panels:
         n = len(panel.time)
@@ -255,6 +256,7 @@ def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
         }
         levels = {b.name: b.level_dbm for b in panel.baselines}
         columns.update({f"{name}_dbm": levels.get(name, nowhere) for name in names})
+        columns.update({name: panel.per_sample.get(name, nowhere) for name in further})
         frames.append(pd.DataFrame(columns, index=range(n)))
     return _stacked(frames, RSS_COLUMNS)
 
@@ -268,6 +270,7 @@ def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
 
     panels = list(panels)
     ks = sorted({at.k for panel in panels for at in panel.simulated})
+    further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
     frames = []
     for panel in panels:
         columns: dict[str, Any] = {
@@ -281,6 +284,8 @@ def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
         ranks = {at.k: at.rank for at in panel.simulated}
         for k in ks:
             columns[f"simulated_rank_k{k_key(k)}"] = integers(ranks.get(k, np.full(len(panel.time), np.nan)))
+        nowhere = np.full(len(panel.time), np.nan)
+        columns.update({name: integers(panel.per_sample.get(name, nowhere)) for name in further})
         frames.append(pd.DataFrame(columns, index=range(len(panel.time))))
     return _stacked(frames, RANK_COLUMNS)
 

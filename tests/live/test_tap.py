@@ -444,3 +444,16 @@ def test_status_line():
 def test_wrong_settings(tmp_path, values):
     with pytest.raises(UsageError):
         TapSettings(tmp_path, **values)
+
+
+def test_schedule_catches_up_after_a_short_stall_and_not_after_a_long_one():
+    for stall, missed in ((900, 0), (1400, 0), (1900, 3)):
+        schedule = Schedule({"ri": 500})
+        schedule.reset(0)
+        schedule.started("ri", 0)
+        now, polls = 500 + stall, 0  # the slot at 500 is answered this late
+        while schedule.next(now)[1] <= now:
+            schedule.started("ri", now)
+            polls += 1
+        assert schedule.missed["ri"] == missed
+        assert polls + missed == 1 + stall // 500, "every slot is polled or missed, once"

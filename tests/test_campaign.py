@@ -243,6 +243,24 @@ def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) ->
     held = [r for r in fold.rows if not r.fitted_here]
     assert len(held) == 2
     assert all(r.rmse_db < r.start_rmse_db for r in held)
+    assert all(r.own == ("offset_db",) for r in held)
+
+
+def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
+    """``rss.lag: apply`` fits the clock of every flight on itself, held out or not."""
+    for name in OFFSETS_DB:
+        settings = flight_settings(name, 1, YAW_DEG)
+        settings["rss"]["lag"] = "apply"
+        (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    flights = ["apply_first.yaml", "apply_second.yaml"]
+    campaign = load_campaign(
+        write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
+    )
+    data = run(campaign, folder)
+    (fold,) = data.held_out
+    by = {(r.flight, r.channel): r.fitted for r in data.rss}
+    assert {(r.flight, r.channel): r.own for r in fold.rows} == by
+    assert any("lag_s" in own for own in by.values())
 
 
 def test_one_parameter_after_the_other_finds_what_all_combinations_find(

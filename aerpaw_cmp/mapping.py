@@ -60,6 +60,10 @@ from .units import AnyArray, ComplexArray, FloatArray, wavelength_m
 FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
 
+RATIO_LIMIT_DB = 180.0
+"""Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
+RATIOS = ("spread", "condition")
+
 Report = Callable[[str], None]
 
 
@@ -427,12 +431,12 @@ def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
     raster = result.grid.raster
     for name, label, values in (
         ("Singular-value spread", "σ1/σ2 [dB]", result.spread_db),
-        ("Condition number", f"σ1/σ{s.elements} [dB]", result.condition_db),
+        ("Condition number", f"σ1/σ{s.elements} [dB], at most {RATIO_LIMIT_DB:g}", result.condition_db),
     ):
         joint = values[..., result.serving, np.arange(len(result.grid))]
         for row, height in enumerate(result.rank_altitudes_m):
-            finite = np.where(np.isfinite(joint[row]), joint[row], np.nan)
-            yield page.Layer(name=f"{name}, foliage {s.shown}", label=label, altitude_m=height, values=raster(finite))
+            shown = raster(np.minimum(joint[row], RATIO_LIMIT_DB))
+            yield page.Layer(name=f"{name}, foliage {s.shown}", label=label, altitude_m=height, values=shown)
     clear = outcome.maps.get("none")
     for mode, maps in outcome.ordered():
         if clear is None or mode == "none":
@@ -591,8 +595,8 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
     site, grid = outcome.site, outcome.shown.grid
     joint, every = _all_layers(outcome, towers_too=False), _all_layers(outcome, towers_too=True)
     names = {layer.name for layer in joint}
-    every = [layer for layer in every if layer.name in names or not layer.name.startswith(("spread", "condition"))]
-    shown = [layer for layer in joint if not layer.name.startswith(("spread", "condition"))]
+    every = [layer for layer in every if layer.name in names or not layer.name.startswith(RATIOS)]
+    shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
     folder.mkdir(parents=True, exist_ok=True)
@@ -619,6 +623,8 @@ def _all_layers(outcome: MapOutcome, *, towers_too: bool) -> list[cells.Layer]:
         for one in others:
             # a hundredth of a dB is more than the site's data hold, and a third of the bytes
             values = one.values if one.classes else np.round(one.values, 2)
+            if one.name.startswith(RATIOS):
+                values = np.minimum(values, RATIO_LIMIT_DB)
             title = f"{one.title}, foliage {mode}"
             result.append(replace(one, name=f"{one.name}_{mode}", title=title, values=values))
     return result

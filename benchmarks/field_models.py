@@ -372,7 +372,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="azimuths on a grid of 30 degrees")
     parser.add_argument("--json", action="store_true")
-    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA"))
+    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA") or None)
     arguments = parser.parse_args()
     if arguments.logs_root is None or not Path(arguments.logs_root).is_dir():
         print("field_models: AERPAW_CMP_FIELD_DATA names no folder of real logs; nothing measured", file=sys.stderr)

@@ -84,10 +84,11 @@ def rss_rows(name: str, root: Path, replicates: int) -> tuple[dict[str, Any], di
         }
         residual = panel.residual_db[np.isfinite(panel.residual_db)]
         shares[panel.channel] = np.histogram(np.clip(residual, -25, 25), edges)[0] / len(residual)
-    pairs = {f"{p.panel.first} - {p.panel.second}": next(iter(p.metrics["pairs"].values())) for p in pairs_of(panels)}
-    for pair in pairs.values():
-        for channels in pair.values():
-            channels.pop("spans")  # places and instants are data, not results
+    pairs: dict[str, Any] = {}
+    for found in pairs_of(panels):
+        for channels in found.metrics["pairs"].values():
+            # places and instants are data, not results
+            pairs |= {name: {k: v for k, v in pair.items() if k != "spans"} for name, pair in channels.items()}
     return {"channels": rows, "pairs": pairs, "engine": engine(data, replays)}, shares
 
 
@@ -412,6 +413,8 @@ How to read it:
 - What else could be wrong was fitted on one flight too, beside its azimuths; the table below says by how much that
   lowered the RMSE of that flight and of the other (negative: it rose). What helps the first and hurts the second is
   no knowledge.
+- {pairs}
+- {audit}
 - The passes of one place within a flight are few and near take-off; they bound repeatability loosely.
 
 {further}
@@ -436,9 +439,43 @@ How to read it:
 - Slanted ports at K = 10 reproduce *how often* each rank is reported, also with the K that fits the other flight best.
 - Vertical ports do not at any K that the paper uses. At K of about 2e4 they do as well, which asks a modem to use
   layers 86 dB below the strongest one: no receiver does.
+- Rules that know more than a threshold do worse on the distribution: {rules}.
 - *When* each rank is reported is hardly predicted: kappa at K = 10 is {kappa}; 0 is chance, 1 is every pose right. Its
   interval excludes 0, so there is some skill, but most of the agreement is that rank 2 is common on both sides.
 """
+
+
+def pairs_text(found: dict[str, Any]) -> str:
+    """How far the two channels differ, in words."""
+    parts = []
+    for name in RSS[:2]:
+        for pair in found[name]["pairs"].values():
+            parts.append(
+                f"{num(pair['std_db'], 1)} dB{between(pair['interval_std_db'], 1)} at "
+                f"{name.removeprefix('dataset12_').removesuffix('m')} m, {100 * pair['share_parted']:.0f} % of the "
+                "samples more than 10 dB apart"
+            )
+    return "The two channels, one place and one instant, differ by (standard deviation) " + "; ".join(parts) + "."
+
+
+def audit_text(found: dict[str, Any]) -> str:
+    """The audits of the RSS replays, in words."""
+    audits = [found[name]["engine"] for name in RSS]
+    total = {key: sum(a[key] for a in audits) for key in ("links", "missing_paths", "extra_paths")}
+    return (
+        f"The image engine against Sionna on {total['links']} links: {total['missing_paths']} paths missing, "
+        f"{total['extra_paths']} invented, RSS within {max(a['rss_max_error_db'] for a in audits):.4f} dB."
+    )
+
+
+def rules_text(found: dict[str, Any]) -> str:
+    """Total variation of the other rank rules, in words."""
+    names = {"condition_number": "a condition number below 17 dB", "capacity": "most rate at the reported SINR"}
+    return "; ".join(
+        f"{words}: total variation "
+        + " and ".join(num(found[name]["slanted"]["rules"][rule]["total_variation"]) for name in RANK)
+        for rule, words in names.items()
+    )
 
 
 def page(found: dict[str, Any], replicates: int) -> str:
@@ -463,6 +500,9 @@ def page(found: dict[str, Any], replicates: int) -> str:
         own=mean("mount of the same flight (fitted on what is scored)"),
         added=mean(added),
         added4=mean(added, "mean_4s"),
+        pairs=pairs_text(found),
+        audit=audit_text(found),
+        rules=rules_text(found),
         kappa=" and ".join(
             f"{num(at['kappa'])}{between(at['kappa_ci95'])}"
             for at in (found[name]["slanted"]["simulated"]["10"] for name in RANK)
@@ -475,7 +515,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--quick", action="store_true", help="100 replicates, azimuths on a grid of 30 degrees")
     parser.add_argument("--json", action="store_true", help="print table.json too")
-    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA"))
+    parser.add_argument("--logs-root", type=Path, default=os.environ.get("AERPAW_CMP_FIELD_DATA") or None)
     parser.add_argument("-o", "--out", type=Path, default=ROOT / "reports" / "lake_wheeler")
     arguments = parser.parse_args()
     if arguments.logs_root is None or not Path(arguments.logs_root).is_dir():

@@ -222,6 +222,7 @@ def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pyt
     (pair,) = pairs_of([one.panel for one in compared_rss(path)])
     assert (pair.panel.first, pair.panel.second) == ("USRP1", "USRP2")
     assert len(pair.panel.time) == len(at)  # 0.05 s is less than half a sampling interval
+    assert abs(np.nanmedian(pair.panel.difference_db)) < 5.0  # each channel after its own offset
     (span,) = pair.panel.apart
     start = np.datetime64(ORIGIN.removesuffix("Z"), "ns")
     assert (span.start - start) / np.timedelta64(1, "s") == pytest.approx(30.25, abs=0.6)
@@ -296,6 +297,11 @@ def test_alternatives_change_only_what_they_name(tmp_path: Path) -> None:
     plain = compared_rss(flight(tmp_path / "iso", rss={"USRP1": (at, free_space_db(at))}))[0].panel
     assert rmse["isotropic antennas"] == pytest.approx(plain.rmse_db, abs=1e-9)
     assert not plain.variants
+    (tmp_path / "alone").mkdir()
+    alone = DIPOLES.replace(", installed_db: [2.0, 0.0]", "")
+    bare = compared_rss(flight(tmp_path / "alone", rss={"USRP1": (at, free_space_db(at))}, more=alone))[0].panel
+    assert rmse["antennas as measured, without added gain"] == pytest.approx(bare.rmse_db, abs=1e-9)
+    assert abs(bare.rmse_db - panel.rmse_db) > 0.1
 
 
 def test_reference_powers_give_the_expected_offset(tmp_path: Path) -> None:

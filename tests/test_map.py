@@ -218,6 +218,9 @@ def test_files_agree_with_each_other_and_with_the_page(made):
     share = float((table["rank_k10_h003m_joint_opaque"] == 0).mean())
     shown = next(m for m in printed["rank"] if (m["foliage"], m["k"], m["altitude_m"]) == ("opaque", 10.0, 3.0))
     assert shown["share"]["Z"] == pytest.approx(share)
+    ratios = table[[name for name in table if name.startswith(("condition", "spread"))]].to_numpy()
+    assert np.nanmin(ratios) >= 0
+    assert np.nanmax(ratios) == mapping.RATIO_LIMIT_DB  # two collinear paths: what is below is rounding
     content = json.loads((folder / "maps.json").read_text())
     level = np.array(content["layers"]["rss_siso_h030m_joint_opaque"]["values"], dtype=float)
     np.testing.assert_allclose(level, table["rss_siso_h030m_joint_opaque"], atol=0.006)

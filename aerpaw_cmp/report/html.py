@@ -57,7 +57,12 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
         if isinstance(value, Mapping):
             yield from flat(value, name)
         else:
-            yield name, ", ".join(map(str, value)) if isinstance(value, (list, tuple)) else str(value)
+            yield name, ", ".join(map(short, value)) if isinstance(value, (list, tuple)) else short(value)
+
+
+def short(value: Any) -> str:
+    """A value as text; numbers to 6 digits, which metrics.json holds in full."""
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
 def data_uri(svg: bytes) -> str:

@@ -123,6 +123,8 @@ class Task:
     setting: str
     overrides: Overrides
     logs_root: Path | None
+    reference: bool = True
+    """Overlays are drawn for this setting: places and times are kept."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -216,10 +218,10 @@ def _rss_row(task: Task, data: FlightData, panel: Any) -> RssRow:
         baselines={b.name: b.rmse_db for b in panel.baselines},
         step_db=data.settings.rss.step_db,
         span_db=data.settings.rss.span_db,
-        time_s=_elapsed_s(panel.time),
-        position_m=_positions_m(panel),
-        distance_m=panel.geometry["distance_m"],
-        heading_deg=panel.geometry.get("heading_deg"),
+        time_s=_elapsed_s(panel.time) if task.reference else np.zeros(0),
+        position_m=_positions_m(panel) if task.reference else np.zeros((0, 3)),
+        distance_m=panel.geometry["distance_m"] if task.reference else np.zeros(0),
+        heading_deg=panel.geometry.get("heading_deg") if task.reference else None,
         within=panel.extra.get("repeatability", {}),
     )
 
@@ -472,7 +474,7 @@ def run(
     settings = campaign.settings or {AS_WRITTEN: {}}
     files, failures = _flight_files(campaign, folder, settings)
     tasks = [
-        Task(path, name, label, overrides, logs_root)
+        Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
         for name, (path, _) in files.items()
         for label, overrides in settings.items()
     ]

@@ -282,9 +282,16 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
                     rmse_db=rmse(own_residual_db(measured, fitted, bench.data.settings)),
                     transferred_offset_db=offset,
                     transferred_rmse_db=rmse(measured + offset - fitted),
+                    own=("offset_db", *_own_lag(bench.clocks[i], point)),
                 )
             )
     return rows
+
+
+def _own_lag(clock: Clock | None, point: Point) -> tuple[str, ...]:
+    """``lag_s`` where a lag that was estimated on these very samples has been applied."""
+    estimated = clock is not None and clock.applied == "estimated and applied" and "rss.lag" not in point
+    return ("lag_s",) if estimated else ()
 
 
 def _curves(

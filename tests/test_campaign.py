@@ -243,6 +243,24 @@ def test_a_planted_clock_shift_is_recovered_on_the_other_flight(folder: Path) ->
     held = [r for r in fold.rows if not r.fitted_here]
     assert len(held) == 2
     assert all(r.rmse_db < r.start_rmse_db for r in held)
+    assert all(r.own == ("offset_db",) for r in held)
+
+
+def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
+    """``rss.lag: apply`` fits the clock of every flight on itself, held out or not."""
+    for name in OFFSETS_DB:
+        settings = flight_settings(name, 1, YAW_DEG)
+        settings["rss"]["lag"] = "apply"
+        (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+    flights = ["apply_first.yaml", "apply_second.yaml"]
+    campaign = load_campaign(
+        write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
+    )
+    data = run(campaign, folder)
+    (fold,) = data.held_out
+    by = {(r.flight, r.channel): r.fitted for r in data.rss}
+    assert {(r.flight, r.channel): r.own for r in fold.rows} == by
+    assert any("lag_s" in own for own in by.values())
 
 
 def test_one_parameter_after_the_other_finds_what_all_combinations_find(
@@ -474,46 +492,52 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
 
 
 FIELD = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
+CAMPAIGNS = Path(__file__).parent / "field" / "campaigns"
+needs_logs = pytest.mark.skipif(
+    not FIELD or not Path(FIELD).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"
+)
+
+
+def real(name: str, folder: Path, **changes: Any) -> dict[str, Any]:
+    """campaign.json of a campaign in tests/field/campaigns, with some of its keys changed."""
+    entries = yaml.safe_load((CAMPAIGNS / f"{name}.yaml").read_text(encoding="utf-8"))
+    entries["flights"] = [str((CAMPAIGNS / flight).resolve()) for flight in entries["flights"]]
+    for key, value in changes.items():
+        entries.setdefault(key, {}).update(value)
+    (folder / "campaign.yaml").write_text(yaml.safe_dump(entries, sort_keys=False), encoding="utf-8")
+    out = folder / "out"
+    assert main(["campaign", str(folder / "campaign.yaml"), "-o", str(out), "--logs-root", FIELD, "--strict"]) == 0
+    found: dict[str, Any] = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
+    return found
 
 
 @pytest.mark.field
-@pytest.mark.skipif(not FIELD or not Path(FIELD).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs")
+@needs_logs
 def test_two_real_flights(tmp_path: Path) -> None:
     """The measured patterns need other azimuths than the paper's, and either flight says so for the other."""
-    here = Path(__file__).parent / "field"
-    gain = {"model": "gain_grid", "file": "antennas/rad_pat.mat"}
-    patterns = {
-        "rt.max_depth": 0,
-        "link.rss.tower.antenna": {**gain, "variable": "RMWB3300_normal"},
-        "link.rss.tower.yaw_deg": 45,
-        "link.rss.uav.antenna": {**gain, "variable": "SA3300"},
-        "link.rss.uav.yaw_deg": 270,
-    }
     azimuths = list(range(10, 360, 50))
-    entries = {
-        "campaign": "dataset12",
-        "flights": [str(here / f"dataset12_{height}m.yaml") for height in (40, 70)],
-        "settings": {"line of sight": {"rt.max_depth": 0}, "patterns": patterns},
-        "calibration": "channel",
-        "held_out": {
-            "setting": "patterns",
-            "samples": 400,
-            "fit": {f"link.channels.{c}.tower.yaw_deg": azimuths for c in ("USRP1", "USRP2")},
-        },
-    }
-    (tmp_path / "campaign.yaml").write_text(yaml.safe_dump(entries, sort_keys=False), encoding="utf-8")
-    out = tmp_path / "out"
-    arguments = ["campaign", str(tmp_path / "campaign.yaml"), "-o", str(out), "--logs-root", FIELD]
-    assert main(arguments) == 0
-    found = json.loads((out / "campaign.json").read_text(encoding="utf-8"))
-    assert found["failures"] == []
-    assert found["mean_rmse_db"]["line of sight"]["dataset12_40m"] == pytest.approx((6.56 + 5.47) / 2, abs=0.05)
+    fit = {f"link.channels.{channel}.tower.yaw_deg": azimuths for channel in ("USRP1", "USRP2")}
+    found = real("dataset12", tmp_path, held_out={"samples": 400, "fit": {"link.rss.uav.yaw_deg": [270, 315], **fit}})
+    for name, rmse in (("dataset12_40m", (6.56 + 5.47) / 2), ("dataset12_70m", (7.14 + 6.30) / 2)):
+        assert found["mean_rmse_db"]["isotropic, line of sight"][name] == pytest.approx(rmse, abs=0.05)
+    assert len(found["held_out"]["folds"]) == 2
     for fold in found["held_out"]["folds"]:
+        assert fold["parameters"]["link.rss.uav.yaw_deg"] == 270
         assert fold["parameters"]["link.channels.USRP1.tower.yaw_deg"] == 110
         held = [r for r in fold["scores"] if not r["fitted_here"]]
-        assert np.mean([r["rmse_db"] for r in held]) < np.mean([r["start_rmse_db"] for r in held])
-        assert np.mean([r["rmse_db"] for r in held]) < 4.9
+        assert np.mean([r["rmse_db"] for r in held]) < np.mean([r["start_rmse_db"] for r in held]) - 0.3
+        assert np.mean([r["rmse_db"] for r in held]) < 4.8
     for pair in found["repeatability"]["pairs"]:
         assert 3.0 < pair["rmse_db"] < 6.0
         assert pair["share"] < 0.25  # they meet on the way up and down only
         assert pair["height_difference_m"] == pytest.approx(30.0, abs=1.0)
+
+
+@pytest.mark.field
+@needs_logs
+def test_two_real_rank_flights_choose_one_k_when_slanted(tmp_path: Path) -> None:
+    found = real("nr_rank", tmp_path)
+    transferred = {(t["setting"], t["flight"]): t for t in found["rank_transfers"]}
+    assert {t["k"] for (setting, _), t in transferred.items() if setting == "slanted"} == {10}
+    for (setting, _), t in transferred.items():
+        assert (t["total_variation"] < 0.11) == (setting == "slanted")

@@ -19,8 +19,9 @@ class RssRow:
 
     ``offset_db`` and ``rmse_db`` come from this row's own samples; ``pooled_offset_db`` is shared as the campaign's
     ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row. ``baselines`` are RMSE [dB] by name, each with
-    an offset of its own. Arrays (n,) are at the samples, NaN where a side is missing; ``span_db`` and ``step_db`` are
-    those of the offset search; ``within`` is the repeatability of the flight's two halves.
+    an offset of its own; ``span_db`` and ``step_db`` are those of the offset search; ``within`` is the repeatability of
+    the flight's two halves. Arrays (n,) are at the samples, NaN where a side is missing; times, places, distances and
+    headings are kept for the first setting only, and empty elsewhere.
     """
 
     flight: str
@@ -180,7 +181,8 @@ class HeldOutRow:
 
     ``fitted_here`` says that the parameters were fitted on this very flight. ``start_rmse_db`` is with the parameters
     as written, ``rmse_db`` with the fitted ones, both with an offset of the row's own samples;
-    ``transferred_rmse_db`` also takes the offset from the flights of the fit (NaN on those flights).
+    ``transferred_rmse_db`` also takes the offset from the flights of the fit (NaN on those flights). ``own`` names
+    what else was fitted on the row's own samples: always the offset, and the lag where the flight file applies one.
     """
 
     flight: str
@@ -192,6 +194,7 @@ class HeldOutRow:
     rmse_db: float
     transferred_offset_db: float
     transferred_rmse_db: float
+    own: tuple[str, ...] = ("offset_db",)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -217,6 +217,8 @@ def warnings(data: CampaignData) -> list[str]:
         on = ", ".join(fold.fitted_on)
         out += [f"Fitted on {on}: {name} ended at a bound of its values." for name in fold.at_bounds]
         out += [f"Fitted on {on}: {name} has no effect; its value means nothing." for name in fold.without_effect]
+        if not fold.applied_to:
+            out.append(f"Fitted on {on}: no flight was held out, so every number of the fit is scored on its own data.")
     out += [
         f"{row.flight}, {row.setting}, {row.link}: the best offset lies at the edge of the searched span."
         for row in data.rss

@@ -356,7 +356,6 @@ class RssSettings(Settings):
     minimum_height_m: float | None = None
     """Samples below this height are left out of the comparison, and counted."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
-    waypoint_labels: bool = True
     reference_powers: ReferencePowers | None = None
 
     @model_validator(mode="after")
@@ -380,7 +379,6 @@ class RankSettings(Settings):
     k: Annotated[list[Positive], Field(min_length=1)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
-    altitude_above: Literal["take_off", "first_sample"] = "take_off"
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
 
     @field_validator("k")
@@ -397,7 +395,6 @@ class ReportSettings(Settings):
     title: str | None = None
     waypoints: list[Waypoint] = []
     speed_table: bool = True
-    figure_formats: list[Literal["svg", "png"]] = ["svg", "png"]
 
 
 class FlightFile(Settings):

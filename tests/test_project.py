@@ -89,3 +89,19 @@ def test_the_keys_of_the_flight_file_page_are_real() -> None:
         known = set(model.model_fields).union(*(settings.model_fields for settings in inner))
         assert keys <= known, (name, keys - known)
         assert keys, name
+
+
+def test_no_setting_is_without_effect() -> None:
+    """Every key that a flight file may hold is read somewhere: a key that does nothing would be a promise not kept."""
+    from aerpaw_cmp import config
+
+    code = "\n".join(path.read_text() for path in (ROOT / "aerpaw_cmp").rglob("*.py"))
+    models = [
+        value
+        for value in vars(config).values()
+        if isinstance(value, type) and issubclass(value, config.Settings) and value is not config.Settings
+    ]
+    assert len(models) > 8
+    for model in models:
+        for name in model.model_fields:
+            assert re.search(rf"\.{name}\b", code), f"{model.__name__}.{name} is never read"

@@ -112,7 +112,7 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
     svg, png = io.BytesIO(), io.BytesIO()
-    fig.savefig(png, format="png", pil_kwargs={"compress_level": 4})
+    fig.savefig(png, format="png", pil_kwargs={"compress_level": 2})
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
     fig.savefig(svg, format="svg", metadata={"Date": None})
     return svg.getvalue(), png.getvalue()

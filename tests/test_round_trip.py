@@ -87,3 +87,17 @@ def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:
     settings = load_flight(path)
     for log, file in zip(settings.logs, read_logs(settings, tmp_path), strict=True):
         assert len(file.result.rejected) == 5 == len(truth["bad_lines"][log.path])
+
+
+def test_the_sample_logs_are_what_simulate_writes(tmp_path: Path) -> None:
+    """The logs in git are made by the command that the README names, not by hand, and have not gone stale."""
+    assert main(["simulate", str(SAMPLE), "-o", str(tmp_path)]) == 0
+    settings = load_flight(SAMPLE)
+    kept, made = (read_logs(settings, folder) for folder in (SAMPLE.parent, tmp_path))
+    for log, one, two in zip(settings.logs, kept, made, strict=True):
+        assert (one.result.lines, len(one.result.rejected)) == (two.result.lines, len(two.result.rejected)), log.path
+        for old, new in zip(one.result.streams, two.result.streams, strict=True):
+            for column in old.frame.columns:
+                if old.frame[column].dtype.kind == "f":
+                    np.testing.assert_allclose(old.frame[column], new.frame[column], atol=2e-3, err_msg=log.path)
+    assert json.loads((tmp_path / "truth.json").read_text()) == json.loads((SAMPLE.parent / "truth.json").read_text())

@@ -78,30 +78,13 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         channel=series.channel,
         unit=series.unit,
         time=series.time,
-        measured_db=levels.measured_db,
-        simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
-        measured_out_of_coverage=levels.posed & ~np.isfinite(levels.measured_db),
-        simulated_out_of_coverage=levels.posed & ~np.isfinite(levels.simulated_db),
+        **_sample_columns(levels),
         **_headline_numbers(result, clock),
         baselines=tuple(
             report.Baseline(name=name, level_dbm=level, offset_db=fit.offset_db, rmse_db=fit.rmse_db)
             for (name, level), fit in zip(levels.baselines.items(), result.baselines.values(), strict=True)
         ),
-        offset_curve=report.OffsetCurve(
-            **dict(
-                zip(
-                    ("offset_db", "rmse_db"),
-                    offsets.offset_curve(
-                        levels.measured_db, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db
-                    ),
-                    strict=True,
-                )
-            )
-        ),
-        east_m=levels.position_m[:, 0],
-        north_m=levels.position_m[:, 1],
-        up_m=levels.position_m[:, 2],
-        geometry=levels.geometry,
+        offset_curve=_offset_curve(levels, settings),
         line_of_sight=direct == 1.0,
         worst=_worst(series.time, result.residual_db, levels, direct),
         variants=_variants(settings, levels, alternatives),
@@ -125,6 +108,27 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     return Compared(
         panel, _rss_warnings(series, result, clock), {"rss": {series.tower: {series.channel: only_metrics}}}
     )
+
+
+def _sample_columns(levels: _Levels) -> dict[str, Any]:
+    """The fields of an RSS panel that have a value per sample."""
+    return {
+        "measured_db": levels.measured_db,
+        "simulated_dbm": np.where(levels.posed, levels.simulated_db, np.nan),
+        "measured_out_of_coverage": levels.posed & ~np.isfinite(levels.measured_db),
+        "simulated_out_of_coverage": levels.posed & ~np.isfinite(levels.simulated_db),
+        "east_m": levels.position_m[:, 0],
+        "north_m": levels.position_m[:, 1],
+        "up_m": levels.position_m[:, 2],
+        "geometry": levels.geometry,
+    }
+
+
+def _offset_curve(levels: _Levels, settings: RssSettings) -> Any:
+    candidates, rmse = offsets.offset_curve(
+        levels.measured_db, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db
+    )
+    return report.OffsetCurve(offset_db=candidates, rmse_db=rmse)
 
 
 @dataclass(frozen=True, slots=True)

@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..errors import InputError, UsageError
+from ..matfile import read_arrays
 from ..units import AnyArray, ComplexArray, FloatArray, db_from_power, power_from_db
 
 HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
@@ -457,15 +458,13 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     UsageError
         No such grid.
     """
-    from scipy.io import loadmat
-
     path = Path(path)
     try:
-        content = loadmat(path)
-    except FileNotFoundError:
-        raise InputError("no such file", path=path) from None
-    except Exception as error:  # scipy raises many kinds for bytes that are no MATLAB file
-        raise InputError(f"not a MATLAB file ({error})", path=path) from None
+        content = read_arrays(path.read_bytes(), None)
+    except OSError as error:
+        raise InputError(f"the file cannot be read ({error.strerror or error})", path=path) from None
+    except InputError as error:
+        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from None
     if not {"theta2", "phi2"} <= set(content):
         raise InputError("no variables 'theta2' and 'phi2'", expected="a file of gain grids (rad_pat.mat)", path=path)
     elevation, azimuth = np.ravel(content["theta2"]).astype(float), np.ravel(content["phi2"]).astype(float)

@@ -8,7 +8,6 @@ The lines of the account are rows.
 
 from __future__ import annotations
 
-import io
 import re
 import struct
 import zlib
@@ -16,6 +15,8 @@ import zlib
 import numpy as np
 
 from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.matfile import MAGIC as _MAGIC
+from aerpaw_cmp.matfile import read_arrays
 from aerpaw_cmp.readers import Reader, ReadOptions
 from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
 from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray
@@ -37,8 +38,6 @@ TELEMETRY = {
 LEVELS = {"mpower1": "USRP1", "mpower2": "USRP2", "mpower": "power", "mquality": "quality"}
 _CLOCKS = ("timestamp_power_for_csv", "timestamp_power")
 _NAMES = {*TELEMETRY, *LEVELS, *_CLOCKS, "mSpeed"}
-_MAGIC = b"MATLAB 5.0 MAT-file"
-_MOST_ELEMENTS = 50_000_000
 _COMPRESSED, _MATRIX = 15, 14
 
 
@@ -84,26 +83,8 @@ def sniff(head: bytes) -> bool:
 
 
 def _load(data: bytes) -> dict[str, AnyArray]:
-    """Variables as flat arrays; any failure of the library becomes an ``InputError``."""
-    import scipy.io
-
-    if not data.startswith(_MAGIC):
-        raise InputError(
-            "no MATLAB 5 file",
-            expected="a file that begins with 'MATLAB 5.0 MAT-file'",
-            cause="another kind of file, or a version 7.3 file: save it again with -v7",
-        )
-    try:
-        sizes = scipy.io.whosmat(io.BytesIO(data))
-        if sum(int(np.prod(shape, dtype=np.float64)) for _, shape, _ in sizes) > _MOST_ELEMENTS:
-            raise InputError("the MATLAB file claims more elements than a flight can have", cause="a damaged file")
-        wanted = [name for name, _, _ in sizes if name in _NAMES]
-        content = scipy.io.loadmat(io.BytesIO(data), variable_names=wanted) if wanted else {}
-    except InputError:
-        raise
-    except Exception as error:  # scipy raises some ten kinds on damaged files, all meaning the same
-        raise InputError(f"the MATLAB file is damaged ({type(error).__name__})", cause="a cut download") from error
-    return {name: np.asarray(content[name]).ravel() for name in wanted if name in content}
+    """Variables of a flight as flat arrays, in the file's order of rows."""
+    return {name: np.asarray(values).ravel() for name, values in read_arrays(data, _NAMES).items()}
 
 
 def _numeric(values: AnyArray, name: str) -> FloatArray:

@@ -15,7 +15,7 @@ from .flight import FlightData, RssSeries
 from .replay.arrays import Array, Link, Poses
 from .replay.field import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .replay.replay import Loss
-from .replaying import Replayed, attitude_rotation, foliage_loss
+from .replaying import Replayed, attitude_rotation, path_loss
 from .site.antennas import Isotropic
 from .site.installed import InstalledPattern
 from .units import ComplexArray, FloatArray, IntArray
@@ -42,7 +42,7 @@ def level_dbm(data: FlightData, link: Link, fields: Fields) -> FloatArray:
 
 def rss_alternatives(data: FlightData, replayed: Replayed) -> dict[str, FloatArray]:
     """Levels at the replayed poses (n,) [dBm] under other assumptions, by name; only those that could differ."""
-    link, loss = replayed.link, foliage_loss(data, replayed.link.carrier_hz)
+    link, loss = replayed.link, path_loss(data, replayed.link.carrier_hz)
     changed: dict[str, tuple[Link, Poses]] = {}
     arrays = [*link.tower_arrays.values(), link.uav_array]
     if any(isinstance(p, InstalledPattern) for a in arrays for p in a.patterns):
@@ -82,10 +82,10 @@ def foliage_alternatives(data: FlightData, replayed: Replayed) -> dict[str, Fiel
     carrier = replayed.link.carrier_hz
     kept = data.settings.rt.foliage
     foliage = "attenuating" if kept == "none" else kept
-    found = {"without trees": evaluate(data, replayed, None)}
+    found = {"without trees": evaluate(data, replayed, path_loss(data, carrier, foliage="none"))}
     for leaves in LEAVES:
         found[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = evaluate(
-            data, replayed, foliage_loss(data, carrier, foliage=foliage, leaves=leaves)
+            data, replayed, path_loss(data, carrier, foliage=foliage, leaves=leaves)
         )
     return found
 

@@ -26,7 +26,7 @@ from .compare import rss, statistics
 from .config import RssSettings
 from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
-from .replaying import Clock, Replayed, direct_foliage_m, foliage_loss
+from .replaying import Clock, Replayed, direct_foliage_m, path_loss
 from .report import data as report
 from .units import BoolArray, FloatArray, IntArray
 
@@ -578,7 +578,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 max_depth=rt.max_depth,
                 samples=rt.samples,
                 batch=rt.batch,
-                loss=foliage_loss(data, replayed.link.carrier_hz),
+                loss=path_loss(data, replayed.link.carrier_hz),
                 cache_dir=None if rt.cache else "",
                 ks=data.settings.rank.k,
             )

@@ -307,6 +307,8 @@ class RtSettings(Settings):
     maximum_loss_db: Positive | None = None
     """Replace P.833's specific attenuation and largest loss at the carrier."""
     leaves: Literal["in", "out"] = "in"
+    reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
+    """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None

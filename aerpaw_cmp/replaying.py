@@ -242,7 +242,7 @@ def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> R
         max_depth=rt.max_depth,
         samples=rt.samples,
         batch=rt.batch,
-        loss=foliage_loss(data, link.carrier_hz),
+        loss=path_loss(data, link.carrier_hz),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         # the image engine is done before a bar could be seen
@@ -250,12 +250,24 @@ def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> R
     )
 
 
-def foliage_loss(
+def path_loss(
     data: FlightData, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
 ) -> Loss | None:
-    """The foliage loss per path that ``rt.foliage`` and ``rt.leaves`` (or the arguments) ask for; None without."""
+    """Loss per path besides the field's own: foliage (by ``rt`` or the arguments) and ``rt.reflection_loss_db``."""
+    through = _foliage_loss(data, carrier_hz, foliage or data.settings.rt.foliage, leaves or data.settings.rt.leaves)
+    per_reflection = data.settings.rt.reflection_loss_db
+    if per_reflection == 0.0:
+        return through
+
+    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+        trees = 0.0 if through is None else through(paths, sources_m, targets_m)
+        return np.asarray(trees + per_reflection * paths.depth, dtype=np.float64)
+
+    return loss
+
+
+def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
     rt = data.settings.rt
-    foliage, leaves = foliage or rt.foliage, leaves or rt.leaves
     if foliage == "none" or len(data.site.trees) == 0:
         return None
     name = rt.foliage_model if foliage == "attenuating" else foliage

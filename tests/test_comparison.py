@@ -364,3 +364,18 @@ def test_a_local_mean_without_a_window_is_refused(tmp_path: Path, capsys: pytest
     path = flight(tmp_path, rss={"USRP1": ([1.0], [-70.0])}, rss_keys=", field: local_mean")
     assert main(["report", str(path)]) == 2
     assert "window_s" in capsys.readouterr().err
+
+
+def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_path: Path) -> None:
+    at = np.arange(0, 120, 0.5)
+    path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))})
+    levels = {}
+    for loss in (0.0, 3.0, 200.0):
+        data = gathered(path)
+        rt = data.settings.rt.model_copy(update={"reflection_loss_db": loss})
+        data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
+        (replayed,) = replay_rss(data, str)
+        levels[loss] = compare_rss_series(data, data.rss[0], replayed).panel
+    ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines[0].level_dbm) for loss, p in levels.items()}
+    assert ripple[0.0] > ripple[3.0] > 0.1
+    assert ripple[200.0] < 1e-6, "only the line of sight is left"

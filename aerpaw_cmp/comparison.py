@@ -360,21 +360,17 @@ def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, Flo
     position = np.full((len(replayed.valid), 3), np.nan)
     position[replayed.valid] = replayed.poses.position_m
     place = data.site.towers[tower]
-    line = position - place.position_m
-    across = np.hypot(line[:, 0], line[:, 1])
-    mount = replayed.link.tower_arrays[tower].mount
-    in_frame = line @ mount  # site to antenna axes: the transpose of the mount, applied from the right
-    out = {
-        "position_m": position,
-        "distance_m": np.linalg.norm(line, axis=1),
-        "elevation_deg": np.degrees(np.arctan2(line[:, 2], across)),
-        "azimuth_deg": np.degrees(np.arctan2(in_frame[:, 1], in_frame[:, 0])),
-        "altitude_m": position[:, 2],
-    }
+    link = replayed.link
     seen = rss.link_geometry(
-        place.position_m, replayed.poses.position_m, replayed.poses.rotation, uav_mount=replayed.link.uav_array.mount
+        place.position_m,
+        replayed.poses.position_m,
+        replayed.poses.rotation,
+        tower_mount=link.tower_arrays[tower].mount,
+        uav_mount=link.uav_array.mount,
     )
-    for name in ("uav_azimuth_deg", "uav_elevation_deg"):
+    seen["azimuth_deg"] = seen["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
+    out = {"position_m": position, "altitude_m": position[:, 2]}
+    for name in ("distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "uav_elevation_deg"):
         out[name] = replayed.spread(seen[name])
     if replayed.track is not None:
         out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)

@@ -17,11 +17,13 @@ from .errors import UsageError
 from .readers import ReadOptions
 from .records import Kind
 from .replay.arrays import (
-    TOWER_PORTS_M,
     Array,
     Link,
     Pattern,
+    linear_array,
     rotation_from_yaw_pitch_roll,
+    tower_comparison_array,
+    uav_comparison_array,
 )
 from .site.antennas import Isotropic
 from .units import FloatArray, wavelength_m
@@ -88,17 +90,11 @@ class ArraySettings(Settings):
             if not self.positions_m:
                 raise UsageError("layout 'custom' without 'positions_m'", expected="a list of [x, y, z] in metres")
             return np.asarray(self.positions_m, dtype=np.float64)
-        if self.layout == "single":
-            return np.zeros((1, 3))
         if self.layout == "uav_comparison":
-            h = wavelength / 4
-            return np.array([[0, h, h], [0, h, -h], [0, -h, h], [0, -h, -h]])
-        along = (
-            np.array(TOWER_PORTS_M) if self.layout == "tower_comparison" else np.arange(self.elements) * wavelength / 2
-        )
-        out = np.zeros((len(along), 3))
-        out[:, 1] = along.mean() - along
-        return out
+            return uav_comparison_array(wavelength).positions_m
+        if self.layout == "tower_comparison":
+            return tower_comparison_array().positions_m
+        return linear_array(1 if self.layout == "single" else self.elements, wavelength / 2).positions_m
 
     def build(self, wavelength: float, folder: Path) -> Array:
         """The array, with patterns loaded from files relative to ``folder``."""

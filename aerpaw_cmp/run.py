@@ -206,20 +206,11 @@ def run_bench(
 ) -> dict[str, Any]:
     """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
     from .peers import ingest_vs_pandas, kriging_vs_pykrige
-    from .replay.arrays import Link, tower_comparison_array, uav_comparison_array
     from .replay.bench import path_search, random_scene, speed_against_error
-    from .units import wavelength_m
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
-    mimo = Link(
-        carrier_hz=link.carrier_hz,
-        tower_arrays={name: tower_comparison_array() for name in names},
-        uav_array=uav_comparison_array(wavelength_m(link.carrier_hz)),
-        transmit_power_dbm=link.transmit_power_dbm,
-        uav_transmits=False,
-    )
-    rows = speed_against_error(site, mimo, some, samples=samples, progress=progress)
+    rows = speed_against_error(site, link, some, samples=samples, progress=progress)
     found: dict[str, Any] = {}
     if ratios:
         progress("path search against PathSolver at 1e6 samples")

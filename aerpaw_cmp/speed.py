@@ -22,6 +22,7 @@ from .replay.arrays import Isotropic, Poses
 from .replay.bench import Row, speed_against_error
 from .replaying import Replayed
 from .report.data import SpeedRow
+from .report.export import write_atomic
 
 POSES = 40
 """Evenly spread poses of the flight that the table is made on."""
@@ -80,12 +81,8 @@ def _load(key: str) -> list[dict[str, Any]] | None:
 
 
 def _save(key: str, rows: list[dict[str, Any]]) -> None:
-    folder = llvm.cache_folder()
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        partial = folder / f"speed-{key}.{os.getpid()}.partial"
-        partial.write_text(json.dumps(rows), encoding="utf-8")
-        partial.replace(folder / f"speed-{key}.json")
+        write_atomic(llvm.cache_folder() / f"speed-{key}.json", json.dumps(rows))
     except OSError:
         return  # a read-only home costs the next report the time, not this one its result
 

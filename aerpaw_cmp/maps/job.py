@@ -18,6 +18,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..compare.rank import rank_from_singular_values
 from ..errors import UsageError
 from ..units import BoolArray, FloatArray, IntArray, db_from_power
 from .grid import (
@@ -201,9 +202,8 @@ def map_job(
 
 def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
     """Channel rank (..., K): how many of ``sigma`` (..., r), descending, exceed ``sigma_1 / k``; 0 for no channel."""
-    sigma = np.nan_to_num(np.asarray(singular_values, dtype=np.float64))
-    above = sigma[..., None, :] > sigma[..., None, :1] / np.asarray(ks, dtype=np.float64)[:, None]
-    return np.asarray(above.sum(axis=-1), dtype=np.int64)
+    sigma = np.asarray(singular_values, dtype=np.float64)
+    return np.stack([rank_from_singular_values(sigma, k) for k in ks], axis=-1)
 
 
 def _ratios_db(singular_values: FloatArray) -> FloatArray:

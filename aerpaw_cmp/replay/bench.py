@@ -16,7 +16,7 @@ from shapely.geometry import Point, box
 
 from ..geodesy import SiteFrame
 from ..site.site import Building, Site, Tower
-from ..units import ComplexArray, FloatArray
+from ..units import ComplexArray, FloatArray, wavelength_m
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from .audit import RANK_K, Difference, compare
 from .field import mean_pair_power, rss_dbm
@@ -396,7 +396,7 @@ def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int 
     link = Link(
         carrier_hz,
         dict.fromkeys(named, tower_comparison_array()),
-        uav_comparison_array(299_792_458.0 / carrier_hz),
+        uav_comparison_array(wavelength_m(carrier_hz)),
         uav_transmits=False,
     )
     return site, link, Poses(position, rotation_from_aircraft(angles[0], angles[1], 18 * angles[2]))

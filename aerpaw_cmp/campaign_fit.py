@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from .compare import rss
-from .compare.heldout import fit_held_out, rmse
+from .compare.heldout import fit_held_out, goes_round, rmse
 from .compare.offset import grid_offset
 from .config import FlightFile
 from .errors import InputError, UsageError
@@ -228,8 +228,9 @@ def search(
     def objective(point: Mapping[str, float], flight: str) -> FloatArray:
         return benches[flight].residual_db(point)
 
+    circular = [name for name, values in grids.items() if name.endswith("yaw_deg") and goes_round(values)]
     if np.prod([len(v) for v in grids.values()], dtype=np.float64) <= LARGEST_PRODUCT:
-        fit = fit_held_out(objective, grids, train, refine=refine)
+        fit = fit_held_out(objective, grids, train, refine=refine, circular=circular)
         return Search(dict(fit.parameters), fit.at_bounds, fit.evaluations, "every combination")
     calls, best = 0, (np.inf, {name: float(v[0]) for name, v in grids.items()})
     for share in (0.25, 0.5, 0.75):
@@ -246,7 +247,9 @@ def search(
         score = float(np.mean([rmse(objective(point, flight)) ** 2 for flight in train]))
         if score < best[0]:
             best = (score, point)
-    edge = tuple(n for n, v in grids.items() if len(v) > 1 and best[1][n] in (float(v[0]), float(v[-1])))
+    edge = tuple(
+        n for n, v in grids.items() if len(v) > 1 and n not in circular and best[1][n] in (float(v[0]), float(v[-1]))
+    )
     return Search(best[1], edge, calls, "one parameter after the other, three starts")
 
 

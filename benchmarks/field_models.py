@@ -195,7 +195,9 @@ def fit_mount(flights: Mapping[str, Flight], patterns: Patterns, train: str, tes
     grid = np.arange(0.0, 360.0, step_deg)
     names = ["uav", *next(iter(flights.values())).measured_db]
     start = {"uav": 0.0, **dict.fromkeys(names[1:], PAPER["tower"])}
-    return fit_held_out(objective, dict.fromkeys(names, grid), [train], [test], start=start, largest_grid=60_000)
+    return fit_held_out(
+        objective, dict.fromkeys(names, grid), [train], [test], start=start, largest_grid=60_000, circular=names
+    )
 
 
 def transferred_models(patterns: Patterns, mounts: Mapping[str, HeldOutFit]) -> dict[str, Model]:

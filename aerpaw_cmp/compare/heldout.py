@@ -6,18 +6,20 @@ flights it was fitted on and keeps the scores of the others apart.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
 import numpy as np
 
-from ..units import FloatArray
+from ..units import BoolArray, FloatArray
 from .statistics import plain
 
 Objective = Callable[[Mapping[str, float], str], FloatArray]
 """``objective(parameters, flight)`` gives that flight's residuals [dB], its own offset already removed."""
+
+CIRCLE_DEG = 360.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,6 +73,7 @@ def fit_held_out(
     refine: bool = True,
     tolerance: float = 1e-3,
     largest_grid: int = 20_000,
+    circular: Collection[str] = (),
 ) -> HeldOutFit:
     """Fit parameters on the flights ``train`` and apply them to the flights ``test``.
 
@@ -90,6 +93,8 @@ def fit_held_out(
         Of the refinement, as a share of each parameter's span.
     largest_grid : int
         More combinations are refused.
+    circular : collection of str
+        Angles [deg] that go round: their values cover the circle (see :func:`goes_round`), so they have no bounds.
 
     Returns
     -------
@@ -127,17 +132,29 @@ def fit_held_out(
         raise ValueError("no combination of parameters gave a residual on every flight to fit on")
     found = np.asarray(best, dtype=np.float64)
     if refine and any(len(v) > 1 for v in values):
-        found = _simplex(score, found, least, values, tolerance)
+        round_ = np.array([name in circular for name in names])
+        found = _simplex(score, found, least, values, tolerance, round_)
     fitted = {name: float(value) for name, value in zip(names, found, strict=True)}
     first = dict(start) if start else {n: float(v[len(v) // 2]) for n, v in zip(names, values, strict=True)}
     flights = (*train, *test)
     calls += 2 * len(flights)
     after = {flight: rmse(objective(fitted, flight)) for flight in flights}
-    edge = [n for n, x, v in zip(names, found, values, strict=True) if len(v) > 1 and _at_bound(x, v)]
+    edge = [
+        n for n, x, v in zip(names, found, values, strict=True) if len(v) > 1 and n not in circular and _at_bound(x, v)
+    ]
     return HeldOutFit(
         fitted, tuple(train), tuple(test), {f: after[f] for f in train}, {f: after[f] for f in test},
         {flight: rmse(objective(first, flight)) for flight in flights}, tuple(edge), calls,
     )  # fmt: skip
+
+
+def goes_round(values: Sequence[float] | FloatArray) -> bool:
+    """Whether increasing angles [deg] cover the circle: the gap from the last to the first is no wider than another."""
+    angles = np.asarray(values, dtype=np.float64)
+    if len(angles) < 3:
+        return False
+    gap = CIRCLE_DEG - (angles[-1] - angles[0])
+    return bool(0.0 <= gap <= np.diff(angles).max() * (1.0 + 1e-9))
 
 
 def _at_bound(value: float, values: FloatArray) -> bool:
@@ -146,28 +163,35 @@ def _at_bound(value: float, values: FloatArray) -> bool:
 
 
 def _simplex(
-    score: Callable[[FloatArray], float], found: FloatArray, least: float, values: list[FloatArray], tolerance: float
+    score: Callable[[FloatArray], float],
+    found: FloatArray,
+    least: float,
+    values: list[FloatArray],
+    tolerance: float,
+    circular: BoolArray,
 ) -> FloatArray:
-    """Nelder-Mead in units of each parameter's span, from the best grid point."""
+    """Nelder-Mead in units of each parameter's span (a turn for angles that go round), from the best grid point."""
     from scipy.optimize import minimize
 
     low = np.array([v[0] for v in values])
-    span = np.array([max(float(v[-1] - v[0]), 0.0) for v in values])
+    span = np.where(circular, CIRCLE_DEG, [max(float(v[-1] - v[0]), 0.0) for v in values])
     free = span > 0
     step = np.array([1.0 / max(1, len(v) - 1) for v in values])[free] * 0.5
+    around = circular[free]
 
     def point(unit: FloatArray) -> FloatArray:
         full = found.copy()
-        full[free] = low[free] + span[free] * unit
+        full[free] = low[free] + span[free] * np.where(around, unit % 1.0, unit)
         return np.asarray(full, dtype=np.float64)
 
     origin = (found[free] - low[free]) / span[free]
-    corners = np.clip(origin + np.vstack([np.zeros(len(step)), np.diag(np.where(origin < 0.5, step, -step))]), 0, 1)
+    corners = origin + np.vstack([np.zeros(len(step)), np.diag(np.where(origin < 0.5, step, -step))])
+    corners = np.where(around, corners, np.clip(corners, 0.0, 1.0))
     result = minimize(
         lambda unit: score(point(unit)),
         origin,
         method="Nelder-Mead",
-        bounds=[(0.0, 1.0)] * len(step),
+        bounds=[(-1.0, 2.0) if turns else (0.0, 1.0) for turns in around],
         options={"initial_simplex": corners, "xatol": tolerance, "fatol": 1e-6, "maxfev": 200 * len(step)},
     )
     return point(np.asarray(result.x)) if result.fun < least else found

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-from aerpaw_cmp.compare.heldout import fit_held_out
+from aerpaw_cmp.compare.heldout import fit_held_out, goes_round
 
 TRUTH = {"yaw_deg": 37.0, "gamma": 0.5}
 
@@ -59,6 +61,31 @@ def test_a_parameter_at_its_bound_is_named():
     fit = fit_held_out(objective, {"yaw_deg": [50.0, 70.0, 90.0], "gamma": [0.5]}, ["a"])
     assert fit.at_bounds == ("yaw_deg",)
     assert fit.parameters["gamma"] == 0.5
+
+
+@given(st.floats(0.0, 360.0, exclude_max=True), st.sampled_from([20.0, 30.0, 45.0]))
+@settings(max_examples=25, deadline=None)
+def test_an_azimuth_that_goes_round_has_no_bound(truth, step):
+    across = np.radians(np.linspace(0, 340, 18))
+
+    def around(parameters, _flight):
+        return np.cos(across - np.radians(parameters["yaw_deg"])) - np.cos(across - np.radians(truth))
+
+    grid = np.arange(0, 360, step)
+    fit = fit_held_out(around, {"yaw_deg": grid}, ["a"], circular=["yaw_deg"])
+    off = (fit.parameters["yaw_deg"] - truth + 180) % 360 - 180
+    assert abs(off) < 0.5
+    assert 0.0 <= fit.parameters["yaw_deg"] < 360.0
+    assert fit.at_bounds == ()
+
+
+def test_what_goes_round():
+    assert goes_round(np.arange(0, 360, 10))
+    assert goes_round([-180.0, -60.0, 60.0])
+    assert goes_round(np.arange(0, 361, 10))
+    assert not goes_round(np.arange(0, 180, 10))
+    assert not goes_round([0.0, 10.0, 20.0, 350.0, 700.0])
+    assert not goes_round([0.0, 180.0])
 
 
 def test_without_refinement_the_grid_decides():

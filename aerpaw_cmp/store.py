@@ -10,18 +10,23 @@ Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
 
 JSON is stored as UTF-8 bytes, because HDF5 strings cannot hold the NUL characters that torn logs have. Times are
 int64 nanoseconds of UTC. Nothing in the file needs this package to be read.
+
+Behind the HDF5 data, where HDF5 does not look, stand the word ``AERPAWCS`` and the SHA-256 of all bytes before it:
+damage is found before HDF5 sees it, which takes some damage for data and never comes back from some. A file without
+it (cut, or written on by another program) is left to HDF5's own checks.
 """
 
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import json
 import os
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from .errors import InputError, UsageError
 from .records import ReadResult, RejectedLine, Stream
@@ -32,6 +37,8 @@ if TYPE_CHECKING:
 FORMAT = "aerpaw-cmp flight"
 VERSION = 1
 _MAGIC = b"\x89HDF\r\n\x1a\n"
+_SEAL = b"AERPAWCS"
+_DIGEST_BYTES = 32
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,8 +84,7 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
             shelf = book.create_group("files")
             for i, file in enumerate(files):
                 _write_file(shelf.create_group(f"{i:05d}"), file)
-        with part.open("rb") as done:
-            os.fsync(done.fileno())
+        _seal(part)
         part.chmod(0o666 & ~_umask())  # mkstemp makes files private; a flight file is an ordinary one
         part.replace(target)
         _sync_folder(target.parent)
@@ -102,6 +108,42 @@ def _sync_folder(folder: Path) -> None:
             os.fsync(handle)
         finally:
             os.close(handle)
+
+
+def _seal(path: Path) -> None:
+    """Append the digest of the content, and bring all of it to the disk."""
+    with path.open("r+b") as book:
+        digest = _digest(book, path.stat().st_size)
+        book.seek(0, os.SEEK_END)
+        book.write(_SEAL + digest)
+        book.flush()
+        os.fsync(book.fileno())
+
+
+def _digest(book: BinaryIO, size: int) -> bytes:
+    """SHA-256 of the first ``size`` bytes."""
+    digest = hashlib.sha256()
+    book.seek(0)
+    while size > 0 and (block := book.read(min(size, 1 << 20))):
+        digest.update(block)
+        size -= len(block)
+    return digest.digest()
+
+
+def _refuse_changed(book: BinaryIO, path: str | Path) -> None:
+    """InputError if the file ends with a seal that its content does not have."""
+    content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
+    if content <= 0:
+        return
+    book.seek(content)
+    seal = book.read()
+    if seal.startswith(_SEAL) and seal[len(_SEAL) :] != _digest(book, content):
+        raise InputError(
+            "the flight file is damaged (its content does not have the SHA-256 written with it)",
+            expected="the bytes that 'aerpaw-cmp ingest -o' wrote",
+            cause="a failing disk or transfer: copy it again or ingest the logs again",
+            path=path,
+        )
 
 
 def _write_file(group: Any, file: IngestedFile) -> None:
@@ -179,6 +221,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     try:
         with place.open("rb") as probe:
             magic = probe.read(len(_MAGIC))
+            if magic == _MAGIC:
+                _refuse_changed(probe, path)
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", expected="a flight file", path=path) from error
     if magic != _MAGIC:

@@ -183,7 +183,7 @@ def test_files_that_are_no_flight_file(tmp_path: Path) -> None:
 def test_cut_at_many_bytes(tmp_path: Path) -> None:
     path = tmp_path / "flight.h5"
     write_flight(path, all_samples_of_one(tmp_path))
-    data = path.read_bytes()
+    data = path.read_bytes()[:-40]  # behind it the seal: without it the content is whole
     for end in range(0, len(data) - 1, max(1, len(data) // 150)):
         path.write_bytes(data[:end])
         with pytest.raises(InputError):
@@ -192,15 +192,48 @@ def test_cut_at_many_bytes(tmp_path: Path) -> None:
 
 @given(st.data())
 @settings(max_examples=80, deadline=None)
-def test_damaged_bytes_give_a_clear_error_or_the_content(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
-) -> None:
+def test_damaged_bytes_are_told_from_the_content(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
     folder = tmp_path_factory.mktemp("damage")
     path = folder / "flight.h5"
     write_flight(path, all_samples_of_one(folder))
     raw = bytearray(path.read_bytes())
+    end = len(raw) - 40  # the seal itself may be lost without loss of content
     for _ in range(data.draw(st.integers(1, 8))):
-        raw[data.draw(st.integers(8, len(raw) - 1))] = data.draw(st.integers(0, 255))
+        raw[data.draw(st.integers(0, end - 1))] ^= data.draw(st.integers(1, 255))
+    if bytes(raw) == path.read_bytes():  # two changes of one byte that cancel
+        return
+    path.write_bytes(bytes(raw))
+    with pytest.raises(InputError):
+        read_flight(path)
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_damage_without_a_seal_gives_a_clear_error_or_the_content(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("unsealed")
+    path = folder / "flight.h5"
+    write_flight(path, all_samples_of_one(folder))
+    raw = bytearray(path.read_bytes()[:-40])
+    raw[data.draw(st.integers(4096, len(raw) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(bytes(raw))
     with contextlib.suppress(InputError):  # any other exception fails the test
         read_flight(path)
+
+
+def test_a_file_without_its_seal_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    files = all_samples_of_one(tmp_path)
+    write_flight(path, files)
+    whole = read_flight(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert [f.sha256 for f in read_flight(path)] == [f.sha256 for f in whole]
+
+
+def test_other_programs_read_a_sealed_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, all_samples_of_one(tmp_path))
+    with h5py.File(path, "r") as book:
+        assert book.attrs["version"] == 1
+        assert len(book["files"]) == len(read_flight(path))

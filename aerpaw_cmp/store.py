@@ -18,17 +18,16 @@ it (cut, or written on by another program) is left to HDF5's own checks.
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import json
 import os
-import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
 from .errors import InputError, UsageError
+from .files import whole
 from .records import ReadResult, RejectedLine, Stream
 
 if TYPE_CHECKING:
@@ -69,55 +68,28 @@ def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
     """
     import h5py
 
-    target = Path(path)
     try:
-        handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name}.", suffix=".part")
-        os.close(handle)
+        with whole(Path(path), durable=True) as part:
+            with h5py.File(part, "w") as book:
+                book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
+                shelf = book.create_group("files")
+                for i, file in enumerate(files):
+                    _write_file(shelf.create_group(f"{i:05d}"), file)
+            _seal(part)
     except OSError as error:
         raise UsageError(
-            f"cannot write here ({error.strerror or error})", cause="a missing folder", path=path
+            f"cannot write the flight file ({error.strerror or error})",
+            cause="a missing folder or a full disk",
+            path=path,
         ) from error
-    part = Path(name)
-    try:
-        with h5py.File(part, "w") as book:
-            book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
-            shelf = book.create_group("files")
-            for i, file in enumerate(files):
-                _write_file(shelf.create_group(f"{i:05d}"), file)
-        _seal(part)
-        part.chmod(0o666 & ~_umask())  # mkstemp makes files private; a flight file is an ordinary one
-        part.replace(target)
-        _sync_folder(target.parent)
-    except OSError as error:
-        raise UsageError(f"cannot write the flight file ({error})", cause="a full disk", path=path) from error
-    finally:
-        part.unlink(missing_ok=True)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
-def _sync_folder(folder: Path) -> None:
-    """Make the new name durable, where the system lets folders be synced."""
-    with contextlib.suppress(OSError):
-        handle = os.open(folder, os.O_RDONLY)
-        try:
-            os.fsync(handle)
-        finally:
-            os.close(handle)
 
 
 def _seal(path: Path) -> None:
-    """Append the digest of the content, and bring all of it to the disk."""
+    """Append the digest of the content."""
     with path.open("r+b") as book:
         digest = _digest(book, path.stat().st_size)
         book.seek(0, os.SEEK_END)
         book.write(_SEAL + digest)
-        book.flush()
-        os.fsync(book.fileno())
 
 
 def _digest(book: BinaryIO, size: int) -> bytes:

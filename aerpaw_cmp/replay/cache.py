@@ -5,10 +5,9 @@ Paths depend on the faces, the ends and the search, not on arrays, attitude or p
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import io
-import os
-import tempfile
 import zipfile
 from dataclasses import asdict
 from importlib import metadata
@@ -18,6 +17,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from .. import __version__
+from ..files import whole
 from ..units import FloatArray
 from .paths import PathSet
 
@@ -71,11 +71,7 @@ class PathCache:
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
-        try:
+        with contextlib.suppress(OSError):  # a cache that cannot be written is no reason to fail
             self.folder.mkdir(parents=True, exist_ok=True)
-            handle, name = tempfile.mkstemp(dir=self.folder, suffix=".part")
-        except OSError:
-            return  # a cache that cannot be written is no reason to fail
-        with os.fdopen(handle, "wb") as stream:
-            np.savez(stream, seconds=seconds, **{column: getattr(paths, column) for column in _COLUMNS})
-        Path(name).replace(self.folder / f"{key}.npz")
+            with whole(self.folder / f"{key}.npz") as part, part.open("wb") as stream:
+                np.savez(stream, seconds=seconds, **{column: getattr(paths, column) for column in _COLUMNS})

@@ -21,6 +21,7 @@ from shapely.geometry import MultiPolygon, Polygon
 from shapely.geometry.base import BaseGeometry
 
 from ..errors import InputError, UsageError
+from ..files import whole
 from ..geodesy import SiteFrame
 from .mapfiles import MapFile, Outline, Position, read_map_file
 from .materials import MATERIALS
@@ -502,10 +503,8 @@ def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str]
     dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
     text = "".join(f"# {line}\n" for entry in header for line in str(entry).splitlines())
     text += yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=118)
-    path = Path(path)
-    partial = path.with_name(path.name + ".partial")
     try:
-        partial.write_text(text, encoding="utf-8")
-        partial.replace(path)
+        with whole(Path(path)) as part:
+            part.write_text(text, encoding="utf-8")
     except OSError as error:
         raise UsageError(f"cannot be written ({error.strerror})", path=path) from None

@@ -1,0 +1,60 @@
+"""Files that appear whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import tempfile
+from collections.abc import Iterator
+from pathlib import Path
+
+
+@contextlib.contextmanager
+def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
+    """A place to write to, which takes the name ``target`` when the block ends without an error.
+
+    Parameters
+    ----------
+    target : Path
+        In a folder that exists. A reader sees the old file or the new one, never a part.
+    durable : bool
+        Bring content and name to the disk first, so that a power cut does not undo them.
+
+    Yields
+    ------
+    Path
+        An empty file in the same folder; it is removed if the block fails.
+
+    Raises
+    ------
+    OSError
+        If the folder is missing, full or not writable.
+    """
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:40]}.", suffix=".part")
+    os.close(handle)
+    part = Path(name)
+    try:
+        yield part
+        part.chmod(0o666 & ~_umask())  # mkstemp makes files private; these are ordinary ones
+        if durable:
+            _sync(part)
+        part.replace(target)
+        if durable:
+            with contextlib.suppress(OSError):  # not every system lets folders be synced
+                _sync(target.parent)
+    finally:
+        part.unlink(missing_ok=True)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def _sync(path: Path) -> None:
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)

@@ -214,19 +214,13 @@ def readers_check() -> Check:
     return Check("Readers", "ok", f"{len(names)}: {', '.join(names)}")
 
 
-def holders(device: str, root: Path = Path("/proc")) -> list[str]:
+def holders(device: str) -> list[str]:
     """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
-    target = os.path.realpath(device)
-    found = []
-    for entry in root.glob("[0-9]*/fd/*"):
-        try:
-            if os.path.realpath(entry) != target:
-                continue
-            process = entry.parents[1]
-            found.append(f"{(process / 'comm').read_text().strip()} ({process.name})")
-        except OSError:
-            continue  # the process has ended, or is not ours to look at
-    return sorted(set(found))
+    try:
+        from .live import ports
+    except ImportError:  # no termios: not a system that the tap runs on
+        return []
+    return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]
 
 
 def serial_checks() -> Iterator[Check]:

@@ -154,15 +154,15 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     return PortInfo(path, path.resolve(), "given", interface, product)
 
 
-def holders(path: Path) -> list[Holder]:
-    """Other processes that have the port open, by ``/proc`` (as far as we may look)."""
+def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
+    """Processes that have the port open, by ``/proc`` (as far as we may look); without our own by default."""
     try:
         wanted = path.stat().st_rdev
     except OSError:
         return []
     found: dict[int, Holder] = {}
     for process in Path("/proc").iterdir():
-        if not process.name.isdigit() or int(process.name) == os.getpid():
+        if not process.name.isdigit() or (others_only and int(process.name) == os.getpid()):
             continue
         with contextlib.suppress(OSError):
             for fd in (process / "fd").iterdir():

@@ -89,6 +89,7 @@ def ingest(
 ) -> None:
     """Read logs, account for every line, write the flight file."""
     from . import run
+    from .ingest import ACCOUNT, account_notes, account_rows
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
@@ -96,40 +97,10 @@ def ingest(
     if as_json:
         _print_json(summary)
         return
-    rows = []
-    for file in summary["files"]:
-        streams = ", ".join(f"{s['name']} ({s['kind']}) {s['rows']}" for s in file["streams"]) or "-"
-        rates = ", ".join("-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in file["streams"]) or "-"
-        spans = "\n".join(f"{s['start']} .. {s['end']}" for s in file["streams"][:1]) or "-"
-        rows.append(
-            [
-                str(file["path"]),
-                file["reader"],
-                streams,
-                str(file["lines"]),
-                str(file["accepted"]),
-                str(file["rejected"]),
-                str(file["blank"]),
-                rates,
-                spans,
-                "\n".join(file["warnings"]) or "-",
-            ]
-        )
-    header = [
-        "file",
-        "reader",
-        "streams (rows)",
-        "lines",
-        "accepted",
-        "rejected",
-        "blank",
-        "rate Hz",
-        "span UTC",
-        "warnings",
-    ]
-    _table(header, rows)
-    for skipped in summary.get("skipped", []):
-        _say(f"skipped: {skipped}")
+    folder, rows = account_rows(summary)
+    _table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
+    for note in account_notes(summary):
+        _say(note)
     if out is not None:
         print(f"wrote {out}")
 

@@ -7,9 +7,10 @@ from __future__ import annotations
 
 import hashlib
 import io
+import os
 import zlib
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,6 +23,9 @@ if TYPE_CHECKING:
 
 MAX_BYTES = 512 * 2**20
 """Largest file read, and largest content of a gzip file: a log of a day is a hundred times smaller."""
+
+FIRST_REJECTED = 3
+"""Rejected lines of a file that a summary quotes."""
 
 _GZIP = b"\x1f\x8b"
 
@@ -215,6 +219,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
             "lines": file.result.lines,
             "accepted": file.result.accepted,
             "rejected": len(file.result.rejected),
+            "first_rejected": [asdict(line) for line in file.result.rejected[:FIRST_REJECTED]],
             "blank": file.result.blank,
             "streams": [
                 {"kind": stream.kind, "name": stream.name, "rows": len(stream.frame), **_span(stream.frame)}
@@ -238,3 +243,57 @@ def _span(frame: pd.DataFrame) -> dict[str, Any]:
     seconds = (end - start).total_seconds()
     rate = (len(frame) - 1) / seconds if seconds > 0 else None
     return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
+
+
+ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
+"""Columns of :func:`account_rows`."""
+
+
+def account_rows(account: Mapping[str, Any]) -> tuple[str, list[list[str]]]:
+    """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file."""
+    paths = [Path(file["path"]) for file in account["files"]]
+    folder = os.path.commonpath([path.parent for path in paths]) if len(paths) > 1 else ""
+    return folder, [_account_row(file, folder) for file in account["files"]]
+
+
+def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
+    streams = file["streams"]
+    kinds: dict[str, list[str]] = {}
+    for stream in streams:
+        kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
+    rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
+    start, seconds = _start_and_length([s for s in streams if s["start"]])
+    return [
+        os.path.relpath(file["path"], folder) if folder else str(file["path"]),
+        file["reader"],
+        "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
+        *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
+        ", ".join(sorted(rates)) or "-",
+        start,
+        seconds,
+    ]
+
+
+def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    import numpy as np
+
+    if not streams:
+        return "-", "-"
+    first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
+    last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
+    whole = str(first.astype("datetime64[s]")).replace("T", " ")
+    # without --time-origin, relative times count from 1970
+    return "relative" if first < np.datetime64("1971") else whole, f"{(last - first) / np.timedelta64(1, 's'):.1f}"
+
+
+def account_notes(account: Mapping[str, Any]) -> list[str]:
+    """What a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
+    notes = []
+    for file in account["files"]:
+        notes += [f"{file['path']}: {text}" for text in file["warnings"]]
+        for line in file["first_rejected"]:
+            notes.append(f"{file['path']}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
+        more = file["rejected"] - len(file["first_rejected"])
+        if more:
+            notes.append(f"{file['path']}: and {more} more rejected lines, all in the flight file (-o)")
+    return notes + [f"{left['path']}: skipped: {left['reason']}" for left in account["skipped"]]

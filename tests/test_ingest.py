@@ -13,7 +13,7 @@ import pytest
 
 from aerpaw_cmp import ingest as room
 from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.ingest import ingest, summary
+from aerpaw_cmp.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, summary
 from aerpaw_cmp.readers import ReadOptions
 from tests.parsers.samples import OPTIONS, SAMPLES
 
@@ -69,6 +69,35 @@ def test_summary_is_the_contract(folder: Path) -> None:
     assert pd.Timestamp(one["start"]) == pd.Timestamp("2025-03-02T15:00:00.25Z")
     assert one["rate_hz"] == pytest.approx(1.0)
     assert any("no_fix" in text and "vehicle.txt" in text for text in answer["warnings"])
+
+
+def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    lines = VEHICLE.splitlines(keepends=True)
+    (tmp_path / "a/vehicle.txt").write_bytes(lines[0] + b"torn,\n" + lines[1])
+    (tmp_path / "b/vehicle.txt").write_bytes(VEHICLE)
+    (tmp_path / "b/notes.md").write_text("words")
+    account = summary(ingest(tmp_path, options=OPTIONS))
+    folder, (first, second) = account_rows(account)
+    assert folder == str(tmp_path)
+    assert [first[0], second[0]] == ["a/vehicle.txt", "b/vehicle.txt"]
+    one = dict(zip(ACCOUNT, first, strict=True))
+    assert (one["lines"], one["accepted"], one["rejected"], one["blank"]) == ("3", "2", "1", "0")
+    assert (one["streams (rows)"], one["start UTC"], one["s"]) == ("telemetry: vehicle 2", "2025-03-02 15:00:00", "1.0")
+    notes = account_notes(account)
+    assert any("a/vehicle.txt:2: rejected: " in note and "torn," in note for note in notes)
+    assert any("notes.md: skipped: " in note for note in notes)
+    assert account_rows(summary(Ingested())) == ("", [])
+
+
+def test_relative_times_are_called_relative(tmp_path: Path) -> None:
+    account = {"files": [{"path": "x", "reader": "r", "lines": 1, "accepted": 1, "rejected": 9, "blank": 0,
+                          "warnings": [], "first_rejected": [{"number": 1, "reason": "torn", "text": "t"}],
+                          "streams": [{"kind": "rank", "name": "a", "rows": 1, "start": "1969-12-31T23:59:59Z",
+                                       "end": "1970-01-01T00:00:01.5Z", "rate_hz": None}]}], "skipped": []}  # fmt: skip
+    assert account_rows(account)[1][0][-3:] == ["-", "relative", "2.5"]
+    assert account_notes(account)[-1].startswith("x: and 8 more rejected lines")
 
 
 def test_summary_of_a_single_sample_has_no_rate(tmp_path: Path) -> None:

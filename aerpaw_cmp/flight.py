@@ -129,6 +129,10 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
     )
 
 
+RATIOS = ("quality", "snr")
+"""Streams of kind rss that the sounder writes beside its level."""
+
+
 def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
@@ -146,6 +150,11 @@ def gather(
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss":
+                if stream.name.lower() in RATIOS:
+                    warnings.append(
+                        f"{log.path}: {stream.name!r} is a ratio to the noise, not a level: compared as RSS as if the "
+                        f"noise were constant ('skip: [{stream.name}]' beside the path leaves it out)"
+                    )
                 rss.append(_rss_series(settings, log, stream, site))
             else:
                 rank.append(_rank_series(settings, log, stream, site))

@@ -10,7 +10,7 @@ import io
 import os
 import zlib
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -173,6 +173,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
 
 def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
     given = options(path) if callable(options) else options or ReadOptions()
+    given = replace(given, file_name=path.name)
     try:
         result = reader.read(data, given)
     except (InputError, UsageError) as error:

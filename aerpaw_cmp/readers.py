@@ -45,6 +45,8 @@ class ReadOptions:
         Unit of RSS where the file does not fix it.
     floor_db : float
         RSS at or below this is out of coverage.
+    file_name : str
+        Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
     """
 
     timezone: str | None = None
@@ -58,6 +60,7 @@ class ReadOptions:
     frequency_hz: float | None = None
     unit: str | None = None
     floor_db: float = -200.0
+    file_name: str = ""
 
 
 @dataclass(frozen=True, slots=True)

@@ -379,3 +379,12 @@ def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_pat
     ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines[0].level_dbm) for loss, p in levels.items()}
     assert ripple[0.0] > ripple[3.0] > 0.1
     assert ripple[200.0] < 1e-6, "only the line of sight is left"
+
+
+def test_a_ratio_to_noise_is_not_taken_for_a_level_in_silence(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    level = free_space_db(at)
+    data = gathered(flight(tmp_path, rss={"power": (at, level), "quality": (at, level + 60)}))
+    said = [text for text in data.warnings if "ratio to the noise" in text]
+    assert len(said) == 1
+    assert said[0].startswith("quality.csv: 'quality'")

@@ -183,8 +183,12 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     return repeats, stars.line[chosen], bad
 
 
+_NAMED = re.compile(r"(power|quality|snr)_?log")
+"""What AERPAW's start scripts call the three logs."""
+
+
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """One stream of levels; power and quality logs look alike, so ``options.channel`` names the stream.
+    """One stream of levels; power and quality logs look alike, so ``options.channel`` or the file name tells them.
 
     Raises
     ------
@@ -251,11 +255,13 @@ def _stream(
         _lines.add_flag(flag, samples.line == len(lines) - 1, _lines.UNTERMINATED)
     frame = _frames.frame("rss", instants.time, samples.line + 1, flag, {"rss_db": value})
     warnings += [*instants.warnings, *_frames.steps_back(frame)]
-    name = options.channel or "power"
+    told = _NAMED.search(options.file_name.lower())
+    name = options.channel or (told.group(1) if told else "power")
     ratio = name.lower() in ("quality", "snr")
-    if options.channel is None:
+    if options.channel is None and not told:
         warnings.append(
-            "power, quality and SNR logs have one layout: read as power; name another with the channel option"
+            "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "
+            "with the channel option"
         )
     attributes = _frames.attributes(
         options,

@@ -81,6 +81,7 @@ def _table(columns: list[str], rows: list[list[str]], title: str | None = None) 
 def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
     out: Out = None,
+    draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
     reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
@@ -93,7 +94,8 @@ def ingest(
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
-    summary = run.run_ingest(paths, out=out, reader=reader, timezone=timezone, time_origin=time_origin, ri_base=ri_base)
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
+    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, **options)
     if as_json:
         _print_json(summary)
         return
@@ -103,6 +105,10 @@ def ingest(
         _say(note)
     if out is not None:
         print(f"wrote {out}")
+    if draft is not None:
+        for remark in summary["draft"]:
+            _say(remark)
+        print(f"wrote {draft}")
 
 
 @app.command(help=COMMANDS["formats"])

@@ -42,9 +42,12 @@ class Stages:
 
 
 def run_ingest(
-    paths: list[Path], *, out: Path | None = None, reader: str | None = None, **options: Any
+    paths: list[Path], *, out: Path | None = None, draft: Path | None = None, reader: str | None = None, **options: Any
 ) -> dict[str, Any]:
-    """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3."""
+    """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3.
+
+    With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
+    """
     from .ingest import ingest, summary
     from .readers import ReadOptions
     from .store import write_flight
@@ -52,7 +55,12 @@ def run_ingest(
     files = ingest(paths, options=ReadOptions(**options), reader=reader)
     if out is not None:
         write_flight(out, files)
-    return summary(files)
+    account = summary(files)
+    if draft is not None:
+        from .draft import write_draft
+
+        account["draft"] = write_draft(files, draft, timezone=options.get("timezone"))
+    return account
 
 
 def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = _silent) -> list[Path]:

@@ -31,9 +31,7 @@ LINK = """\
 link:
   rss: {carrier_hz: 3.3e9, transmit_power_dbm: 40, uav_transmits: true}  # as in your experiment?
 """
-RANK = (
-    "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
-)
+RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
 
 
 @dataclass

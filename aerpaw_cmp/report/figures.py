@@ -111,10 +111,15 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     svg, png = io.BytesIO(), io.BytesIO()
-    fig.savefig(png, format="png", pil_kwargs={"compress_level": 2})
+    fig.set_dpi(RASTER_DPI)
+    FigureCanvasAgg(fig).print_png(png, pil_kwargs={"compress_level": 2})
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
-    fig.savefig(svg, format="svg", metadata={"Date": None})
+    FigureCanvasSVG(fig).print_svg(svg, metadata={"Date": None})
     return svg.getvalue(), png.getvalue()
 
 

@@ -11,7 +11,7 @@ from ..site.site import Site
 from ..units import FloatArray
 from .data import RANKS
 from .export import k_key, safe_name
-from .figures import RANK_HATCH, TOWER, Plate, colour_bar, figure, rank_colour, spread_out
+from .figures import RANK_HATCH, TOWER, Plate, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
 
 if TYPE_CHECKING:
@@ -284,9 +284,10 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
             marker=MARKERS[number % 8], markersize=5, label=curve.method,
         )  # fmt: skip
     ax.set_ylim(bottom=0)
+    plain_ticks(ax.xaxis)
     ax.set_xlabel("Number of samples")
     ax.set_ylabel("Mean absolute error of the rank")
-    ax.legend(loc="best")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
 
 

@@ -146,8 +146,8 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     columns = min(len(rows), MAPS_PER_ROW)
     lines = -(-len(rows) // columns)
     shape = plan_shape(east, north)
-    width = 8.0 / columns
-    fig = figure((9.2, 0.9 + lines * min(width / shape + 0.5, 6.0)))
+    width = (7.2 - 0.2 * columns) / columns  # what labels and the colour bar leave
+    fig = figure((9.2, 1.0 + lines * min(width / shape + 0.45, 6.0)))
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     mesh: Any = None
     for ax in axes.ravel()[len(rows) :]:

@@ -700,40 +700,31 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     if good.sum() < 40 or np.ptp(quantity[good]) == 0:
         return
     middle, low, median, high = running_levels(quantity[good], residual[good]).T
-    ax.plot(middle, median, color=SIMULATED, linewidth=1.3, label="median")
+    ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
     ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
     ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
 
 
-def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 15) -> FloatArray:
-    """Mean quantity and 10, 50, 90 % points of the values in bins of about equal count (b, 4).
+def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, fewest: int = 8) -> FloatArray:
+    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width (bins, 4).
 
-    Bins are no narrower than a fiftieth of the range, and a row of NaN breaks the line where the quantity has a gap of
-    a tenth of it: no line is drawn over what was not flown.
+    NaN where a bin has fewer than ``fewest`` samples: no line is drawn over what was not flown.
 
     Examples
     --------
-    >>> at = np.concatenate([np.arange(40.0), 900.0 + np.arange(40.0)])
-    >>> middle = running_levels(at, at)[:, 0]
-    >>> int(np.isnan(middle).sum()), bool(np.nanmax(np.diff(middle)) < 30)
-    (2, True)
+    >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])
+    >>> levels = running_levels(at, at)
+    >>> np.flatnonzero(np.isfinite(levels[:, 2])).tolist(), levels[0].round(3).tolist()
+    ([0, 1, 18, 19], [9.5, 1.9, 9.5, 17.1])
     """
-    order = np.argsort(quantity)
-    at, of = quantity[order], values[order]
-    span = at[-1] - at[0]
-    cuts = np.flatnonzero(np.diff(at) > 0.1 * span) + 1
-    rows: list[tuple[float, ...]] = []
-    for part, members in zip(np.split(at, cuts), np.split(of, cuts), strict=True):
-        edges = [part[0]]
-        for edge in np.quantile(part, np.linspace(0, 1, max(2, round(bins * len(part) / len(at)) + 1)))[1:]:
-            if edge - edges[-1] >= span / 50:
-                edges.append(edge)
-        which = np.clip(np.searchsorted(edges, part, side="right") - 1, 0, max(len(edges) - 2, 0))
-        for number in np.unique(which):
-            inside = which == number
-            rows.append((float(part[inside].mean()), *np.percentile(members[inside], [10, 50, 90])))
-        rows.append((float("nan"),) * 4)
-    return np.array(rows)
+    edges = np.linspace(quantity.min(), quantity.max(), bins + 1)
+    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
+    levels = np.full((bins, 4), np.nan)
+    for number in range(bins):
+        inside = which == number
+        if inside.sum() >= fewest:
+            levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
+    return levels
 
 
 def seen_from_tower(panel: RssPanel) -> Figure:
@@ -797,18 +788,18 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
 def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
     """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out."""
     draw_site(ax, site)
-    counts = {value: int((rank == value).sum()) for value in (0, *RANKS)}
-    for value, count in counts.items():
+    for value in (0, *RANKS):
         at = rank == value
-        if not count:
+        number = int(at.sum())
+        if not number:
             continue
         look: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
             look = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
-            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count})",
-            zorder=3.0 + 1.0 / count,  # the rarer a rank, the higher it lies: a few points must not vanish under many
+            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",
+            zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
         )  # fmt: skip
     ax.set_title(title)
     pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t.startswith(("rank", "Z"))]

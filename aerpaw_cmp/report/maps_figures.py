@@ -108,7 +108,7 @@ def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     columns = -(-count // rows)
-    width = min(7.4 / columns, 3.2)  # what a colour bar and the labels leave
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
     fig = figure((9.2, rows * (height + 0.35) + 1.0))
     grid = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)

@@ -14,6 +14,7 @@ from .export import k_key, safe_name
 from .figures import (
     BASELINE,
     Plate,
+    beyond,
     colour_bar,
     count,
     draw_site,
@@ -175,7 +176,7 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
         ax.label_outer()
     frame_around(axes[0][0], east, north, shape=shape)
     if mesh is not None:
-        colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured − simulated [dB]")
+        colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured − simulated [dB]", beyond(values, -reach, reach))
     handles, labels = axes[0][0].get_legend_handles_labels()
     if handles:
         fig.legend(handles, labels, loc="outside lower center")

@@ -402,9 +402,21 @@ def plan_shape(east: FloatArray, north: FloatArray) -> float:
     return float(np.clip((np.ptp(east[good]) + 60.0) / (np.ptp(north[good]) + 60.0), 0.8, 2.0))
 
 
-def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str) -> None:
-    """A colour bar that an SVG holds as one picture: without seams between its bands."""
-    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85)
+def beyond(values: FloatArray, low: float, high: float) -> str:
+    """Ends of a colour scale from ``low`` to ``high`` that values pass: its colours mean "or more" there.
+
+    Examples
+    --------
+    >>> beyond(np.array([1.0, 9.0]), 0.0, 5.0), beyond(np.array([1.0, np.nan]), 0.0, 5.0)
+    ('max', 'neither')
+    """
+    under, over = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
+
+
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> None:
+    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond."""
+    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
@@ -748,7 +760,7 @@ def seen_from_tower(panel: RssPanel) -> Figure:
     ax.set_facecolor("#F4F4F4")
     ax.set_xlabel("Azimuth in the frame of the tower antenna [deg]")
     ax.set_ylabel("Elevation [deg]")
-    colour_bar(fig, points, ax, "Measured − simulated [dB]")
+    colour_bar(fig, points, ax, "Measured − simulated [dB]", beyond(residual[good], -reach, reach))
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
     return fig
 

@@ -11,7 +11,7 @@ from ..site.site import Site
 from ..units import FloatArray
 from .data import RANKS
 from .export import k_key, safe_name
-from .figures import RANK_HATCH, TOWER, Plate, colour_bar, figure, plain_ticks, rank_colour, spread_out
+from .figures import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
 
 if TYPE_CHECKING:
@@ -135,7 +135,8 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
         alone = None if one.tower == JOINT else one.tower
         image = draw_map(ax, data, one.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{one.tower}: {100 * one.coverage:.0f} %", fontsize=9)
-    colour_bar(fig, image, axes, "RSS [dBm]")
+    levels = np.concatenate([one.rss_dbm.ravel() for one in maps])
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
     entries = overlay_legend(data, borders=any(one.tower == JOINT for one in maps))
     fig.legend(handles=entries, loc="outside lower center", ncols=3)
     return fig
@@ -172,7 +173,7 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     for ax, one in zip(axes, layers, strict=True):
         image = draw_map(ax, data, one.values, **options)
         ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
-    colour_bar(fig, image, axes, layers[0].label)
+    colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
     fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
     return fig
 

@@ -414,12 +414,13 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
     return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
 
 
-def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> None:
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> Any:
     """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond."""
     bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
+    return bar
 
 
 def used_towers(data: ReportData) -> list[str]:
@@ -685,7 +686,11 @@ def residual_against_geometry(panel: RssPanel) -> Figure:
         else:
             ax.set_ylabel("Measured − simulated [dB]")
     robust_limits(axes[0], [panel.residual_db], around=0.0)
-    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, markerscale=4)
+    legend = fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, markerscale=4)
+    handles: list[Any] = legend.legend_handles
+    for handle in handles:
+        if handle.get_linestyle() not in ("None", ""):  # markers on a line are not enlarged
+            handle.set_markersize(1.6)
     return fig
 
 
@@ -711,7 +716,8 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     good = np.isfinite(quantity) & np.isfinite(residual)
     if good.sum() < 40 or np.ptp(quantity[good]) == 0:
         return
-    middle, low, median, high = running_levels(quantity[good], residual[good]).T
+    bins = int(np.clip(good.sum() // 40, 8, 20))
+    middle, low, median, high = running_levels(quantity[good], residual[good], bins).T
     ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
     ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
     ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
@@ -756,9 +762,12 @@ def seen_from_tower(panel: RssPanel) -> Figure:
         azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
         rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
     )  # fmt: skip
-    ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
+    span = max(float(np.ptp(azimuth[good])), 1.0) if good.any() else 360.0
+    nearest = float(np.min(np.abs(azimuth[good]), initial=180.0))
+    if nearest < 0.3 * span:  # farther away it would squeeze the flight into a corner
+        ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
     ax.set_facecolor("#F4F4F4")
-    ax.set_xlabel("Azimuth in the frame of the tower antenna [deg]")
+    ax.set_xlabel("Azimuth in the frame of the tower antenna (0: boresight) [deg]")
     ax.set_ylabel("Elevation [deg]")
     colour_bar(fig, points, ax, "Measured − simulated [dB]", beyond(residual[good], -reach, reach))
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)

@@ -173,7 +173,11 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     for ax, one in zip(axes, layers, strict=True):
         image = draw_map(ax, data, one.values, **options)
         ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
-    colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
+    bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
+    if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
+        from matplotlib.ticker import MaxNLocator
+
+        bar.locator = MaxNLocator(integer=True)
     fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
     return fig
 
@@ -221,7 +225,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
                 label="Z: out of coverage" if value == 0 else f"rank {value}",
             )  # fmt: skip
             below = below + share[:, column]
-        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members])
+        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members], fontsize=7)
         ax.set_title(f"K = {k_key(k)}")
         ax.set_xlabel("Height [m]")
         ax.grid(visible=False)
@@ -376,7 +380,7 @@ def _layer_plates(data: MapsData) -> list[Plate]:
             name=f"layer_{safe_name(name)}",
             section="layers",
             title=name,
-            caption=f"{layers[0].label}. Hatched: no path.",
+            caption=f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path.",
             alt=f"Maps of {name}.",
             draw=lambda layers=layers: layer_maps(data, layers),  # type: ignore[misc]
         )

@@ -594,7 +594,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         },
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
-        note="seconds of the engine are its share for the audited links; the reference's include its start-up",
+        note="The time of the engine is its share for the audited links; that of the reference includes its start-up.",
     )
 
 

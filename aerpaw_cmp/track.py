@@ -845,7 +845,7 @@ def _blocks(values: FloatArray) -> FloatArray:
 
 def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
     """Half widths of 95 % intervals of least-squares parameters whose residuals remember each other."""
-    from scipy.stats import t as student
+    from scipy.special import stdtrit
 
     normal = jacobian @ jacobian.T
     if np.linalg.matrix_rank(normal) < len(normal):
@@ -854,7 +854,7 @@ def _sandwich(residual: FloatArray, jacobian: FloatArray) -> FloatArray:
     count = scores.shape[1]
     bread = np.linalg.inv(normal)
     covariance = bread @ (scores @ scores.T) @ bread * count / max(count - 1, 1)
-    return np.asarray(student.ppf(0.975, max(count - 1, 1)) * np.sqrt(np.diag(covariance)))
+    return np.asarray(stdtrit(max(count - 1, 1), 0.975) * np.sqrt(np.diag(covariance)))
 
 
 def _likelihood_ratios(cost: FloatArray, whitened: FloatArray) -> FloatArray:

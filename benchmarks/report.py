@@ -96,6 +96,7 @@ def main() -> None:
             "imports_s": statistics.median(r["wall_s"] for r in imports),
             "report_s": statistics.median(r["wall_s"] for r in reports),
             "ratio": statistics.median(r["wall_s"] / i["wall_s"] for r, i in zip(reports, imports, strict=True)),
+            "ratio_cpu": statistics.median(r["cpu_s"] / i["cpu_s"] for r, i in zip(reports, imports, strict=True)),
             "peak_mib": max(r["peak_mib"] for r in reports),
         },
         "sample": sample,
@@ -113,7 +114,7 @@ def main() -> None:
     one, two, three = result["two_channels"], result["sample"], result["second_report"]
     print(
         f"report of {one['flight']}: {one['report_s']:.1f} s, "
-        f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s"
+        f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s ({one['ratio_cpu']:.2f} x in processor time)"
     )
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
     print(

@@ -299,8 +299,9 @@ def censored_offset(
 def _tobit(full: FloatArray, above: FloatArray, below: FloatArray) -> tuple[float, float]:
     """Mean and standard deviation of a normal sample with values known, above and below given limits."""
     from scipy.optimize import minimize
-    from scipy.stats import norm
+    from scipy.special import log_ndtr
 
+    log_tau = float(np.log(2.0 * np.pi))
     centre, variance = _mean_and_variance(full)
     scale = max(float(np.sqrt(variance)), 1e-3)
     full, above, below = (full - centre) / scale, (above - centre) / scale, (below - centre) / scale
@@ -309,9 +310,9 @@ def _tobit(full: FloatArray, above: FloatArray, below: FloatArray) -> tuple[floa
         delta, theta = parameters  # mean / sigma, 1 / sigma
         z = theta * full - delta
         up, down = delta - theta * above, theta * below - delta
-        log_up, log_down = norm.logcdf(up), norm.logcdf(down)
+        log_up, log_down = log_ndtr(up), log_ndtr(down)
         value = 0.5 * (z @ z) - len(full) * np.log(theta) - log_up.sum() - log_down.sum()
-        mills_up, mills_down = np.exp(norm.logpdf(up) - log_up), np.exp(norm.logpdf(down) - log_down)
+        mills_up, mills_down = (np.exp(-0.5 * (x**2 + log_tau) - log) for x, log in ((up, log_up), (down, log_down)))
         slope = np.array(
             [
                 -z.sum() - mills_up.sum() + mills_down.sum(),

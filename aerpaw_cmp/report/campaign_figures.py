@@ -14,7 +14,9 @@ from .export import k_key, safe_name
 from .figures import (
     BASELINE,
     Plate,
+    beyond,
     colour_bar,
+    count,
     draw_site,
     figure,
     frame_around,
@@ -37,6 +39,21 @@ MAPS_PER_ROW = 3
 
 TALLEST = 40.0
 """No figure is higher than this [inch], however many flights there are."""
+
+
+UNITS = {"deg": "deg", "db": "dB", "dbi": "dBi", "dbm": "dBm", "hz": "Hz", "m": "m", "s": "s"}
+
+
+def with_unit(key: str) -> str:
+    """A settings key with the unit that its ending names.
+
+    Examples
+    --------
+    >>> with_unit("link.rss.uav.yaw_deg"), with_unit("rt.max_depth")
+    ('link.rss.uav.yaw_deg [deg]', 'rt.max_depth')
+    """
+    _, line, ending = key.rpartition("_")
+    return f"{key} [{UNITS[ending]}]" if line and ending in UNITS else key
 
 
 def look(number: int) -> dict[str, Any]:
@@ -74,7 +91,9 @@ def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
         for ax, values in ((top, row.measured_db + row.offset_db), (low, row.residual_db)):
             middle, levels = binned(row.distance_m, values, edges)
             ax.fill_between(middle, levels[:, 0], levels[:, 2], color=style["color"], alpha=0.15, linewidth=0)
-            ax.plot(middle, levels[:, 1], linewidth=1.8, label=f"{row.flight}, measured + offset", **style)
+            ax.plot(
+                middle, levels[:, 1], linewidth=1.8, label=f"{row.flight}, measured + offset ({count(row.n)})", **style
+            )
         middle, levels = binned(
             row.distance_m, np.where(np.isfinite(row.measured_db), row.simulated_dbm, np.nan), edges
         )
@@ -83,8 +102,8 @@ def against_distance(rows: Sequence[RssRow], numbers: dict[str, int]) -> Figure:
             markerfacecolor="white", color=style["color"], label=f"{row.flight}, ray tracing",
         )  # fmt: skip
     low.axhline(0.0, color="black", linewidth=0.8)
-    top.set_ylabel("Received power [dBm]")
-    low.set_ylabel("Measured - simulated [dB]")
+    top.set_ylabel("RSS [dBm]")
+    low.set_ylabel("Measured − simulated [dB]")
     low.set_xlabel("Distance tower to UAV [m]")
     fig.legend(*top.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
@@ -128,8 +147,8 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     columns = min(len(rows), MAPS_PER_ROW)
     lines = -(-len(rows) // columns)
     shape = plan_shape(east, north)
-    width = 8.0 / columns
-    fig = figure((9.2, 0.9 + lines * min(width / shape + 0.5, 6.0)))
+    width = (7.2 - 0.2 * columns) / columns  # what labels and the colour bar leave
+    fig = figure((9.2, 1.0 + lines * min(width / shape + 0.45, 6.0)))
     axes = fig.subplots(lines, columns, squeeze=False, sharex=True, sharey=True)
     mesh: Any = None
     for ax in axes.ravel()[len(rows) :]:
@@ -153,11 +172,11 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
             )  # fmt: skip
             east, north = np.append(east, tower.east_m), np.append(north, tower.north_m)
         plan_axes(ax)
-        ax.set_title(row.flight)
+        ax.set_title(f"{row.flight} ({count(row.n)} samples)")
         ax.label_outer()
     frame_around(axes[0][0], east, north, shape=shape)
     if mesh is not None:
-        colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured - simulated [dB]")
+        colour_bar(fig, mesh, axes.ravel().tolist(), "Mean of measured − simulated [dB]", beyond(values, -reach, reach))
     handles, labels = axes[0][0].get_legend_handles_labels()
     if handles:
         fig.legend(handles, labels, loc="outside lower center")
@@ -260,7 +279,7 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
                 markersize=3.5, **look(number),
             )  # fmt: skip
         ax.axvline(fold.parameters[name], color="#888888", linewidth=2.5, alpha=0.6, label="fitted value")
-        ax.set_xlabel(name, fontsize=8)
+        ax.set_xlabel(with_unit(name), fontsize=8)
         ax.set_ylabel("RMSE [dB]")
     fig.legend(*axes[0][0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig

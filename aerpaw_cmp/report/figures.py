@@ -22,6 +22,7 @@ from .export import k_key, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
     from matplotlib.figure import Figure
 
 # Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
@@ -97,6 +98,8 @@ def style() -> Iterator[None]:
         "svg.fonttype": "path",  # the page must look the same where the font is missing
         "svg.hashsalt": "aerpaw-cmp",  # same numbers, same bytes
         "path.simplify": True,
+        "figure.autolayout": False,  # the layout is set here, and is switched off again when it is done
+        "figure.constrained_layout.use": False,
     }
     with matplotlib.rc_context(settings):
         yield
@@ -111,10 +114,15 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     svg, png = io.BytesIO(), io.BytesIO()
-    fig.savefig(png, format="png", pil_kwargs={"compress_level": 2})
+    fig.set_dpi(RASTER_DPI)
+    FigureCanvasAgg(fig).print_png(png, pil_kwargs={"compress_level": 2})
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
-    fig.savefig(svg, format="svg", metadata={"Date": None})
+    FigureCanvasSVG(fig).print_svg(svg, metadata={"Date": None})
     return svg.getvalue(), png.getvalue()
 
 
@@ -151,9 +159,41 @@ def start_of(data: ReportData) -> np.datetime64:
     return times[0] if data.track is not None and len(data.track.time) else min(times)
 
 
+def has_wall_clock(start: np.datetime64) -> bool:
+    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
+    return bool(start >= np.datetime64("1980-01-01"))
+
+
 def time_label(start: np.datetime64) -> str:
-    """Label of a time axis."""
+    """Label of a time axis.
+
+    Examples
+    --------
+    >>> time_label(np.datetime64("2025-06-01T14:00:00.25")), time_label(np.datetime64("1970-01-01T00:02:29"))
+    ('Time after 2025-06-01 14:00:00 UTC [s]', 'Time after the first sample [s]')
+    """
+    if not has_wall_clock(start):
+        return "Time after the first sample [s]"
     return f"Time after {str(start)[:19].replace('T', ' ')} UTC [s]"
+
+
+def count(n: int) -> str:
+    """A number of samples, thousands set apart.
+
+    Examples
+    --------
+    >>> count(3172) == "3\N{NARROW NO-BREAK SPACE}172", count(40)
+    (True, '40')
+    """
+    return f"{n:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Decades of a logarithmic axis as plain numbers (0.01, 1, 1000): read at a glance, and drawn faster."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _at: f"{value:.10g}".replace("-", "\N{MINUS SIGN}")))
+    axis.set_minor_formatter(NullFormatter())
 
 
 def thinned(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
@@ -362,12 +402,25 @@ def plan_shape(east: FloatArray, north: FloatArray) -> float:
     return float(np.clip((np.ptp(east[good]) + 60.0) / (np.ptp(north[good]) + 60.0), 0.8, 2.0))
 
 
-def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str) -> None:
-    """A colour bar that an SVG holds as one picture: without seams between its bands."""
-    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85)
+def beyond(values: FloatArray, low: float, high: float) -> str:
+    """Ends of a colour scale from ``low`` to ``high`` that values pass: its colours mean "or more" there.
+
+    Examples
+    --------
+    >>> beyond(np.array([1.0, 9.0]), 0.0, 5.0), beyond(np.array([1.0, np.nan]), 0.0, 5.0)
+    ('max', 'neither')
+    """
+    under, over = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
+
+
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> Any:
+    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond."""
+    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)
         bar.solids.set_edgecolor("face")
+    return bar
 
 
 def used_towers(data: ReportData) -> list[str]:
@@ -437,7 +490,7 @@ def altitude(data: ReportData, track: Track) -> Figure:
     ax.set_xlabel(time_label(start))
     ax.set_ylabel("Height above ground [m]")
     ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
-    ax.legend(loc="best")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
 
 
@@ -456,7 +509,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     )
     ax.plot(
         seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label=f"measured {signed(panel.offset_db)} dB", zorder=3.5,
+        label=f"measured {signed(panel.offset_db)} dB ({count(panel.n)} scored)", zorder=3.5,
     )  # fmt: skip
     for number, baseline in enumerate(panel.baselines):
         colour, dashes = baseline_style(baseline.name, number)
@@ -476,7 +529,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
     below.plot(
         seconds, panel.residual_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
-        label="measured - simulated",
+        label="measured − simulated",
     )  # fmt: skip
     below.axhline(0.0, color=SIMULATED, linewidth=0.8)
     if np.isfinite(panel.rmse_db):
@@ -489,7 +542,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     robust_limits(below, [panel.residual_db], around=0.0)
     below.set_ylabel("Residual [dB]")
     below.set_xlabel(time_label(start))
-    handles, labels = only(below, ("measured - simulated", f"RMSE {panel.rmse_db:.1f} dB"))
+    handles, labels = only(below, ("measured − simulated", f"RMSE {panel.rmse_db:.1f} dB"))
     below.legend(
         handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
     )  # fmt: skip
@@ -502,11 +555,11 @@ def signed(value: float) -> str:
     Examples
     --------
     >>> signed(52.13), signed(-4.0)
-    ('+ 52.1', '- 4.0')
+    ('+ 52.1', '− 4.0')
     """
     if not np.isfinite(value):
         return "(no offset) 0"
-    return f"{'-' if value < 0 else '+'} {abs(value):.1f}"
+    return f"{'−' if value < 0 else '+'} {abs(value):.1f}"
 
 
 def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
@@ -539,7 +592,7 @@ def scatter_levels(ax: Axes, panel: RssPanel) -> None:
     """Calibrated measurement against simulation, with the line of equality."""
     ax.plot(
         panel.simulated_dbm, panel.calibrated_db, linestyle="none", marker=".", markersize=2, alpha=0.5,
-        color="#0072B2", rasterized=True, label="sample",
+        color="#0072B2", rasterized=True, label=f"sample ({count(panel.n)})",
     )  # fmt: skip
     both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
     if both.any():
@@ -564,7 +617,7 @@ def residual_histogram(ax: Axes, panel: RssPanel) -> None:
         bins = np.linspace(-reach, reach, 41)
         ax.hist(
             np.clip(residual, -reach, reach), bins.tolist(), density=True, color=MEASURED, edgecolor="white",
-            linewidth=0.3, label="residual",
+            linewidth=0.3, label=f"residual ({count(len(residual))})",
         )  # fmt: skip
         if np.isfinite(panel.rmse_db) and panel.rmse_db > 0:
             at = np.linspace(-reach, reach, 200)
@@ -572,7 +625,7 @@ def residual_histogram(ax: Axes, panel: RssPanel) -> None:
             ax.plot(at, height, color=SIMULATED, linewidth=1.0, linestyle=(0, (4, 2)), label="normal, same RMSE")
         ax.set_ylim(top=1.35 * ax.get_ylim()[1])  # room for the legend above the bars
         ax.legend(loc="upper left", fontsize=7)
-    ax.set_xlabel("Measured - simulated [dB]")
+    ax.set_xlabel("Measured − simulated [dB]")
     ax.set_ylabel("Density [1/dB]")
     ax.set_title("Residual")
 
@@ -588,7 +641,7 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
         edge = " (edge of the search!)" if panel.at_search_edge else ""
         ax.plot(
             panel.offset_db, panel.rmse_db, marker="o", color=TOWER, linestyle="none",
-            label=f"chosen: {panel.offset_db:+.1f} dB{edge}",
+            label=f"chosen: {signed(panel.offset_db).replace(' ', '')} dB{edge}",
         )  # fmt: skip
     for number, baseline in enumerate(panel.baselines):
         colour, dashes = baseline_style(baseline.name, number)
@@ -605,7 +658,7 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
         for a, b in ((low, span[0]), (span[1], high)):
             if a < b:
                 ax.axvspan(a, b, color="#DDDDDD", hatch="///", linewidth=0, label="not searched")
-    ax.set_xlabel(f"Offset added [dB], searched {span[0]:.0f} to {span[1]:.0f}")
+    ax.set_xlabel(f"Offset added [dB]\n(searched {span[0]:.0f} to {span[1]:.0f})".replace("-", "−"))
     ax.set_ylabel("RMSE [dB]")
     ax.set_title("Is the offset well defined?")
     ax.legend(loc="upper center", fontsize=7)
@@ -614,20 +667,30 @@ def offset_curve(ax: Axes, panel: RssPanel) -> None:
 def residual_against_geometry(panel: RssPanel) -> Figure:
     """Residual against distance, angles, height, foliage, split by line of sight where known."""
     names = [name for name in GEOMETRY if name in panel.geometry]
-    columns = 2 if len(names) == 4 else min(3, len(names))
+    columns = -(-len(names) // 2) if len(names) > 3 else len(names)
     rows = -(-len(names) // columns)
-    fig = figure((9.2, 2.6 * rows + 0.3))
-    axes = fig.subplots(rows, columns, squeeze=False, sharey=True)
-    for ax, name in zip(axes.ravel(), names, strict=False):
+    fig = figure((9.2, 2.6 * rows + 0.5))
+    grid = fig.add_gridspec(rows, columns)
+    axes: list[Axes] = []
+    for number, name in enumerate(names):
+        row, column = divmod(number, columns)
+        ax = fig.add_subplot(grid[row, column], sharey=axes[0] if axes else None)
+        axes.append(ax)
         residual_cloud(ax, panel.geometry[name], panel)
+        ax.locator_params(axis="x", nbins=5)
         ax.set_xlabel(GEOMETRY[name].replace(" in the frame of the tower antenna", ",\ntower antenna frame")
-                      .replace(" seen from the tower", ""))  # fmt: skip
-    for ax in axes[:, 0]:
-        ax.set_ylabel("Measured - simulated [dB]")
-    robust_limits(axes[0, 0], [panel.residual_db], around=0.0)
-    for ax in axes.ravel()[len(names) :]:
-        ax.set_visible(False)
-    axes[0, 0].legend(loc="upper right", fontsize=7, markerscale=4)
+                      .replace(" seen from the tower", "").replace(" above ground", "")
+                      .replace("deg clockwise from north", "deg from north"))  # fmt: skip
+        if column:
+            ax.tick_params(labelleft=False)
+        else:
+            ax.set_ylabel("Measured − simulated [dB]")
+    robust_limits(axes[0], [panel.residual_db], around=0.0)
+    legend = fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, markerscale=4)
+    handles: list[Any] = legend.legend_handles
+    for handle in handles:
+        if handle.get_linestyle() not in ("None", ""):  # markers on a line are not enlarged
+            handle.set_markersize(1.6)
     return fig
 
 
@@ -636,29 +699,50 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     residual = panel.residual_db
     sight = panel.line_of_sight
     groups = (
-        [("sample", np.ones(len(residual), dtype=bool), "#56B4E9", ".")]
+        [("sample", np.isfinite(residual), "#56B4E9", ".")]
         if sight is None
-        else [("line of sight", sight, "#56B4E9", "."), ("no line of sight", ~sight, "#D55E00", "x")]
+        else [
+            ("line of sight", sight & np.isfinite(residual), "#56B4E9", "."),
+            ("no line of sight", ~sight & np.isfinite(residual), "#D55E00", "x"),
+        ]
     )
     for label, chosen, colour, marker in groups:
         if chosen.any():
             ax.plot(
                 quantity[chosen], residual[chosen], linestyle="none", marker=marker, markersize=2, alpha=0.5,
-                color=colour, rasterized=True, label=label,
+                color=colour, rasterized=True, label=f"{label} ({count(int(chosen.sum()))})",
             )  # fmt: skip
     ax.axhline(0.0, color=SIMULATED, linewidth=0.8)
     good = np.isfinite(quantity) & np.isfinite(residual)
     if good.sum() < 40 or np.ptp(quantity[good]) == 0:
         return
-    edges = np.unique(np.quantile(quantity[good], np.linspace(0, 1, 16)))
-    which = np.clip(np.searchsorted(edges, quantity[good], side="right") - 1, 0, len(edges) - 2)
-    middle = (edges[1:] + edges[:-1]) / 2
-    parts = [residual[good][which == i] for i in range(len(middle))]
-    full = np.array([len(part) > 0 for part in parts])
-    low, median, high = np.array([np.percentile(part, [10, 50, 90]) for part in parts if len(part)]).T
-    ax.plot(middle[full], median, color=SIMULATED, linewidth=1.3, label="median")
-    ax.plot(middle[full], low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
-    ax.plot(middle[full], high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
+    bins = int(np.clip(good.sum() // 40, 8, 20))
+    middle, low, median, high = running_levels(quantity[good], residual[good], bins).T
+    ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
+    ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
+    ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
+
+
+def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, fewest: int = 8) -> FloatArray:
+    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width (bins, 4).
+
+    NaN where a bin has fewer than ``fewest`` samples: no line is drawn over what was not flown.
+
+    Examples
+    --------
+    >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])
+    >>> levels = running_levels(at, at)
+    >>> np.flatnonzero(np.isfinite(levels[:, 2])).tolist(), levels[0].round(3).tolist()
+    ([0, 1, 18, 19], [9.5, 1.9, 9.5, 17.1])
+    """
+    edges = np.linspace(quantity.min(), quantity.max(), bins + 1)
+    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
+    levels = np.full((bins, 4), np.nan)
+    for number in range(bins):
+        inside = which == number
+        if inside.sum() >= fewest:
+            levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
+    return levels
 
 
 def seen_from_tower(panel: RssPanel) -> Figure:
@@ -669,19 +753,23 @@ def seen_from_tower(panel: RssPanel) -> Figure:
     fig = figure((9.2, 3.6))
     ax = fig.subplots()
     reach = float(np.percentile(np.abs(residual[good]), 98)) if good.any() else 1.0
-    ax.plot(
-        azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
-        rasterized=True, label="not scored",
-    )  # fmt: skip
+    if (~good).any():
+        ax.plot(
+            azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+            rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
+        )  # fmt: skip
     points = ax.scatter(
         azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
-        rasterized=True, label="sample (colour: residual)",
+        rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
     )  # fmt: skip
-    ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
+    span = max(float(np.ptp(azimuth[good])), 1.0) if good.any() else 360.0
+    nearest = float(np.min(np.abs(azimuth[good]), initial=180.0))
+    if nearest < 0.3 * span:  # farther away it would squeeze the flight into a corner
+        ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
     ax.set_facecolor("#F4F4F4")
-    ax.set_xlabel("Azimuth in the frame of the tower antenna [deg]")
+    ax.set_xlabel("Azimuth in the frame of the tower antenna (0: boresight) [deg]")
     ax.set_ylabel("Elevation [deg]")
-    colour_bar(fig, points, ax, "Measured - simulated [dB]")
+    colour_bar(fig, points, ax, "Measured − simulated [dB]", beyond(residual[good], -reach, reach))
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
     return fig
 
@@ -694,7 +782,7 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
     ax = fig.subplots()
     ax.plot(
         seconds, pair.difference_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label="measured", zorder=3,
+        label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
     )  # fmt: skip
     levels = [pair.difference_db]
     if pair.simulated_difference_db is not None:
@@ -707,8 +795,10 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
         )  # fmt: skip
     draw_waypoints(ax, data, start)
     robust_limits(ax, levels, around=0.0)
+    reach = max(ax.get_ylim()[1], 1.1 * pair.limit_db)  # the limit is drawn, so it is seen
+    ax.set_ylim(-reach, reach)
     ax.set_xlabel(time_label(start))
-    ax.set_ylabel(f"{pair.first} - {pair.second} [dB]")
+    ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
     return fig
 
@@ -719,18 +809,18 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
 def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
     """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out."""
     draw_site(ax, site)
-    counts = {value: int((rank == value).sum()) for value in (0, *RANKS)}
-    for value, count in counts.items():
+    for value in (0, *RANKS):
         at = rank == value
-        if not count:
+        number = int(at.sum())
+        if not number:
             continue
         look: dict[str, Any] = {"color": "black", "linewidths": 0.8}
         if value:
             look = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
         ax.scatter(
             east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
-            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count})",
-            zorder=3.0 + 1.0 / count,  # the rarer a rank, the higher it lies: a few points must not vanish under many
+            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",
+            zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
         )  # fmt: skip
     ax.set_title(title)
     pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t.startswith(("rank", "Z"))]
@@ -763,7 +853,8 @@ def rank_histograms(panel: RankPanel) -> Figure:
     """Shares of rank 1 to 4, measured beside every K, with intervals where known."""
     fig = figure((9.2, 3.4))
     ax = fig.subplots()
-    series: list[tuple[str, Histogram]] = [("measured", panel.histogram)]
+    reported = int(np.isfinite(panel.measured).sum())
+    series: list[tuple[str, Histogram]] = [(f"measured ({count(reported)} samples)", panel.histogram)]
     series += [(at_label(at), at.histogram) for at in panel.simulated]
     width = 0.8 / len(series)
     from matplotlib import colormaps
@@ -868,6 +959,8 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, pane
             fontsize=7,
             va="bottom",
             color=TOWER,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+            zorder=6,
         )
     lowest = [-20 * np.log10(at.k) for at in panel.simulated] + values[np.isfinite(values)].tolist()
     ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # below -110 dB lies nothing but rounding
@@ -897,8 +990,9 @@ def confusion(panel: RankPanel) -> Figure:
         ax.set_xticks(range(5), ["Z", "1", "2", "3", "4"])
         ax.set_yticks(range(4), [f"{r}" for r in RANKS])
         ax.set_xlabel("Simulated rank")
-        agreement = "" if not np.isfinite(at.agreement) else f": {100 * at.agreement:.0f} % agree"
-        ax.set_title(f"K = {k_key(at.k)}{agreement}")
+        samples = count(int(table.sum()))
+        equal = f": equal in {100 * at.agreement:.0f} % of {samples}" if np.isfinite(at.agreement) else ""
+        ax.set_title(f"K = {k_key(at.k)}{equal}")
         ax.grid(visible=False)
     axes[0].set_ylabel("Measured rank")
     if image is not None:
@@ -909,7 +1003,7 @@ def confusion(panel: RankPanel) -> Figure:
 def agreement_curve(panel: RankPanel) -> Figure:
     """Agreement and total variation against continuous K."""
     curve = panel.curve
-    fig = figure((9.2, 3.0))
+    fig = figure((9.2, 3.4))
     ax = fig.subplots()
     if curve is not None:
         ax.semilogx(
@@ -926,50 +1020,94 @@ def agreement_curve(panel: RankPanel) -> Figure:
     for number, at in enumerate(panel.simulated):
         ax.axvline(at.k, color=WAYPOINT, linestyle=":", linewidth=0.9, label="K of the report" if number == 0 else None)
     ax.set_ylim(0.0, 1.02)
+    plain_ticks(ax.xaxis)
     ax.set_xlabel("K (ratio of singular values)")
-    ax.set_ylabel("Share of samples")
-    ax.legend(loc="best")
+    ax.set_ylabel("Agreement, total variation")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
     return fig
 
 
 # --- speed against error ------------------------------------------------------------------------
 
 
+def rank_changes(speed: Sequence[SpeedRow]) -> bool:
+    """Whether any setting gives any link another rank; with one antenna at each end none can."""
+    return any(share > 0 for row in speed for share in row.rank_disagreement.values())
+
+
 def pareto(speed: Sequence[SpeedRow]) -> Figure:
     """Seconds against the largest RSS error and against rank disagreement, with the front of the best."""
-    ks = sorted({k for row in speed for k in row.rank_disagreement})
-    fig = figure((9.2, 4.4))
+    ks = sorted({k for row in speed for k in row.rank_disagreement}) if rank_changes(speed) else []
+    fig = figure((9.2, 4.6))
     axes = fig.subplots(1, 2 if ks else 1, squeeze=False)[0]
     pareto_axes(axes[0], speed, [row.rss_max_error_db for row in speed], "Largest RSS error [dB]")
     axes[0].set_yscale("symlog", linthresh=0.01)  # an error of exactly zero has its place
+    plain_ticks(axes[0].yaxis)
     errors = [row.rss_max_error_db for row in speed if np.isfinite(row.rss_max_error_db)]
-    axes[0].set_ylim(-0.001, 3.0 * max([0.01, *errors]))
+    axes[0].set_ylim(-0.0015, 3.0 * max([0.01, *errors]))
     if ks:
         values = [100 * row.rank_disagreement.get(ks[-1], float("nan")) for row in speed]
         pareto_axes(axes[1], speed, values, f"Links with another rank at K = {k_key(ks[-1])} [%]")
-        axes[1].set_ylim(bottom=-2.0)
+        top = 1.1 * max([1.0, *(value for value in values if np.isfinite(value))])
+        axes[1].set_ylim(-0.05 * top, top)
     handles, labels = axes[0].get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=3)
+    keys = pareto_keys(speed)
+    fig.legend([*handles, *keys], [*labels, *(key.get_label() for key in keys)], loc="outside lower center", ncols=3)
     return fig
 
 
+def pareto_keys(speed: Sequence[SpeedRow]) -> list[Any]:
+    """Legend entries for what the size of a marker says, and for the ring around the reference."""
+    from matplotlib.lines import Line2D
+
+    sizes = {row.samples: row.samples_label for row in speed if row.samples is not None}
+    keys = [
+        Line2D([], [], marker="o", linestyle="none", markersize=marker_size(n), markerfacecolor="none",
+               markeredgecolor="black", label=f"{sizes[n]} samples per source")
+        for n in sorted(sizes)
+    ]  # fmt: skip
+    if any(row.reference for row in speed):
+        keys.append(Line2D([], [], label="reference", **REFERENCE_RING))
+    return keys
+
+
+REFERENCE_RING: dict[str, Any] = {
+    "marker": "o", "markersize": 14, "markerfacecolor": "none", "markeredgecolor": "black", "markeredgewidth": 1.0,
+    "linestyle": "none",
+}  # fmt: skip
+
+
+def marker_size(samples: int | None) -> float:
+    """Size of a marker [point], growing with the logarithm of the samples.
+
+    Examples
+    --------
+    >>> marker_size(None), marker_size(1000), marker_size(1_000_000)
+    (8.0, 5.0, 11.0)
+    """
+    return 8.0 if samples is None else float(np.clip(5.0 + 2.0 * (np.log10(max(samples, 1)) - 3.0), 3.0, 13.0))
+
+
 def pareto_axes(ax: Axes, rows: Sequence[SpeedRow], error: Sequence[float], label: str) -> None:
-    """One plane of seconds against error: a line per setting, its points named by the number of samples."""
+    """One plane of seconds against error: a line per setting, markers that grow with the number of samples."""
     markers, colours = "osD^v<>P", ("#111111", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#0072B2")
     families: dict[str, list[int]] = {}
     for index, row in enumerate(rows):
         families.setdefault(row.family, []).append(index)
     for number, (family, members) in enumerate(families.items()):
+        look: dict[str, Any] = {"color": colours[number % len(colours)], "marker": markers[number % len(markers)]}
+        members = sorted(members, key=lambda i: rows[i].samples or 0)
         ax.plot(
-            [rows[i].seconds for i in members], [error[i] for i in members], marker=markers[number % len(markers)],
-            color=colours[number % len(colours)], markeredgecolor="black", markersize=7, linewidth=0.8, label=family,
-            zorder=3,
+            [rows[i].seconds for i in members], [error[i] for i in members], linewidth=0.8, markersize=7,
+            markeredgecolor="black", markevery=[], label=family, zorder=3, **look,
         )  # fmt: skip
-        for i in members:
-            name = "reference" if rows[i].reference else rows[i].samples_label
-            ax.annotate(
-                name, (rows[i].seconds, error[i]), xytext=(5, 5), textcoords="offset points", fontsize=7, zorder=4
+        for i in members:  # a large marker below a small one, so that both are seen where they fall together
+            ax.plot(
+                rows[i].seconds, error[i], markersize=marker_size(rows[i].samples), markeredgecolor="black",
+                markeredgewidth=0.7, alpha=0.85, zorder=4.0 - 0.05 * marker_size(rows[i].samples), **look,
             )  # fmt: skip
+            if rows[i].reference:
+                ax.plot(rows[i].seconds, error[i], zorder=4.5, **REFERENCE_RING)
     front = pareto_front([row.seconds for row in rows], error)
     if len(front) > 1:
         ax.plot(
@@ -977,7 +1115,9 @@ def pareto_axes(ax: Axes, rows: Sequence[SpeedRow], error: Sequence[float], labe
             linewidth=1.6, label="not beaten in both", zorder=2,
         )  # fmt: skip
     ax.set_xscale("log")
-    ax.set_xlabel("Seconds for the same links")
+    plain_ticks(ax.xaxis)
+    ax.margins(x=0.08)
+    ax.set_xlabel("Time for the same links [s]")
     ax.set_ylabel(label)
 
 
@@ -1020,7 +1160,8 @@ def plates(data: ReportData) -> list[Plate]:
                 section="speed",
                 title="Speed against error",
                 caption="Down and left is better. The dashed line joins the settings that no other setting beats in "
-                "both seconds and error. Numbers at the points are samples per source.",
+                "both seconds and error. Markers grow with the samples per source; an error of 0 has its place at the "
+                "foot of the scale." + ("" if rank_changes(data.speed) else " No setting changes the rank of a link."),
                 alt="Scatter plot of seconds against error for each engine setting.",
                 draw=lambda: pareto(data.speed),
             )
@@ -1039,9 +1180,12 @@ def _with_own_names(found: list[Plate]) -> list[Plate]:
 
 
 def _track_plates(data: ReportData, track: Track) -> list[Plate]:
-    invented = " Buildings and forests are illustrative: they were invented to show the method." if (
-        data.site.illustrative
-    ) else ""  # fmt: skip
+    there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
+    invented = (
+        f" {' and '.join(there).capitalize()} are illustrative: they were invented to show the method."
+        if data.site.illustrative and there
+        else ""
+    )
     return [
         Plate(
             name="trajectory",
@@ -1055,7 +1199,8 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
             name="altitude",
             section="flight",
             title="Height over time",
-            caption="Height of the UAV above the ground at the site origin. Dotted lines are waypoints.",
+            caption="Height of the UAV above the ground at the site origin."
+            + (" Dotted lines are waypoints." if data.waypoints else ""),
             alt=f"Line plot of height over time; highest point {np.nanmax(track.up_m, initial=-np.inf):.0f} m.",
             draw=lambda: altitude(data, track),
         ),
@@ -1071,8 +1216,13 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
             section=section,
             title=f"{panel.name}: RSS over time",
             caption="Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to "
-            "its own best fit. Hatched spans marked Z have no path in the simulation and are not scored. Bottom: "
-            "residual; dashed lines are plus and minus one RMSE.",
+            "its own best fit. "
+            + (
+                "Hatched spans marked Z have no path in the simulation and are not scored. "
+                if panel.simulated_out_of_coverage.any()
+                else ""
+            )
+            + "Bottom: residual; dashed lines are plus and minus one RMSE.",
             alt=f"RSS of {panel.name} over time, measured against simulated; RMSE {panel.rmse_db:.1f} dB over "
             f"{panel.n} samples.",
             draw=lambda: rss_over_time(data, panel),
@@ -1162,7 +1312,8 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[Plate]:
             plate(
                 "rank_confusion",
                 "which ranks are mistaken for which",
-                "Counts; colour is the share of each measured rank (rows). Z: no path in the simulation.",
+                "Counts; colour is the share of each measured rank (rows). Frames: equal ranks. "
+                "Z: no path in the simulation.",
                 f"Confusion matrices of {panel.tower} for every K.",
                 lambda: confusion(panel),
             )
@@ -1172,7 +1323,8 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[Plate]:
             plate(
                 "rank_k",
                 "which K explains the modem",
-                "Agreement by pose and distance between the histograms as the threshold K varies.",
+                "Agreement by pose and distance between the histograms as the threshold K varies. "
+                "The best K is the one of the highest agreement.",
                 f"Agreement and total variation against K for {panel.tower}.",
                 lambda: agreement_curve(panel),
             )

@@ -12,10 +12,12 @@ from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
 from typing import Any
 
+import numpy as np
+
 from . import words
 from .data import RANKS, ReportData
 from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
-from .figures import Picture
+from .figures import Picture, has_wall_clock, start_of
 
 REJECTED_SHOWN = 20
 """Rejected lines shown per file; the flight file holds all."""
@@ -29,12 +31,13 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 
     Examples
     --------
-    >>> number(-3.14159, 2), number(float("nan"))
-    ('−3.14', '–')
+    >>> number(-3.14159, 2), number(float("nan")), number(-0.004, 2)
+    ('−3.14', '–', '0.00')
     """
     if value is None or not math.isfinite(value):
         return "–"
-    text = f"{value:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
+    rounded = round(value, decimals) + 0.0  # what rounds to zero has no sign
+    text = f"{rounded:,.{decimals}f}".replace(",", "\u202f").replace("-", "\u2212")
     return f"{text}\u202f{unit}" if unit else text
 
 
@@ -50,6 +53,20 @@ def percent(share: float | None, decimals: int = 0) -> str:
     return number(None if share is None else 100 * share, decimals, "%")
 
 
+def duration(seconds: float | None) -> str:
+    """Seconds with three digits that count, in ms below one second.
+
+    Examples
+    --------
+    >>> duration(0.000412), duration(0.1731), duration(5.1913), duration(None)
+    ('0.412\u202fms', '173\u202fms', '5.19\u202fs', '–')
+    """
+    if seconds is None or not math.isfinite(seconds):
+        return "–"
+    value, unit = (1000.0 * seconds, "ms") if seconds < 1.0 else (seconds, "s")
+    return number(value, 0 if value >= 100 else 1 if value >= 10 else 2 if value >= 1 else 3, unit)
+
+
 def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, str]]:
     """Nested settings as dotted names and plain text."""
     for key, value in settings.items():
@@ -58,6 +75,21 @@ def flat(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, st
             yield from flat(value, name)
         else:
             yield name, ", ".join(map(short, value)) if isinstance(value, (list, tuple)) else short(value)
+
+
+def clock(instant: Any, start: Any) -> str:
+    """Time of day (UTC), or seconds after ``start`` where the log has relative times only.
+
+    Examples
+    --------
+    >>> clock(np.datetime64("2025-06-01T14:00:03.2"), np.datetime64("2025-06-01T14:00:00"))
+    '14:00:03'
+    >>> clock(np.datetime64("1970-01-01T00:00:03.2"), np.datetime64("1970-01-01"))
+    '3.2'
+    """
+    if has_wall_clock(start):
+        return str(iso_time([instant])[0])[11:19]
+    return number(float((instant - start) / np.timedelta64(1, "s")))
 
 
 def short(value: Any) -> str:
@@ -86,8 +118,8 @@ def environment() -> Any:
         lstrip_blocks=True,
     )
     environment.filters.update(
-        num=number, interval=interval, percent=percent, data_uri=data_uri, k=k_key, flat=lambda s: list(flat(s)),
-        clock=lambda t: str(iso_time([t])[0])[11:19],
+        num=number, interval=interval, percent=percent, duration=duration, data_uri=data_uri, k=k_key,
+        flat=lambda s: list(flat(s)), clock=clock,
     )  # fmt: skip
     return environment
 
@@ -110,7 +142,10 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     text: str = template.render(
         data=data,
         sections=sections,
+        start=start_of(data),
+        clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
         files=files,
+        notes=list(dict.fromkeys([*data.site.notes, *data.notes])),  # a flight repeats what its site says
         ranks=RANKS,
         headline=words.headline(data),
         verdicts=words.verdicts(data),

@@ -11,7 +11,7 @@ from ..site.site import Site
 from ..units import FloatArray
 from .data import RANKS
 from .export import k_key, safe_name
-from .figures import RANK_HATCH, TOWER, Plate, colour_bar, figure, rank_colour, spread_out
+from .figures import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def map_axes(data: MapsData, count: int) -> tuple[Figure, list[Axes]]:
     columns = min(count, COLUMNS)
     rows = -(-count // columns)
     columns = -(-count // rows)
-    width = min(7.4 / columns, 3.2)  # what a colour bar and the labels leave
+    width = min((7.4 - 0.15 * columns) / columns, 3.2)  # what a colour bar and the labels leave
     height = float(np.clip(width * (north - south) / (east - west), 0.8, 6.5))
     fig = figure((9.2, rows * (height + 0.35) + 1.0))
     grid = fig.subplots(rows, columns, squeeze=False, sharex=True, sharey=True)
@@ -135,7 +135,8 @@ def rss_maps(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float]
         alone = None if one.tower == JOINT else one.tower
         image = draw_map(ax, data, one.rss_dbm, highlight=alone, cmap="viridis", vmin=limits[0], vmax=limits[1])
         ax.set_title(f"{one.tower}: {100 * one.coverage:.0f} %", fontsize=9)
-    colour_bar(fig, image, axes, "RSS [dBm]")
+    levels = np.concatenate([one.rss_dbm.ravel() for one in maps])
+    colour_bar(fig, image, axes, "RSS [dBm]", beyond(levels, *limits))
     entries = overlay_legend(data, borders=any(one.tower == JOINT for one in maps))
     fig.legend(handles=entries, loc="outside lower center", ncols=3)
     return fig
@@ -172,7 +173,11 @@ def layer_maps(data: MapsData, layers: Sequence[Any]) -> Figure:
     for ax, one in zip(axes, layers, strict=True):
         image = draw_map(ax, data, one.values, **options)
         ax.set_title(f"{one.altitude_m:g} m", fontsize=9)
-    colour_bar(fig, image, axes, layers[0].label)
+    bar = colour_bar(fig, image, axes, layers[0].label, beyond(finite, options["vmin"], options["vmax"]))
+    if np.array_equal(finite, np.round(finite)):  # ranks: no colour stands for half of one
+        from matplotlib.ticker import MaxNLocator
+
+        bar.locator = MaxNLocator(integer=True)
     fig.legend(handles=overlay_legend(data, borders=True), loc="outside lower center", ncols=3)
     return fig
 
@@ -220,7 +225,7 @@ def rank_shares(maps: Sequence[RankMap]) -> Figure:
                 label="Z: out of coverage" if value == 0 else f"rank {value}",
             )  # fmt: skip
             below = below + share[:, column]
-        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members])
+        ax.set_xticks(at, [f"{one.altitude_m:g}" for one in members], fontsize=7)
         ax.set_title(f"K = {k_key(k)}")
         ax.set_xlabel("Height [m]")
         ax.grid(visible=False)
@@ -284,9 +289,10 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
             marker=MARKERS[number % 8], markersize=5, label=curve.method,
         )  # fmt: skip
     ax.set_ylim(bottom=0)
+    plain_ticks(ax.xaxis)
     ax.set_xlabel("Number of samples")
     ax.set_ylabel("Mean absolute error of the rank")
-    ax.legend(loc="best")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
     return fig
 
 
@@ -374,7 +380,7 @@ def _layer_plates(data: MapsData) -> list[Plate]:
             name=f"layer_{safe_name(name)}",
             section="layers",
             title=name,
-            caption=f"{layers[0].label}. Hatched: no path.",
+            caption=f"{layers[0].label[0].upper()}{layers[0].label[1:]}. Hatched: no path.",
             alt=f"Maps of {name}.",
             draw=lambda layers=layers: layer_maps(data, layers),  # type: ignore[misc]
         )

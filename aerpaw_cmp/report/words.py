@@ -16,6 +16,28 @@ def pretty(name: str) -> str:
     return _TITLES.get(name, name.replace("_", " "))
 
 
+def count(n: int) -> str:
+    """A whole number, thousands set apart as in the tables.
+
+    Examples
+    --------
+    >>> count(6608) == "6\N{NARROW NO-BREAK SPACE}608"
+    True
+    """
+    return f"{n:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def signed(value: float) -> str:
+    """A number with its sign, as in the tables.
+
+    Examples
+    --------
+    >>> signed(12.91), signed(-10.4)
+    ('+12.9', '−10.4')
+    """
+    return f"{value:+.1f}".replace("-", "−")
+
+
 def _within(value: Interval | None, decimals: int = 1) -> str:
     if value is None or not all(map(math.isfinite, value)):
         return ""
@@ -29,10 +51,10 @@ def headline(data: ReportData) -> str:
         towers = list(dict.fromkeys(panel.tower for panel in data.rss))
         samples = sum(len(panel.time) for panel in data.rss)
         panels = "1 channel" if len(data.rss) == 1 else f"{len(data.rss)} tower channels"
-        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {samples:,} samples)")
+        parts.append(f"received signal strength at {_listed(towers)} ({panels}, {count(samples)} samples)")
     if data.rank:
         samples = sum(len(panel.time) for panel in data.rank)
-        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({samples:,} samples)")
+        parts.append(f"channel rank at {_listed([panel.tower for panel in data.rank])} ({count(samples)} samples)")
     if not parts:
         return "This flight holds no radio measurement that could be compared; only its track and inputs are shown."
     engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
@@ -52,10 +74,10 @@ def verdicts(data: ReportData) -> list[str]:
 def rss_verdict(panel: RssPanel) -> str:
     """How well one channel is predicted, and whether the baselines do better."""
     if panel.n == 0 or not math.isfinite(panel.rmse_db):
-        return f"{panel.name}: nothing to score; all {len(panel.time):,} samples are out of coverage on one side."
+        return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
     text = (
         f"{panel.name}: ray tracing misses the measurement by {panel.rmse_db:.1f} dB RMSE{_within(panel.rmse_ci95_db)} "
-        f"after an offset of {panel.offset_db:+.1f} dB"
+        f"after an offset of {signed(panel.offset_db)} dB"
     )
     scored = [b for b in panel.baselines if math.isfinite(b.rmse_db)]
     if not scored:
@@ -103,13 +125,13 @@ def warnings(data: ReportData) -> list[str]:
         found.append("The replay engine was not audited against the other engine in this report.")
     if audit is not None and (audit.missing_paths or audit.extra_paths):
         found.append(
-            f"The audit found {audit.missing_paths:,} paths that only the {audit.reference} engine has and "
-            f"{audit.extra_paths:,} that only the {data.engine.engine if data.engine else ''} engine has, "
-            f"on {audit.links:,} links."
+            f"The audit found {count(audit.missing_paths)} paths that only the {audit.reference} engine has and "
+            f"{count(audit.extra_paths)} that only the {data.engine.engine if data.engine else ''} engine has, "
+            f"on {count(audit.links)} links."
         )
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
-        found.append(f"{rejected:,} log lines were rejected; see the account of the inputs.")
+        found.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
     return found
 
 
@@ -130,6 +152,6 @@ def _rss_warnings(panel: RssPanel) -> list[str]:
     elif panel.lag_verdict == "ok" and abs(panel.lag_s) > 0.5:
         applied = (panel.extra.get("clock") or {}).get("applied", "estimated")
         found.append(
-            f"{panel.name}: the radio clock shows {panel.lag_s:+.1f} s more than the telemetry clock ({applied})."
+            f"{panel.name}: the radio clock shows {signed(panel.lag_s)} s more than the telemetry clock ({applied})."
         )
     return found

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import dataclasses
+import io
 import re
 from itertools import pairwise
 
@@ -9,8 +10,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
+from PIL import Image
 
-from aerpaw_cmp.report import figures
+from aerpaw_cmp.report import figures, html
 from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, Track
 
 
@@ -236,3 +238,89 @@ def test_residual_sign_is_measured_minus_simulated(report_data):
 def test_grey_steps_of_the_ranks_are_apart():
     grey = [np.dot(figures.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
     assert min(np.diff(grey)) > 0.12
+
+
+def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
+    """``Figure.savefig`` draws once more before each file; leaving that out must not move anything."""
+    plate = next(p for p in figures.plates(small_report) if p.name == "trajectory")
+    with figures.style():
+        ours = figures.save(plate.draw())[1]
+        theirs = io.BytesIO()
+        plate.draw().savefig(theirs, format="png")
+    one, two = (np.asarray(Image.open(io.BytesIO(png))) for png in (ours, theirs.getvalue()))
+    np.testing.assert_array_equal(one, two)
+
+
+def relative(data: ReportData) -> ReportData:
+    """The same flight from logs whose times are relative: they count from 1970."""
+    back = data.track.time[0] - np.datetime64("1969-12-31T23:57:31", "ns")
+    rss = tuple(
+        dataclasses.replace(
+            p, time=p.time - back,
+            worst=tuple(dataclasses.replace(w, start=w.start - back, end=w.end - back) for w in p.worst),
+        )
+        for p in data.rss
+    )  # fmt: skip
+    pairs = tuple(dataclasses.replace(p, time=p.time - back, apart=()) for p in data.pairs)
+    return dataclasses.replace(
+        data, track=dataclasses.replace(data.track, time=data.track.time - back), waypoints=(), rss=rss, pairs=pairs,
+        rank=tuple(dataclasses.replace(p, time=p.time - back) for p in data.rank),
+    )  # fmt: skip
+
+
+def test_relative_times_count_from_the_first_sample(small_report):
+    data = relative(small_report)
+    labels = [ax.get_xlabel() for _, fig in drawn(data) for ax in data_axes(fig) if "Time after" in ax.get_xlabel()]
+    assert labels
+    assert set(labels) == {"Time after the first sample [s]"}
+    assert any(panel.worst for panel in data.rss)
+    page = html.page(data, [], [])
+    assert "From (s)" in page
+    assert "23:57" not in page
+
+
+def test_samples_are_told_by_size_and_no_labels_collide(report_data):
+    with figures.style():
+        fig = figures.pareto(report_data.speed)
+    left, right = fig.axes
+    assert not left.texts
+    assert not right.texts
+    sizes = {n: figures.marker_size(n) for n in (1_000, 10_000, 100_000, 1_000_000)}
+    assert (np.diff(list(sizes.values())) >= 1.5).all()
+    drawn_sizes = {line.get_markersize() for line in left.lines if len(line.get_xdata()) == 1}
+    assert set(sizes.values()) <= drawn_sizes
+    told = {text.get_text() for text in fig.legends[0].get_texts()}
+    assert {"1e3 samples per source", "1e6 samples per source", "reference"} <= told
+
+
+def test_no_empty_rank_plane_where_no_setting_changes_a_rank(report_data):
+    same = tuple(
+        dataclasses.replace(r, rank_disagreement=dict.fromkeys(r.rank_disagreement, 0.0)) for r in report_data.speed
+    )
+    with figures.style():
+        fig = figures.pareto(same)
+    assert len(fig.axes) == 1
+    plate = next(p for p in figures.plates(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
+    assert plate.caption.endswith("No setting changes the rank of a link.")
+
+
+def test_captions_speak_of_what_is_drawn(report_data):
+    bare = dataclasses.replace(
+        report_data, waypoints=(), site=dataclasses.replace(report_data.site, buildings=(), illustrative=True)
+    )
+    captions = {p.name: p.caption for p in figures.plates(bare)}
+    assert "waypoints" not in captions["altitude"]
+    assert "uildings" not in captions["trajectory"]
+    for panel in bare.rss:
+        name = f"rss_{panel.tower}_{panel.channel}"
+        assert ("marked Z" in captions[name]) == bool(panel.simulated_out_of_coverage.any())
+
+
+def test_a_log_axis_says_plain_numbers(small_report):
+    plate = next(p for p in figures.plates(small_report) if p.name.startswith("rank_k_"))
+    with figures.style():
+        fig = plate.draw()
+        fig.draw_without_rendering()
+    shown = [t.get_text() for t in fig.axes[0].get_xticklabels() if t.get_text()]
+    assert "100" in shown
+    assert not any("$" in text for text in shown)

@@ -246,3 +246,17 @@ class TestWords:
         panel = report_data.rank[0]
         best = min(panel.simulated, key=lambda at: at.total_variation)
         assert f"K = {best.k:g} comes nearest" in words.rank_verdict(panel)
+
+
+def test_a_note_of_site_and_flight_is_said_once(report_data):
+    note = "this flight is replayed without the buildings of the site"
+    site = dataclasses.replace(report_data.site, notes=(note,))
+    text = html.page(dataclasses.replace(report_data, site=site, notes=(note, "of the flight alone")), [], [])
+    assert text.count(note) == 1
+    assert text.count("of the flight alone") == 1
+
+
+def test_thousands_and_signs_are_written_alike_everywhere(report_data):
+    text = render(report_data).text
+    assert not re.search(r"\d,\d{3}\b", text)
+    assert not re.search(r"offset of -\d", text)

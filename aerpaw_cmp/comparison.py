@@ -28,7 +28,7 @@ from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
 from .replaying import Clock, Replayed, direct_foliage_m, path_loss
 from .report import data as report
-from .units import BoolArray, FloatArray, IntArray
+from .units import BoolArray, FloatArray, IntArray, wavelength_m
 
 Progress = Callable[[str], None]
 
@@ -205,6 +205,10 @@ def _variants(settings: RssSettings, levels: _Levels, alternatives: Mapping[str,
 FOOTING_WINDOWS_S = (0.0, 1.0, 4.0)
 """Both sides are averaged over these windows to see how much of the error is fading."""
 
+FOOTING_WAVELENGTHS = 40
+FOOTING_LENGTH_M = 20.0
+"""And over stretches of path, each of which counts once, however long the UAV hovered there."""
+
 PASSES_WITHIN_M = 3.0
 """Two passes of one place, first and second half of a flight, come this near."""
 
@@ -227,6 +231,9 @@ def _further_numbers(
         name: {f"{window:g} s": {"offset_db": f.offset_db, "rmse_db": f.rmse_db} for window, f in fits.items()}
         for name, fits in footing.items()
     }
+    places = _places(data, series, levels, simulations)
+    for name, fits in places.items():
+        found["same_footing"][name] |= fits
     measured, simulated = levels.measured_db[levels.posed], levels.simulated_db[levels.posed]
     if len(measured) and not (np.isfinite(measured) & np.isfinite(simulated)).all():
         found["censored"] = _censored(settings, measured, simulated)
@@ -235,6 +242,27 @@ def _further_numbers(
         found["expected_offset"] = {**expected, "fitted_minus_expected_db": offset_db - expected["expected_db"]}
     found["repeatability"] = _repeatability(series.time, levels)
     return found
+
+
+def _places(
+    data: FlightData, series: RssSeries, levels: _Levels, simulations: Mapping[str, FloatArray]
+) -> dict[str, dict[str, Any]]:
+    """Offset and RMSE of local means over stretches of path, per simulation."""
+    settings = data.settings.rss
+    lengths = {
+        FOOTING_WAVELENGTHS * wavelength_m(series.link.carrier_hz): f"{FOOTING_WAVELENGTHS} wavelengths of path",
+        FOOTING_LENGTH_M: f"{FOOTING_LENGTH_M:g} m of path",
+    }
+    found = rss.same_place(
+        levels.position_m, levels.measured_db, simulations, lengths_m=tuple(lengths), step_db=settings.step_db,
+        span_db=settings.span_db,
+    )  # fmt: skip
+    return {
+        name: {
+            lengths[length]: {"offset_db": f.offset_db, "rmse_db": f.rmse_db, "n": f.n} for length, f in fits.items()
+        }
+        for name, fits in found.items()
+    }
 
 
 def _censored(settings: RssSettings, measured: FloatArray, simulated: FloatArray) -> dict[str, Any]:

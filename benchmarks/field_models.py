@@ -5,10 +5,12 @@ offset per flight and channel and nothing else fitted, but for the azimuths of t
 per channel at the tower) in the rows that say so: those are fitted on one flight and scored on the other. The last rows
 also learn, on the other flight, how much gain mast and airframe add per azimuth (compare/installed.py). Both flights
 follow one route, so such a correction may learn the place together with the antenna.
-Each model is scored four times: samples as they are and both sides averaged in power over four seconds (20 m, which
-leaves the local mean that a ray model predicts), each over the whole flight and over cruise alone (heights within 5 m
-of the commonest, the filter of the authors of these data). A bound is printed too: what the best azimuths of all,
-chosen for every flight and channel on the samples that are scored, would reach.
+Each model is scored on several footings: samples as they are; both sides averaged in power over four seconds; over
+stretches of path of 40 wavelengths and of 20 m, the local mean that a ray model without fast fading can predict, where
+every stretch counts once however long the UAV hovered there (a third of the samples are hover at three waypoints); and
+the samples of cruise alone (heights within 5 m of the commonest, the filter of the authors of these data). A bound is
+printed too: what the best azimuths of all, chosen for every flight and channel on the samples that are scored, would
+reach.
 
     AERPAW_CMP_FIELD_DATA=DIR python benchmarks/field_models.py [--quick] [--json]
 """
@@ -30,7 +32,7 @@ import numpy as np
 from aerpaw_cmp.compare.heldout import HeldOutFit, fit_held_out
 from aerpaw_cmp.compare.installed import InstalledFit, LinkAngles, fit_installed
 from aerpaw_cmp.compare.offset import grid_offset
-from aerpaw_cmp.compare.rss import local_mean_db
+from aerpaw_cmp.compare.rss import local_mean_db, stretch_means_db, stretches
 from aerpaw_cmp.config import load_flight
 from aerpaw_cmp.flight import FlightData, gather, read_logs
 from aerpaw_cmp.replay.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
@@ -39,7 +41,7 @@ from aerpaw_cmp.replay.foliage import CrownIndex, foliage_loss_db, foliage_model
 from aerpaw_cmp.replay.replay import replay
 from aerpaw_cmp.site.antennas import read_gain_grid
 from aerpaw_cmp.site.installed import InstalledPattern
-from aerpaw_cmp.units import BoolArray, FloatArray
+from aerpaw_cmp.units import BoolArray, FloatArray, wavelength_m
 
 TOWER = "LW1"
 CARRIER_HZ = 3.3e9
@@ -345,21 +347,30 @@ def cruise(flight: Flight) -> BoolArray:
     return np.asarray(np.abs(height - whole[count.argmax()]) < CRUISE_M)
 
 
-FOOTINGS = {"as_logged": (0.0, False), "mean_4s": (WINDOW_S, False), "cruise": (0.0, True),
-            "cruise_mean_4s": (WINDOW_S, True)}  # fmt: skip
-"""Seconds averaged over, and whether over cruise alone."""
+WAVELENGTHS_40_M = 40.0 * wavelength_m(CARRIER_HZ)
+FOOTINGS = ("as_logged", "mean_4s", "mean_40_wavelengths", "mean_20m", "cruise")
+
+
+def footing_pair(flight: Flight, footing: str, measured: FloatArray, level: FloatArray) -> tuple[FloatArray, ...]:
+    """Both sides (m,) as a footing compares them."""
+    sides = (measured, level)
+    if footing == "mean_4s":
+        return tuple(local_mean_db(flight.time_s, side, WINDOW_S) for side in sides)
+    if footing in ("mean_40_wavelengths", "mean_20m"):
+        stretch = stretches(flight.poses.position_m, 20.0 if footing == "mean_20m" else WAVELENGTHS_40_M)
+        return tuple(stretch_means_db(stretch, side) for side in sides)
+    keep = cruise(flight) if footing == "cruise" else np.ones(len(measured), np.bool_)
+    return tuple(side[keep] for side in sides)
 
 
 def score(flights: Mapping[str, Flight], model: Model) -> dict[str, Any]:
     """RMSE [dB] per flight and channel, and their means, on every footing."""
     cells: dict[str, dict[str, float]] = {footing: {} for footing in FOOTINGS}
     for name, flight in flights.items():
-        steady = cruise(flight)
         for channel, measured in flight.measured_db.items():
             level = model(flight, channel)
-            for footing, (window, alone) in FOOTINGS.items():
-                keep = steady if alone else np.ones_like(steady)
-                pair = (local_mean_db(flight.time_s[keep], side[keep], window) for side in (measured, level))
+            for footing in FOOTINGS:
+                pair = footing_pair(flight, footing, measured, level)
                 cells[footing][f"{name} {channel}"] = grid_offset(*pair, span_db=SPAN_DB).rmse_db
     return {footing: {**row, "mean": float(np.mean(list(row.values())))} for footing, row in cells.items()}
 
@@ -368,12 +379,10 @@ def bounds(flights: Mapping[str, Flight], patterns: Patterns, step_deg: float) -
     """Least RMSE [dB] that azimuths chosen for each flight and channel on the scored samples reach, in half steps."""
     azimuths = np.arange(0.0, 360.0, step_deg / 2.0)
     found: dict[str, Any] = {}
-    for footing, (window, alone) in FOOTINGS.items():
-        if window:
-            continue
+    for footing in ("as_logged", "cruise"):
         cells = {}
         for name, flight in flights.items():
-            keep = cruise(flight) if alone else np.ones(len(flight.time_s), np.bool_)
+            keep = cruise(flight) if footing == "cruise" else np.ones(len(flight.time_s), np.bool_)
             ray = (flight.poses.position_m - flight.data.site.towers[TOWER].position_m)[keep]
             body = np.einsum("nji,nj->ni", flight.poses.rotation[keep], -ray)
             uav = np.stack([gain_dbi(patterns.uav, body @ yaw_deg(a)) for a in azimuths])
@@ -388,13 +397,15 @@ def bounds(flights: Mapping[str, Flight], patterns: Patterns, step_deg: float) -
 
 
 def scatter(flights: Mapping[str, Flight]) -> dict[str, Any]:
-    """Scatter of the measured level about its 4 s mean [dB], and how far two channels share it."""
+    """Scatter of the measured level about its 4 s mean [dB], how far two channels share it, share of hover."""
     found = {}
     for name, flight in flights.items():
+        speed = np.linalg.norm(np.gradient(flight.poses.position_m, axis=0), axis=1) / np.gradient(flight.time_s)
         quick = {c: m - local_mean_db(flight.time_s, m, WINDOW_S) for c, m in flight.measured_db.items()}
         found[name] = {
             "within_4s_db": {c: float(np.std(q)) for c, q in quick.items()},
             "correlation_of_channels": float(np.corrcoef(*quick.values())[0, 1]),
+            "share_below_1_mps": float(np.mean(speed < 1.0)),
         }
     return found
 
@@ -454,9 +465,8 @@ def main() -> None:
         print(json.dumps(found))
         return
     columns = [c for c in next(iter(found["rows"].values()))["as_logged"] if c != "mean"]
-    print("RMSE [dB] after the best offset; last columns: mean of four, samples as logged / 4 s means on both sides,")
-    print("then the same over cruise alone (within 5 m of the commonest height)")
-    heads = [*(c.removeprefix("dataset12_") for c in columns), "mean", "mean 4 s", "cruise", "cruise 4 s"]
+    print("RMSE [dB] after the best offset; last columns: mean of the four on each footing")
+    heads = [*(c.removeprefix("dataset12_") for c in columns), "as logged", "4 s", "40 lambda", "20 m", "cruise"]
     print(" " * 64 + " ".join(f"{head:>10s}" for head in heads))
     for name, row in found["rows"].items():
         values = [*(row["as_logged"][c] for c in columns), *(row[footing]["mean"] for footing in FOOTINGS)]
@@ -467,7 +477,8 @@ def main() -> None:
     for name, row in found["scatter"].items():
         each = ", ".join(f"{c} {value:.2f} dB" for c, value in row["within_4s_db"].items())
         shared = row["correlation_of_channels"]
-        print(f"scatter within 4 s, {name}: {each}; correlation of the channels {shared:.2f}")
+        hover = 100.0 * row["share_below_1_mps"]
+        print(f"scatter within 4 s, {name}: {each}; correlation of the channels {shared:.2f}; {hover:.0f} % hover")
     for test, fit in found["mounts"].items():
         angles = ", ".join(f"{name} {value:.0f} deg" for name, value in fit["parameters"].items())
         print(f"mount applied to {test}, fitted on {fit['fitted_on'][0]}: {angles}")

@@ -271,6 +271,40 @@ def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> Fl
     return result
 
 
+def stretches(position_m: FloatArray, length_m: float) -> IntArray:
+    """Number (n,) of the stretch of path that each sample belongs to.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        In the order flown; NaN where unknown (counted to the stretch before).
+    length_m : float
+        Path of one stretch. A UAV that hovers stays in its stretch.
+    """
+    known = np.isfinite(position_m).all(axis=1)
+    way = np.zeros(len(position_m))
+    rows = np.flatnonzero(known)
+    if len(rows):
+        steps = np.linalg.norm(np.diff(position_m[rows], axis=0), axis=1)
+        way[rows] = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.asarray(np.maximum.accumulate(way) // length_m, dtype=np.int64)
+
+
+def stretch_means_db(stretch: IntArray, level_db: ArrayLike) -> FloatArray:
+    """Mean power [dB] of each stretch that has a level (stretches,), in the order of their numbers.
+
+    The local mean over 20 to 40 wavelengths is what a prediction without fast fading can hold for (Lee 1985,
+    doi:10.1109/T-VT.1985.24030). Every stretch counts once, however long the UAV hovered in it.
+    """
+    level = _levels(level_db)
+    known = np.isfinite(level)
+    if not known.any():
+        return np.zeros(0)
+    _, at = np.unique(stretch[known], return_inverse=True)
+    top = level[known].max()
+    return np.asarray(db_from_power(np.bincount(at, power_from_db(level[known] - top)) / np.bincount(at)) + top)
+
+
 def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
     """Sums of values[first:last] for windows that move forward.
 
@@ -331,6 +365,28 @@ def same_footing(
             )
             for w in windows_s
         }
+    return result
+
+
+def same_place(
+    position_m: FloatArray,
+    measured_db: ArrayLike,
+    simulations: Mapping[str, ArrayLike],
+    *,
+    lengths_m: Sequence[float],
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> dict[str, dict[float, OffsetFit]]:
+    """As :func:`same_footing`, with both sides averaged over stretches of path: ``result[name][length]``."""
+    measured = _levels(measured_db)
+    result: dict[str, dict[float, OffsetFit]] = {name: {} for name in simulations}
+    for length in lengths_m:
+        stretch = stretches(position_m, length)
+        for name, levels in simulations.items():
+            simulated = _levels(levels)
+            both = np.isfinite(measured) & np.isfinite(simulated)
+            pair = (stretch_means_db(stretch[both], side[both]) for side in (measured, simulated))
+            result[name][float(length)] = grid_offset(*pair, step_db=step_db, span_db=span_db)
     return result
 
 

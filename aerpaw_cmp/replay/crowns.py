@@ -8,12 +8,13 @@ single bounce. Sequences of a crown with a building or with a second crown are l
 Crowns are the polygonal cones of :func:`aerpaw_cmp.site.meshes.site_meshes`: triangular sides and a flat bottom. They
 lie inside the round cones that block, and are convex: a crown never hides its own bounce.
 
-Facets and poses are thinned by beams: the pyramid from the image of the source through the facet against the boxes of
-a few poses each, all at once as one matrix product; then the same planes against the poses of the boxes that are left.
+Facets and poses are thinned by beams, the pyramids from the image of the source through the facets: only poses inside
+the rectangle, east and north, that a beam lights between the lowest and the highest pose are looked at.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from itertools import pairwise
@@ -34,10 +35,16 @@ FACES_PER_CROWN = CROWN_SIDES + 1
 """Sides, then the bottom."""
 
 SLACK_M = 1e-3
-"""Of the beams, which only thin out: far above their rounding; the reflection point decides."""
+"""Margin of the beams, which only thin out: far above their rounding; the reflection point decides."""
 
-TARGETS_PER_BOX = 32
-TARGETS_AT_ONCE = 16_384
+LAYER_M, MOST_LAYERS = 10.0, 12
+"""Poses are looked up in layers of about this height: beams light little of each."""
+
+WIDE_SHARE = 0.2
+"""Beams whose rectangle is larger than this share of the poses', both ways, are tried against every pose at once."""
+
+PAIRS_AT_ONCE = 200_000
+"""Of a facet and a pose; about 100 MB of temporary arrays."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,31 +52,35 @@ class _Facets:
     """Facets with the same number of corners.
 
     ``corners_m`` (facets, corners, 3) counter-clockwise seen from outside, ``normal`` (facets, 3), ``offset_m``
-    (facets,), ``number`` (facets,): tree times :data:`FACES_PER_CROWN` plus side.
+    (facets,), ``number`` (facets,): tree times :data:`FACES_PER_CROWN` plus side. ``inward`` (facets, corners, 3) are
+    unit normals of the edges in the facet, ``edge_m`` (facets, corners) how far along them the edges lie.
     """
 
     corners_m: FloatArray
     normal: FloatArray
     offset_m: FloatArray
     number: IntArray
+    inward: FloatArray
+    edge_m: FloatArray
 
     @classmethod
     def of(cls, corners_m: FloatArray, number: IntArray) -> _Facets:
         one, two = corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]
         normal = np.cross(one, two)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
-        return cls(corners_m, normal, np.einsum("fi,fi->f", normal, corners_m[:, 0]), number)
+        offset = np.einsum("fi,fi->f", normal, corners_m[:, 0])
+        inward = np.cross(normal[:, None], np.roll(corners_m, -1, axis=1) - corners_m)
+        inward /= np.linalg.norm(inward, axis=2, keepdims=True)
+        return cls(corners_m, normal, offset, number, inward, np.einsum("fki,fki->fk", inward, corners_m))
 
     def select(self, rows: IntArray) -> _Facets:
-        return _Facets(self.corners_m[rows], self.normal[rows], self.offset_m[rows], self.number[rows])
+        columns = (self.corners_m, self.normal, self.offset_m, self.number, self.inward, self.edge_m)
+        return _Facets(*(column[rows] for column in columns))  # type: ignore[arg-type]
 
     def contain(self, rows: IntArray, point_m: FloatArray, tolerance_m: float) -> BoolArray:
         """Whether points (n, 3) in the planes of the facets ``rows`` (n,) lie inside them."""
-        corners, normal = self.corners_m[rows], self.normal[rows]
-        edge = np.roll(corners, -1, axis=1) - corners
-        inward = np.cross(normal[:, None], edge)
-        depth = np.einsum("nki,nki->nk", inward, point_m[:, None] - corners)
-        return np.asarray((depth >= -tolerance_m * np.linalg.norm(edge, axis=2)).all(axis=1))
+        depth = np.einsum("nki,ni->nk", self.inward[rows], point_m) - self.edge_m[rows]
+        return np.asarray((depth >= -tolerance_m).all(axis=1))
 
 
 class Crowns:
@@ -145,9 +156,7 @@ class Crowns:
             poses = np.flatnonzero(alive[tower])
             for before, after, plane in _sequences(np.flatnonzero(ground[tower]), max_depth):
                 search = _Search(self, faces, hiding, plane, before, after, dem)
-                for start in range(0, len(poses), TARGETS_AT_ONCE):
-                    some = poses[start : start + TARGETS_AT_ONCE]
-                    found.append(search(source, targets_m, some, tower, max_depth))
+                found.append(search(source, targets_m, poses, tower, max_depth))
         paths = merge(found, max_depth, None)
         return self._with_facets(paths, faces, max_depth)
 
@@ -317,79 +326,115 @@ def _single_bounces(
     facet, target : (points,) int
     point_m : (points, 3)
     """
-    empty = np.zeros(0, dtype=np.int64)
     height = facets.normal @ source_m - facets.offset_m
     lit = np.flatnonzero(height > tolerance_m)
-    if not len(lit) or not len(targets_m):
-        return empty, empty, np.zeros((0, 3))
-    facets, height = facets.select(lit), height[lit]
-    image = source_m - 2.0 * height[:, None] * facets.normal
-    facet, target = _candidates(_beams(facets, image), targets_m)
-    ahead = np.einsum("ni,ni->n", facets.normal[facet], targets_m[target]) - facets.offset_m[facet]
-    good = ahead > tolerance_m
-    facet, target, ahead = facet[good], target[good], ahead[good]
-    behind = height[facet]
-    point = image[facet] + (behind / (behind + ahead))[:, None] * (targets_m[target] - image[facet])
-    good = facets.contain(facet, point, tolerance_m)
-    return lit[facet[good]], target[good], point[good]
+    none = np.zeros(0, dtype=np.int64)
+    found: list[tuple[IntArray, IntArray, FloatArray]] = [(none, none, np.zeros((0, 3)))]
+    if len(lit) and len(targets_m):
+        facets, height = facets.select(lit), height[lit]
+        image = source_m - 2.0 * height[:, None] * facets.normal
+        for facet, target in _candidates(facets.corners_m, image, targets_m):
+            normal, behind = facets.normal[facet], height[facet]
+            ahead = np.einsum("ni,ni->n", normal, targets_m[target]) - facets.offset_m[facet]
+            good = np.flatnonzero(ahead > tolerance_m)
+            facet, target, share = facet[good], target[good], (behind / (behind + ahead))[good]
+            point = image[facet] + share[:, None] * (targets_m[target] - image[facet])
+            good = np.flatnonzero(facets.contain(facet, point, tolerance_m))
+            found.append((lit[facet[good]], target[good], point[good]))
+    facet, target, point = (np.concatenate(x) for x in zip(*found, strict=True))
+    return facet, target, point
 
 
-def _beams(facets: _Facets, image_m: FloatArray) -> FloatArray:
-    """Planes (facets, corners + 1, 4) round what the images light through their facets.
+def _candidates(
+    corners_m: FloatArray, image_m: FloatArray, targets_m: FloatArray
+) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (facet, target) that could belong to each other, layer by layer of the targets' heights."""
+    order = np.argsort(targets_m[:, 2], kind="stable")
+    height = targets_m[order, 2]
+    layers = 1 + int(min(height[-1] - height[0], LAYER_M * MOST_LAYERS) / LAYER_M)
+    edges = np.linspace(height[0], height[-1], layers + 1)[1:-1]
+    for members in np.split(order, np.searchsorted(height, edges)):
+        if len(members):
+            some = targets_m[members]
+            low, high = _shadows(corners_m, image_m, float(some[:, 2].min()), float(some[:, 2].max()))
+            first, last = some[:, :2].min(axis=0)[:, None], some[:, :2].max(axis=0)[:, None]
+            size = np.minimum(high, last) - np.maximum(low, first)
+            wide = (size > WIDE_SHARE * (last - first)).all(axis=0)
+            rows = np.flatnonzero(~wide & (size >= 0.0).all(axis=0))
+            for facet, target in _within(low[:, rows], high[:, rows], some):
+                yield rows[facet], members[target]
+            rows = np.flatnonzero(wide)
+            for facet, target in _lit(corners_m[rows], image_m[rows], some):
+                yield rows[facet], members[target]
 
-    ``plane . (x, 1)`` is the distance [m] of x inside: of the planes through the edges, then of the facet.
+
+def _lit(corners_m: FloatArray, image_m: FloatArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (facet, point) of points between the planes through the images and the edges of the facets; all tried."""
+    place = np.concatenate([points_m, np.ones((len(points_m), 1))], axis=1).T
+    step = max(1, CELLS_PER_CHUNK // (corners_m.shape[1] * len(points_m)))
+    for start in range(0, len(image_m), step):
+        image = image_m[start : start + step]
+        ray = corners_m[start : start + step] - image[:, None]
+        side = np.cross(ray, np.roll(ray, -1, axis=1))  # inwards: counter-clockwise seen from the front
+        side /= np.linalg.norm(side, axis=2, keepdims=True) + 1e-300
+        planes = np.concatenate([side, -np.einsum("fki,fi->fk", side, image)[..., None]], axis=2)
+        facet, point = np.nonzero((planes @ place >= -SLACK_M).all(axis=1))
+        yield facet + start, point
+
+
+def _shadows(corners_m: FloatArray, image_m: FloatArray, low_m: float, high_m: float) -> tuple[FloatArray, FloatArray]:
+    """Bounds (2, facets), east and north [m], of what images light through their facets between two heights.
+
+    What is lit is bounded by the rays through the corners, beyond the facet. Where all of them rise, or all fall, they
+    leave the heights in between within a finite distance; else the bounds are infinite. Where nothing is lit the
+    interval is empty.
     """
-    ray = facets.corners_m - image_m[:, None]
-    side = np.cross(ray, np.roll(ray, -1, axis=1))  # inwards: the corners go counter-clockwise seen from the front
-    side /= np.linalg.norm(side, axis=2, keepdims=True) + 1e-300
-    planes = np.empty((len(image_m), side.shape[1] + 1, 4))
-    planes[:, :-1, :3] = side
-    planes[:, :-1, 3] = -np.einsum("fki,fi->fk", side, image_m)
-    planes[:, -1, :3] = facets.normal
-    planes[:, -1, 3] = -facets.offset_m
-    return planes
+    image = np.ascontiguousarray(image_m.T)
+    ray = np.ascontiguousarray(np.moveaxis(corners_m, 0, -1)) - image  # (corners, 3, facets)
+    rise = ray[:, 2]
+    bounded = (rise > 0).all(axis=0) | (rise < 0).all(axis=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one = (low_m - SLACK_M - image[2]) / rise
+        two = (high_m + SLACK_M - image[2]) / rise
+    first, last = np.minimum(one, two), np.maximum(one, two)  # 1 is the facet
+    across = (first < 1.0).any(axis=0)  # the facet itself may take part in the bounds
+    share = np.stack([np.maximum(first, 1.0), np.maximum(last, 1.0), np.where(across, 1.0, first)])
+    share[..., ~bounded] = 1.0
+    place = image[:2] + share[:, :, None] * ray[:, :2]  # (3, corners, 2, facets)
+    low, high = place.min(axis=(0, 1)) - SLACK_M, place.max(axis=(0, 1)) + SLACK_M
+    low[:, ~bounded], high[:, ~bounded] = -np.inf, np.inf
+    dark = bounded & (last < 1.0).all(axis=0)
+    low[:, dark], high[:, dark] = np.inf, -np.inf
+    return low, high
 
 
-def _candidates(beams: FloatArray, targets_m: FloatArray) -> tuple[IntArray, IntArray]:
-    """Pairs (beam, target) of beams (n, planes, 4) and the targets inside them, but for :data:`SLACK_M`."""
-    boxes = _boxes(targets_m)
-    low = np.array([targets_m[box].min(axis=0) for box in boxes])
-    high = np.array([targets_m[box].max(axis=0) for box in boxes])
-    # the corner of a box farthest along a plane's normal m lies at m . centre + |m| . half
-    size = np.concatenate([(low + high) / 2, np.ones((len(boxes), 1)), (high - low) / 2], axis=1).T
-    step = max(1, CELLS_PER_CHUNK // (beams.shape[1] * len(boxes)))
-    beam_of: list[IntArray] = []
-    box_of: list[IntArray] = []
-    for start in range(0, len(beams), step):
-        some = beams[start : start + step]
-        reach = np.concatenate([some, np.abs(some[..., :3])], axis=2) @ size
-        beam, box = np.nonzero((reach >= -SLACK_M).all(axis=1))
-        beam_of.append(beam + start)
-        box_of.append(box)
-    beam, box = np.concatenate(beam_of), np.concatenate(box_of)
-    order = np.argsort(box, kind="stable")
-    groups = np.split(beam[order], np.searchsorted(box[order], np.arange(1, len(boxes))))
-    found_beam: list[IntArray] = []
-    found_target: list[IntArray] = []
-    for members, rows in zip(boxes, groups, strict=True):
-        place = np.concatenate([targets_m[members], np.ones((len(members), 1))], axis=1).T
-        one, two = np.nonzero((beams[rows] @ place >= -SLACK_M).all(axis=1))
-        found_beam.append(rows[one])
-        found_target.append(members[two])
-    return np.concatenate(found_beam), np.concatenate(found_target)
+def _within(low_m: FloatArray, high_m: FloatArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (rectangle, point) of all points inside rectangles (2, n), and some nearby; in parts of bounded size.
 
-
-def _boxes(points_m: FloatArray) -> list[IntArray]:
-    """Indices of points in groups of neighbours, halved along the longest side until they are few."""
-    done: list[IntArray] = []
-    left = [np.arange(len(points_m))]
-    while left:
-        some = left.pop()
-        if len(some) <= TARGETS_PER_BOX:
-            done.append(some)
-            continue
-        axis = int(np.argmax(np.ptp(points_m[some], axis=0)))
-        middle = len(some) // 2
-        order = np.argpartition(points_m[some, axis], middle)
-        left += [some[order[:middle]], some[order[middle:]]]
-    return done
+    The points are sorted into square cells of about two points; a row of cells is a run of points.
+    """
+    corner = points_m[:, :2].min(axis=0)
+    span = np.ptp(points_m[:, :2], axis=0)
+    cell = max(math.sqrt(float(span.prod()) * 2 / len(points_m)), float(span.max()) / len(points_m), 1e-6)
+    shape = (span / cell).astype(np.int64) + 1
+    at = ((points_m[:, :2] - corner) / cell).astype(np.int64)
+    key = at[:, 0] * shape[1] + at[:, 1]
+    order = np.argsort(key, kind="stable")
+    begins = np.searchsorted(key[order], np.arange(int(shape.prod()) + 1))
+    first, last = (np.floor(np.clip((x.T - corner) / cell, -1, shape + 1)).astype(np.int64) for x in (low_m, high_m))
+    first, last = first.clip(0), np.minimum(last, shape - 1)
+    rows = np.where((last >= first).all(axis=1), last[:, 0] - first[:, 0] + 1, 0)
+    rectangle = np.repeat(np.arange(len(rows)), rows)
+    row = first[rectangle, 0] + np.arange(len(rectangle)) - np.repeat(np.cumsum(rows) - rows, rows)
+    begin = begins[row * shape[1] + first[rectangle, 1]]
+    count = begins[row * shape[1] + last[rectangle, 1] + 1] - begin
+    done = np.cumsum(count)
+    start = 0
+    while start < len(count):
+        used = int(done[start - 1]) if start else 0
+        stop = max(start + 1, int(np.searchsorted(done, used + PAIRS_AT_ONCE, side="right")))
+        some = count[start:stop]
+        run = np.repeat(np.arange(start, stop), some)
+        place = begin[run] + np.arange(len(run)) - np.repeat(np.cumsum(some) - some, some)
+        yield rectangle[run], order[place]
+        start = stop

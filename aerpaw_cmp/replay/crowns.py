@@ -43,6 +43,9 @@ LAYER_M, MOST_LAYERS = 10.0, 12
 WIDE_SHARE = 0.2
 """Beams whose rectangle is larger than this share of the poses', both ways, are tried against every pose at once."""
 
+KEPT_BEAMS = 12
+"""Sources whose beams are kept; 10 MB each for 10 000 trees."""
+
 PAIRS_AT_ONCE = 200_000
 """Of a facet and a pose; about 100 MB of temporary arrays."""
 
@@ -73,10 +76,6 @@ class _Facets:
         inward /= np.linalg.norm(inward, axis=2, keepdims=True)
         return cls(corners_m, normal, offset, number, inward, np.einsum("fki,fki->fk", inward, corners_m))
 
-    def select(self, rows: IntArray) -> _Facets:
-        columns = (self.corners_m, self.normal, self.offset_m, self.number, self.inward, self.edge_m)
-        return _Facets(*(column[rows] for column in columns))  # type: ignore[arg-type]
-
     def contain(self, rows: IntArray, point_m: FloatArray, tolerance_m: float) -> BoolArray:
         """Whether points (n, 3) in the planes of the facets ``rows`` (n,) lie inside them."""
         depth = np.einsum("nki,ni->nk", self.inward[rows], point_m) - self.edge_m[rows]
@@ -102,6 +101,7 @@ class Crowns:
         sides = np.stack([rim, np.roll(rim, -1, axis=1), tips], axis=2).reshape(-1, 3, 3)
         first = solid * FACES_PER_CROWN
         self._families: tuple[_Facets, ...] = ()
+        self._beams: dict[tuple[bytes, float], tuple[_Beams, ...]] = {}
         if len(solid):
             self._families = (
                 _Facets.of(sides, (first[:, None] + np.arange(CROWN_SIDES)).reshape(-1)),
@@ -160,6 +160,15 @@ class Crowns:
         paths = merge(found, max_depth, None)
         return self._with_facets(paths, faces, max_depth)
 
+    def beams(self, source_m: FloatArray, tolerance_m: float) -> tuple[_Beams, ...]:
+        """Beams of each family of facets; those of the last sources are kept, for replays of few poses each."""
+        key = (source_m.tobytes(), tolerance_m)
+        if key not in self._beams:
+            if len(self._beams) >= KEPT_BEAMS:
+                self._beams.pop(next(iter(self._beams)))
+            self._beams[key] = tuple(_Beams.of(facets, source_m, tolerance_m) for facets in self._families)
+        return self._beams[key]
+
     def _tolerance_m(self, *points_m: FloatArray) -> float:
         """As :func:`aerpaw_cmp.replay.image.scene_tolerance_m`, with the crowns in the scene."""
         sizes = [1.0, *(float(np.nanmax(np.abs(p), initial=0.0, where=np.isfinite(p))) for p in points_m)]
@@ -185,12 +194,13 @@ class Crowns:
         polygon, offset = np.empty(len(number), dtype=object), np.zeros(len(number))
         for facets in self._families:
             rows = np.flatnonzero(np.isin(number, facets.number))
-            mine = facets.select(np.searchsorted(facets.number, number[rows]))
-            edge = mine.corners_m[:, 1] - mine.corners_m[:, 0]
-            normal[rows], offset[rows] = mine.normal, mine.offset_m
+            at = np.searchsorted(facets.number, number[rows])
+            corners = facets.corners_m[at]
+            edge = corners[:, 1] - corners[:, 0]
+            normal[rows], offset[rows] = facets.normal[at], facets.offset_m[at]
             along[rows] = edge / np.linalg.norm(edge, axis=1, keepdims=True)
             across[rows] = np.cross(normal[rows], along[rows])
-            flat = np.einsum("fki,afi->fka", mine.corners_m, np.stack([along[rows], across[rows]]))
+            flat = np.einsum("fki,afi->fka", corners, np.stack([along[rows], across[rows]]))
             lower[rows], upper[rows], polygon[rows] = flat.min(axis=1), flat.max(axis=1), shapely.polygons(flat)
         names = [f"side {k + 1}" if k < CROWN_SIDES else "bottom" for k in side]
         return Faces(
@@ -243,8 +253,8 @@ class _Search:
         start = self._mirrored(source_m[None])[0] if self.before else source_m
         target = self._mirrored(targets_m[poses]) if self.after else targets_m[poses]
         pieces: list[PathSet] = []
-        for facets in self.crowns._families:
-            facet, pose, point = _single_bounces(facets, start, target, tolerance_m)
+        for facets, beams in zip(self.crowns._families, self.crowns.beams(start, tolerance_m), strict=True):
+            facet, pose, point = _single_bounces(facets, beams, target, tolerance_m)
             pose, number = poses[pose], facets.number[facet]
             vertices, good = self._unfolded(source_m, point, targets_m[pose])
             pose, number, vertices = pose[good], number[good], vertices[good]
@@ -316,8 +326,36 @@ class _Search:
         return np.asarray((point_m[:, 2] > base) & (away < width))
 
 
+@dataclass(frozen=True, slots=True)
+class _Beams:
+    """What a source lights by way of facets: pyramids from its images through them.
+
+    ``facet`` (beams,) of the family; ``height_m`` (beams,) of the source above its plane; ``image_m`` (3, beams);
+    ``ray_m`` (corners, 3, beams) from the image to the corners. Nothing is lit below ``floor_m`` (beams,) and above
+    ``ceiling_m`` (beams,).
+    """
+
+    facet: IntArray
+    height_m: FloatArray
+    image_m: FloatArray
+    ray_m: FloatArray
+    floor_m: FloatArray
+    ceiling_m: FloatArray
+
+    @classmethod
+    def of(cls, facets: _Facets, source_m: FloatArray, tolerance_m: float) -> _Beams:
+        height = facets.normal @ source_m - facets.offset_m
+        lit = np.flatnonzero(height > tolerance_m)
+        image = (source_m - 2.0 * height[lit, None] * facets.normal[lit]).T.copy()
+        corners = np.ascontiguousarray(np.moveaxis(facets.corners_m[lit], 0, -1))
+        ray = corners - image
+        falls, rises = (ray[:, 2] <= 0).any(axis=0), (ray[:, 2] >= 0).any(axis=0)
+        floor = np.where(falls, -np.inf, corners[:, 2].min(axis=0))
+        return cls(lit, height[lit], image, ray, floor, np.where(rises, np.inf, corners[:, 2].max(axis=0)))
+
+
 def _single_bounces(
-    facets: _Facets, source_m: FloatArray, targets_m: FloatArray, tolerance_m: float
+    facets: _Facets, beams: _Beams, targets_m: FloatArray, tolerance_m: float
 ) -> tuple[IntArray, IntArray, FloatArray]:
     """All specular points of facets between a source and targets, whatever lies between.
 
@@ -326,86 +364,81 @@ def _single_bounces(
     facet, target : (points,) int
     point_m : (points, 3)
     """
-    height = facets.normal @ source_m - facets.offset_m
-    lit = np.flatnonzero(height > tolerance_m)
     none = np.zeros(0, dtype=np.int64)
     found: list[tuple[IntArray, IntArray, FloatArray]] = [(none, none, np.zeros((0, 3)))]
-    if len(lit) and len(targets_m):
-        facets, height = facets.select(lit), height[lit]
-        image = source_m - 2.0 * height[:, None] * facets.normal
-        for facet, target in _candidates(facets.corners_m, image, targets_m):
-            normal, behind = facets.normal[facet], height[facet]
-            ahead = np.einsum("ni,ni->n", normal, targets_m[target]) - facets.offset_m[facet]
-            good = np.flatnonzero(ahead > tolerance_m)
-            facet, target, share = facet[good], target[good], (behind / (behind + ahead))[good]
-            point = image[facet] + share[:, None] * (targets_m[target] - image[facet])
-            good = np.flatnonzero(facets.contain(facet, point, tolerance_m))
-            found.append((lit[facet[good]], target[good], point[good]))
+    for beam, target in _candidates(beams, targets_m):
+        facet, behind = beams.facet[beam], beams.height_m[beam]
+        ahead = np.einsum("ni,ni->n", facets.normal[facet], targets_m[target]) - facets.offset_m[facet]
+        good = np.flatnonzero(ahead > tolerance_m)
+        facet, target, share = facet[good], target[good], (behind / (behind + ahead))[good]
+        image = beams.image_m[:, beam[good]].T
+        point = image + share[:, None] * (targets_m[target] - image)
+        good = np.flatnonzero(facets.contain(facet, point, tolerance_m))
+        found.append((facet[good], target[good], point[good]))
     facet, target, point = (np.concatenate(x) for x in zip(*found, strict=True))
     return facet, target, point
 
 
-def _candidates(
-    corners_m: FloatArray, image_m: FloatArray, targets_m: FloatArray
-) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs (facet, target) that could belong to each other, layer by layer of the targets' heights."""
+def _candidates(beams: _Beams, targets_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (beam, target) that could belong to each other, layer by layer of the targets' heights."""
+    if not len(targets_m):
+        return
     order = np.argsort(targets_m[:, 2], kind="stable")
     height = targets_m[order, 2]
     layers = 1 + int(min(height[-1] - height[0], LAYER_M * MOST_LAYERS) / LAYER_M)
     edges = np.linspace(height[0], height[-1], layers + 1)[1:-1]
     for members in np.split(order, np.searchsorted(height, edges)):
-        if len(members):
-            some = targets_m[members]
-            low, high = _shadows(corners_m, image_m, float(some[:, 2].min()), float(some[:, 2].max()))
-            first, last = some[:, :2].min(axis=0)[:, None], some[:, :2].max(axis=0)[:, None]
-            size = np.minimum(high, last) - np.maximum(low, first)
-            wide = (size > WIDE_SHARE * (last - first)).all(axis=0)
-            rows = np.flatnonzero(~wide & (size >= 0.0).all(axis=0))
-            for facet, target in _within(low[:, rows], high[:, rows], some):
-                yield rows[facet], members[target]
-            rows = np.flatnonzero(wide)
-            for facet, target in _lit(corners_m[rows], image_m[rows], some):
-                yield rows[facet], members[target]
+        if not len(members):
+            continue
+        some = targets_m[members]
+        bottom, top = float(some[:, 2].min()) - SLACK_M, float(some[:, 2].max()) + SLACK_M
+        rows = np.flatnonzero((beams.floor_m <= top) & (beams.ceiling_m >= bottom))
+        low, high = _shadows(beams, rows, bottom, top)
+        first, last = some[:, :2].min(axis=0)[:, None], some[:, :2].max(axis=0)[:, None]
+        size = np.minimum(high, last) - np.maximum(low, first)
+        wide = (size > WIDE_SHARE * (last - first)).all(axis=0)
+        narrow = np.flatnonzero(~wide & (size >= 0.0).all(axis=0))
+        for beam, target in _within(low[:, narrow], high[:, narrow], some):
+            yield rows[narrow[beam]], members[target]
+        for beam, target in _lit(beams, rows[wide], some):
+            yield beam, members[target]
 
 
-def _lit(corners_m: FloatArray, image_m: FloatArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
-    """Pairs (facet, point) of points between the planes through the images and the edges of the facets; all tried."""
-    place = np.concatenate([points_m, np.ones((len(points_m), 1))], axis=1).T
-    step = max(1, CELLS_PER_CHUNK // (corners_m.shape[1] * len(points_m)))
-    for start in range(0, len(image_m), step):
-        image = image_m[start : start + step]
-        ray = corners_m[start : start + step] - image[:, None]
-        side = np.cross(ray, np.roll(ray, -1, axis=1))  # inwards: counter-clockwise seen from the front
-        side /= np.linalg.norm(side, axis=2, keepdims=True) + 1e-300
-        planes = np.concatenate([side, -np.einsum("fki,fi->fk", side, image)[..., None]], axis=2)
-        facet, point = np.nonzero((planes @ place >= -SLACK_M).all(axis=1))
-        yield facet + start, point
+def _shadows(beams: _Beams, rows: IntArray, low_m: float, high_m: float) -> tuple[FloatArray, FloatArray]:
+    """Bounds (2, rows), east and north [m], of what some beams light between two heights.
 
-
-def _shadows(corners_m: FloatArray, image_m: FloatArray, low_m: float, high_m: float) -> tuple[FloatArray, FloatArray]:
-    """Bounds (2, facets), east and north [m], of what images light through their facets between two heights.
-
-    What is lit is bounded by the rays through the corners, beyond the facet. Where all of them rise, or all fall, they
-    leave the heights in between within a finite distance; else the bounds are infinite. Where nothing is lit the
-    interval is empty.
+    It is bounded by the rays through the corners, beyond the facet. Where all of them rise, or all fall, they leave
+    the heights in between within a finite distance; else the bounds are infinite.
     """
-    image = np.ascontiguousarray(image_m.T)
-    ray = np.ascontiguousarray(np.moveaxis(corners_m, 0, -1)) - image  # (corners, 3, facets)
+    # taken, not indexed: an index on the last axis would put the beams first in memory, and the bounds are taken over
+    # the others
+    image, ray = beams.image_m.take(rows, axis=1), beams.ray_m.take(rows, axis=2)
     rise = ray[:, 2]
-    bounded = (rise > 0).all(axis=0) | (rise < 0).all(axis=0)
+    endless = np.isinf(beams.floor_m[rows]) & np.isinf(beams.ceiling_m[rows])
     with np.errstate(divide="ignore", invalid="ignore"):
-        one = (low_m - SLACK_M - image[2]) / rise
-        two = (high_m + SLACK_M - image[2]) / rise
+        one, two = (low_m - image[2]) / rise, (high_m - image[2]) / rise
     first, last = np.minimum(one, two), np.maximum(one, two)  # 1 is the facet
     across = (first < 1.0).any(axis=0)  # the facet itself may take part in the bounds
     share = np.stack([np.maximum(first, 1.0), np.maximum(last, 1.0), np.where(across, 1.0, first)])
-    share[..., ~bounded] = 1.0
-    place = image[:2] + share[:, :, None] * ray[:, :2]  # (3, corners, 2, facets)
+    share[..., endless] = 1.0
+    place = image[:2] + share[:, :, None] * ray[:, :2]  # (3, corners, 2, rows)
     low, high = place.min(axis=(0, 1)) - SLACK_M, place.max(axis=(0, 1)) + SLACK_M
-    low[:, ~bounded], high[:, ~bounded] = -np.inf, np.inf
-    dark = bounded & (last < 1.0).all(axis=0)
-    low[:, dark], high[:, dark] = np.inf, -np.inf
+    low[:, endless], high[:, endless] = -np.inf, np.inf
     return low, high
+
+
+def _lit(beams: _Beams, rows: IntArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:
+    """Pairs (beam, point) of some beams and the points between the planes through their edges; all are tried."""
+    place = np.concatenate([points_m, np.ones((len(points_m), 1))], axis=1).T
+    step = max(1, CELLS_PER_CHUNK // (len(beams.ray_m) * len(points_m)))
+    for start in range(0, len(rows), step):
+        part = rows[start : start + step]
+        ray = np.moveaxis(beams.ray_m[:, :, part], -1, 0)
+        side = np.cross(ray, np.roll(ray, -1, axis=1))  # inwards: counter-clockwise seen from the front
+        side /= np.linalg.norm(side, axis=2, keepdims=True) + 1e-300
+        planes = np.concatenate([side, -np.einsum("fki,if->fk", side, beams.image_m[:, part])[..., None]], axis=2)
+        beam, point = np.nonzero((planes @ place >= -SLACK_M).all(axis=1))
+        yield part[beam], point
 
 
 def _within(low_m: FloatArray, high_m: FloatArray, points_m: FloatArray) -> Iterator[tuple[IntArray, IntArray]]:

@@ -9,6 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from shapely.geometry import box
 
+from aerpaw_cmp.replay import audit
 from aerpaw_cmp.replay.arrays import Array
 from aerpaw_cmp.replay.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.replay.field import channel_matrices
@@ -224,7 +225,8 @@ def test_thinning_out_loses_nothing_in_a_wood(scenes):
     position = np.column_stack([rng.uniform(-200, 200, (500, 2)), rng.uniform(1, 120, 500)])
     total = 0
     for facets in wood._families:
-        facet, target, point = module._single_bounces(facets, source, position, 1e-9)
+        beams = module._Beams.of(facets, source, 1e-9)
+        facet, target, point = module._single_bounces(facets, beams, position, 1e-9)
         corners = facets.corners_m[:, None]
         height = (facets.normal @ source - facets.offset_m)[:, None]
         ahead = facets.normal @ position.T - facets.offset_m[:, None]
@@ -389,6 +391,26 @@ def test_without_bounces_everything_stays_as_it_was(scenes):
     np.testing.assert_array_equal(same.h, blocking.h)
     assert same.faces is not None
     assert len(same.faces) == len(blocking.faces)
+
+
+def test_the_audit_compares_paths_over_crowns(scenes):
+    rng = np.random.default_rng(8)
+    stand = random_trees(rng, 40)
+    site = scenes.site(trees=stand)
+    position = np.concatenate(
+        [aimed_positions(rng, site, site.towers["LW1"].position_m, 60), rng.uniform(20, 50, (9, 3))]
+    )
+    found = opaque_replay(scenes, site, position)
+    crowns, link, poses = Crowns(stand), scenes.link(site), scenes.poses(position)
+    settings = {"reference": "image", "loss": opaque(crowns), "links": 40}
+    same = audit(site, link, poses, found, crowns=crowns, **settings).difference
+    # the reference has other facets than the whole replay, so that their numbers differ
+    assert (same.missing_paths, same.extra_paths, same.rss_max_error_db) == (0, 0, 0.0)
+    without = audit(site, link, poses, found, **settings).difference
+    chosen = np.linspace(0, len(position) - 1, 40).round()
+    off = found.paths.select(found.paths.off_crown)
+    assert without.extra_paths == np.isin(off.pose, chosen).sum() > 10
+    assert without.missing_paths == 0
 
 
 def test_only_opaque_crowns_reflect(scenes):

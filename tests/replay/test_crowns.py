@@ -245,6 +245,27 @@ def test_thinning_out_loses_nothing_in_a_wood(scenes):
     assert total > 100
 
 
+def test_thinning_out_loses_no_pose_close_to_its_facet(scenes):
+    # one pose at a time, between base and tip of the crown: the facet itself bounds what is lit
+    from aerpaw_cmp.replay import crowns as module
+
+    rng = np.random.default_rng(6)
+    stand = random_trees(rng, 20)
+    sides = triangles_of(scenes.site(trees=stand))[:, :CROWN_SIDES].reshape(-1, 3, 3)
+    facets, source = Crowns(stand)._families[0], np.array([3.0, -4.0, 10.0])
+    beams, tried = module._Beams.of(facets, source, 1e-9), 0
+    for number in beams.facet:
+        corners, n = sides[number], facets.normal[number]
+        point = rng.dirichlet([0.5, 0.5, 0.5]) @ corners
+        ray = point - source
+        pose = point + rng.choice([1e-3, 0.05]) * (ray - 2 * (n @ ray) * n)
+        facet, _, found = module._single_bounces(facets, beams, pose[None], 1e-9)
+        assert number in facet
+        np.testing.assert_allclose(found[facet == number][0], point, atol=1e-6)
+        tried += 1
+    assert tried > 60
+
+
 # ---------------------------------------------------------------- physics
 
 
@@ -347,20 +368,25 @@ def test_bottoms_of_crowns_in_one_plane_reflect_once_where_they_overlap(scenes):
 
 
 def test_ground_bounce_is_at_the_ground_of_the_tower(scenes):
-    # the tower stands 3 m higher; the pose is the mirror image, in that plane, of one that sees a bounce directly
+    # two antennas at one place, one on a hill: what the plain reflects for one is nothing to the other
+    rng = np.random.default_rng(9)
+    site = scenes.site(towers=((0, 0, 7.0, 3.0), (0, 0, 10.0, 0.0)), trees=random_trees(rng, 30))
+    position = aimed_positions(rng, site, np.array([0, 0, 10.0]), 80)
+    found = opaque_replay(scenes, site, position)
+    off = found.paths.select(found.paths.off_crown & (found.paths.depth == 2))
+    on_ground = off.vertices_m[off.tree < 0][:, 2]
+    np.testing.assert_allclose(on_ground, np.array([3.0, 0.0])[off.tower], atol=1e-9)
+    assert (off.tower == 1).sum() > 5
+
+
+def test_a_crown_below_the_ground_of_the_tower_takes_no_part_in_its_ground_bounces(scenes):
+    # mirrored at up = 27 m the tower is where it sees the pose over the crown at 14 m, but the hill lies in between
+    plane = 27.0
+    assert ENDS[0][2] < plane < ENDS[1][2]
     site = scenes.site(
-        towers=((*ENDS[0][:2], ENDS[0][2] - 3.0, 3.0), (0, 0, 10.0, 0.0)), trees=trees((100, 0, 0, 20, 10, 5))
-    )
-    facet_to = 2 * BOUNCE - ENDS[0] + 2 * (NORMAL @ (ENDS[0] - BOUNCE)) * NORMAL - BOUNCE
-    assert facet_to[2] > 0  # a side sends up what comes level
-    down = BOUNCE + 0.6 * facet_to
-    labels, off = bounces(scenes, site, down)
-    assert ("crown 1 side 5",) in labels
-    low = opaque_replay(scenes, site, down, max_depth=2)
-    ground = [i for i, name in enumerate(low.faces.label) if name.startswith("ground")]
-    for row in np.flatnonzero(off.depth == 2):
-        step = int(np.flatnonzero(np.isin(off.faces[row], ground))[0])
-        assert off.vertices_m[row, step, 2] == pytest.approx((3.0, 0.0)[off.tower[row]], abs=1e-9)
+        towers=((*ENDS[0][:2], plane - ENDS[0][2], plane),), trees=trees((100, 0, 0, 20, 10, 5))
+    )  # fmt: skip
+    assert [label for label in bounces(scenes, site, ENDS[1])[0] if len(label) > 1] == []
 
 
 # ---------------------------------------------------------------- beside everything else

@@ -101,7 +101,7 @@ class Crowns:
         sides = np.stack([rim, np.roll(rim, -1, axis=1), tips], axis=2).reshape(-1, 3, 3)
         first = solid * FACES_PER_CROWN
         self._families: tuple[_Facets, ...] = ()
-        self._beams: dict[tuple[bytes, float], tuple[_Beams, ...]] = {}
+        self._beams: dict[bytes, tuple[_Beams, ...]] = {}
         if len(solid):
             self._families = (
                 _Facets.of(sides, (first[:, None] + np.arange(CROWN_SIDES)).reshape(-1)),
@@ -160,12 +160,13 @@ class Crowns:
         paths = merge(found, max_depth, None)
         return self._with_facets(paths, faces, max_depth)
 
-    def beams(self, source_m: FloatArray, tolerance_m: float) -> tuple[_Beams, ...]:
+    def beams(self, source_m: FloatArray) -> tuple[_Beams, ...]:
         """Beams of each family of facets; those of the last sources are kept, for replays of few poses each."""
-        key = (source_m.tobytes(), tolerance_m)
+        key = source_m.tobytes()
         if key not in self._beams:
             if len(self._beams) >= KEPT_BEAMS:
                 self._beams.pop(next(iter(self._beams)))
+            tolerance_m = self._tolerance_m(source_m)
             self._beams[key] = tuple(_Beams.of(facets, source_m, tolerance_m) for facets in self._families)
         return self._beams[key]
 
@@ -253,7 +254,7 @@ class _Search:
         start = self._mirrored(source_m[None])[0] if self.before else source_m
         target = self._mirrored(targets_m[poses]) if self.after else targets_m[poses]
         pieces: list[PathSet] = []
-        for facets, beams in zip(self.crowns._families, self.crowns.beams(start, tolerance_m), strict=True):
+        for facets, beams in zip(self.crowns._families, self.crowns.beams(start), strict=True):
             facet, pose, point = _single_bounces(facets, beams, target, tolerance_m)
             pose, number = poses[pose], facets.number[facet]
             vertices, good = self._unfolded(source_m, point, targets_m[pose])

@@ -147,6 +147,7 @@ def replay(
     if crowns is not None:
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
+        left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
     result = _evaluate(scene, link, poses, paths, engine, loss)
     return replace(
         result,

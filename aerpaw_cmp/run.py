@@ -297,7 +297,8 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     for index in range(len(found)):
         corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
         source = site.towers[towers[found.tower[index]]].position_m
-        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections"
+        off = ", one off a crown" if found.off_crown[index] else ""
+        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections{off}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -23,6 +24,7 @@ from aerpaw_cmp.comparison import (
 from aerpaw_cmp.config import load_flight
 from aerpaw_cmp.flight import FlightData, gather, read_logs
 from aerpaw_cmp.replaying import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.run import _paths_of_pose
 
 ORIGIN = "2025-06-01T14:00:00Z"
 LW1 = (35.72750947, -78.69595819)
@@ -302,6 +304,14 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
     assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
     assert not off.replay.paths.off_crown.any()
     np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
+    # the picture of a pose has them, too, and no path that trees stop
+    pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
+    east, north, up = found.poses.position_m.T
+    track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
+    lines = [line.label for line in _paths_of_pose(data, data.site, track, pose) if line.label.startswith("LW1")]
+    here = found.replay.paths.select(found.replay.paths.pose == pose)
+    assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
+    assert len(lines) <= len(here)
     # the run without trees has lost the paths over crowns as well
     panel = compare_rss_series(data, data.rss[0], found).panel
     columns = panel.per_sample

@@ -417,6 +417,9 @@ def map_(
         Optional[list[str]],  # noqa: UP045
         typer.Option(help="none, attenuating, opaque or all; may be repeated. Default: all."),
     ] = None,
+    crown_reflections: Annotated[
+        bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns reflect, too.")
+    ] = True,
     spacing: Annotated[Optional[float], typer.Option(help="Between positions [m]. Default: 30.")] = None,  # noqa: UP045
     rss_altitude: Annotated[
         Optional[list[float]],  # noqa: UP045
@@ -460,6 +463,7 @@ def map_(
         logs_root=logs_root,
         progress=_say,
         foliage=modes,
+        crown_reflections=crown_reflections,
         spacing_m=spacing,
         rss_altitudes_m=tuple(sorted(set(rss_altitude))) if rss_altitude else None,
         rank_altitudes_m=tuple(sorted(set(rank_altitude))) if rank_altitude else None,

@@ -26,7 +26,7 @@ from .compare import rss, statistics
 from .config import RssSettings
 from .flight import FlightData, RankSeries, RssSeries
 from .replay.baselines import free_space_dbm, two_ray_dbm
-from .replaying import Clock, Replayed, direct_foliage_m, path_loss
+from .replaying import Clock, Replayed, direct_foliage_m, path_loss, reflecting_crowns
 from .report import data as report
 from .units import BoolArray, FloatArray, IntArray, wavelength_m
 
@@ -573,10 +573,25 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
         links=sum(len(r.poses) for r in replays),
         seconds=sum(r.replay.seconds for r in replays),
         paths=sum(len(r.replay.paths) for r in replays),
-        settings={"max_depth": rt.max_depth, "samples": rt.samples, "attitude": rt.attitude, "foliage": rt.foliage},
+        settings={
+            "max_depth": rt.max_depth,
+            "samples": rt.samples,
+            "attitude": rt.attitude,
+            "foliage": rt.foliage,
+            **_crown_settings(data, replays),
+        },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
         audit=_audit(data, replays, progress) if rt.audit_links else None,
     )
+
+
+def _crown_settings(data: FlightData, replays: Sequence[Replayed]) -> dict[str, object]:
+    """Whether opaque crowns reflect, and how many paths bounce off one."""
+    rt = data.settings.rt
+    if rt.foliage != "opaque":
+        return {}
+    bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
+    return {"crown_reflections": rt.crown_reflections, "paths_off_crowns": bounced}
 
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> Any:
@@ -603,6 +618,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 samples=rt.samples,
                 batch=rt.batch,
                 loss=path_loss(data, replayed.link.carrier_hz),
+                crowns=reflecting_crowns(data),
                 cache_dir=None if rt.cache else "",
                 ks=data.settings.rank.k,
             )

@@ -298,6 +298,8 @@ class RtSettings(Settings):
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
+    crown_reflections: bool = True
+    """Opaque crowns reflect besides blocking."""
     foliage_model: Literal["p833", "weissberger"] = "p833"
     gamma_db_per_m: Positive | None = None
     maximum_loss_db: Positive | None = None

@@ -1,10 +1,8 @@
 """The map job: the replay engine plugged into :mod:`aerpaw_cmp.maps.job`, foliage modes, study, record of the page.
 
-Paths depend neither on arrays nor on foliage. Each chunk of positions is searched once; one element and the arrays,
-and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only the links that foliage touches.
-
-RSS of the arrays is that of the paper's figures: all tower elements send the same signal in phase, each with its
-share of the transmit power, which gives the beam broadside to the array; it is the mean over the UAV's elements.
+Paths depend neither on arrays nor, but for bounces off opaque crowns, on foliage. Each chunk of positions is searched
+once; one element and the arrays, and every foliage mode, are evaluated on the same paths, and a mode re-evaluates only
+the links that foliage touches.
 """
 
 from __future__ import annotations
@@ -49,10 +47,11 @@ from .maps.job import (
 from .maps.study import HonestStudy, Study, honest_study, rank_fields, rank_study
 from .maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from .replay.arrays import Link, Poses, linear_array, single_element
+from .replay.crowns import Crowns
 from .replay.field import channel_matrices, rss_dbm
 from .replay.foliage import CrownIndex, foliage_loss_db, foliage_model
 from .replay.paths import PathSet
-from .replay.replay import Engine, Replay, replay
+from .replay.replay import Engine, Replay, Scene, replay
 from .report import maps_data as page
 from .site.site import Site
 from .units import AnyArray, ComplexArray, FloatArray, wavelength_m
@@ -75,6 +74,8 @@ class MapSettings:
     ----------
     foliage : tuple of str
         Modes to map, of :data:`FOLIAGE`.
+    crown_reflections : bool
+        Opaque crowns reflect besides blocking.
     spacing_m : float
         Between neighbouring positions.
     rss_altitudes_m, rank_altitudes_m : tuple of float
@@ -100,6 +101,7 @@ class MapSettings:
     """
 
     foliage: tuple[str, ...] = FOLIAGE
+    crown_reflections: bool = True
     spacing_m: float = cells.PAPER_SPACING_M
     rss_altitudes_m: tuple[float, ...] = PAPER_RSS_ALTITUDES_M
     rank_altitudes_m: tuple[float, ...] = PAPER_RANK_ALTITUDES_M
@@ -160,8 +162,10 @@ class SiteChannels:
         self.siso = self._link(single_element())
         self.mimo = self._link(line)
         self.sources_m = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
-        self.crowns = CrownIndex(site.trees)
-        self.paths = 0
+        reflect = settings.crown_reflections and "opaque" in settings.foliage and len(site.trees) > 0
+        self.mirrors = Crowns(site.trees) if reflect else None
+        self.crowns = self.mirrors.index if self.mirrors else CrownIndex(site.trees)
+        self.paths = self.paths_off_crowns = 0
         self._kept: dict[tuple[str, bytes], Evaluation] = {}
 
     def _link(self, array: Any) -> Link:
@@ -192,8 +196,20 @@ class SiteChannels:
             loss = self._loss_db(mode, found.paths, poses)
             one = self._shaded(siso, found, poses, self.siso, loss)
             many = self._shaded(mimo, found, poses, self.mimo, loss)
+            if mode == "opaque" and self.mirrors:
+                one, many = self._with_bounces(self.mirrors, poses, one, many)
             result[mode] = Evaluation(self._rss_dbm(one), self._rss_dbm(many), singular_values(many))
         return result
+
+    def _with_bounces(
+        self, mirrors: Crowns, poses: Poses, siso: ComplexArray, mimo: ComplexArray
+    ) -> tuple[ComplexArray, ComplexArray]:
+        """Channel matrices with what bounces off opaque crowns, which nothing stops on its way."""
+        scene = Scene.of(self.site, self.siso, poses)
+        scene, paths = scene.with_bounces(self.site, poses, mirrors, self.settings.max_depth)
+        self.paths_off_crowns += len(paths)
+        more = (channel_matrices(paths, scene.faces, self.sources_m, poses, x).h for x in (self.siso, self.mimo))
+        return siso + next(more), mimo + next(more)
 
     def _rss_dbm(self, h: ComplexArray) -> FloatArray:
         level = rss_dbm(beam_power(h), self.settings.transmit_power_dbm)
@@ -260,6 +276,7 @@ class MapOutcome:
     learning: dict[str, FloatArray] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
     paths: int = 0
+    paths_off_crowns: int = 0
     trajectory_m: FloatArray | None = None
     trajectory_name: str = ""
     stages_s: dict[str, float] = field(default_factory=dict)
@@ -304,7 +321,7 @@ def make_maps(site: Site, settings: MapSettings, report: Report) -> MapOutcome:
                 rank_altitudes_m=settings.rank_altitudes_m, ks=settings.ks,
                 progress=progress if mode == settings.foliage[0] else None,
             )  # fmt: skip
-    outcome.paths = channels.paths
+    outcome.paths, outcome.paths_off_crowns = channels.paths, channels.paths_off_crowns
     return outcome
 
 
@@ -539,14 +556,28 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
     return (
         f"Foliage {modes}: opaque stops whatever touches a crown or a trunk (the paper); attenuating takes "
         "ITU-R P.833 over the path's length in crowns; none leaves the trees out.",
+        *_crown_note(outcome),
         "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
         f"Spread, condition number, correlation and interpolation are those of foliage {s.shown}.",
     )
 
 
+def _crown_note(outcome: MapOutcome) -> Iterator[str]:
+    s = outcome.settings
+    if "opaque" in s.foliage and len(outcome.site.trees):
+        if s.crown_reflections:
+            yield f"Opaque crowns reflect: {outcome.paths_off_crowns:,} paths bounce off one, beside {outcome.paths:,}."
+        else:
+            yield "Opaque crowns do not reflect: crown_reflections is off."
+
+
 def _metrics(outcome: MapOutcome) -> dict[str, Any]:
     """What metrics.json holds beyond the tables of the page."""
-    result: dict[str, Any] = {"paths": outcome.paths, "settings": asdict(outcome.settings)}
+    result: dict[str, Any] = {
+        "paths": outcome.paths,
+        "paths_off_crowns": outcome.paths_off_crowns,
+        "settings": asdict(outcome.settings),
+    }
     for key in ("zero", "missing"):
         if key not in outcome.studies:
             continue

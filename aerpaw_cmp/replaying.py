@@ -11,6 +11,7 @@ import numpy as np
 
 from .flight import FlightData, RssSeries, Times, rank_positions
 from .replay.arrays import Link, Poses, rotation_from_aircraft
+from .replay.crowns import Crowns
 from .replay.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
 from .replay.paths import PathSet
 from .replay.replay import Loss, Replay, replay
@@ -183,13 +184,7 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
         rss_power_dbm=whole.rss_power_dbm[start:stop],
         h=whole.h[start:stop],
         has_path=whole.has_path[start:stop],
-        paths=PathSet(
-            paths.pose[chosen] - start,
-            paths.tower[chosen],
-            paths.depth[chosen],
-            paths.faces[chosen],
-            paths.vertices_m[chosen],
-        ),
+        paths=dataclasses.replace(paths.select(chosen), pose=paths.pose[chosen] - start),
         seconds=whole.seconds * share,
         search_seconds=whole.search_seconds * share,
     )
@@ -243,11 +238,19 @@ def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> R
         samples=rt.samples,
         batch=rt.batch,
         loss=path_loss(data, link.carrier_hz),
+        crowns=reflecting_crowns(data),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         # the image engine is done before a bar could be seen
         progress=(lambda share: progress(f"{name} {100 * share:.0f} %")) if rt.engine == "sionna" else None,
     )
+
+
+def reflecting_crowns(data: FlightData) -> Crowns | None:
+    """Crowns that reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
+    rt = data.settings.rt
+    wanted = rt.foliage == "opaque" and rt.crown_reflections and len(data.site.trees) > 0
+    return Crowns(data.site.trees) if wanted else None
 
 
 def path_loss(
@@ -268,8 +271,8 @@ def path_loss(
 
 def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
     rt = data.settings.rt
-    if foliage == "none" or len(data.site.trees) == 0:
-        return None
+    if len(data.site.trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
+        return None  # where opaque crowns reflect, a run without trees has to lose those paths
     name = rt.foliage_model if foliage == "attenuating" else foliage
     own = leaves == rt.leaves  # numbers of the flight file belong to its own season
     model = foliage_model(
@@ -282,7 +285,8 @@ def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str
     index = CrownIndex(data.site.trees)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        return foliage_loss_db(sources_m[paths.tower], paths.vertices_m, targets_m[paths.pose], index, model)
+        source, target = sources_m[paths.tower], targets_m[paths.pose]
+        return foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
 
     return loss
 

@@ -280,23 +280,33 @@ def run_site_show(
 
 def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     """Propagation paths of all towers to one point of the track, as polylines."""
+    import dataclasses
+
     import numpy as np
 
     from .replay.arrays import Poses
     from .replay.replay import replay
+    from .replaying import path_loss, reflecting_crowns
     from .report.site_view import PathLine
 
     if track is None or not 0 <= pose < len(track.time):
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
     link = data.settings.link.rss.build(list(site.towers), data.folder)
-    found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=data.settings.rt.max_depth).paths
+    data = dataclasses.replace(data, site=site)
+    crowns, depth = reflecting_crowns(data), data.settings.rt.max_depth
+    found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
+    loss = path_loss(data, link.carrier_hz)
+    if data.settings.rt.foliage == "opaque" and loss is not None:
+        sources = np.array([site.towers[name].position_m for name in towers])
+        found = found.select(np.isfinite(loss(found, sources, point)))
     lines = []
     for index in range(len(found)):
         corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
         source = site.towers[towers[found.tower[index]]].position_m
-        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections"
+        off = ", one off a crown" if found.off_crown[index] else ""
+        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections{off}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
 

@@ -9,6 +9,7 @@ import argparse
 import json
 import os
 import platform
+import resource
 import tempfile
 import time
 from collections.abc import Callable
@@ -18,10 +19,13 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.replay.arrays import Link, Poses, single_element
+from aerpaw_cmp.replay.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.replay.foliage import CrownIndex, foliage_depth_m
+from aerpaw_cmp.replay.replay import Scene
 from aerpaw_cmp.site.footprints import import_site, write_site_yaml
 from aerpaw_cmp.site.meshes import site_meshes
-from aerpaw_cmp.site.site import Trees
+from aerpaw_cmp.site.site import Site, Trees
 from aerpaw_cmp.site.siteyaml import load_site, site_model
 
 
@@ -72,6 +76,26 @@ def monte_carlo_m(start: np.ndarray, end: np.ndarray, trees: Trees, samples: int
     return inside / samples * float(np.linalg.norm(end - start))
 
 
+def bounces_of(site: Site, position: np.ndarray) -> dict[str, Any]:
+    """Time of all bounces off opaque crowns at depth 2, of one tower and of all."""
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    build_s, crowns = timed(lambda: Crowns(site.trees))
+    found: dict[str, Any] = {"crown_facets": len(site.trees) * FACES_PER_CROWN, "crown_build_s": build_s}
+    level = position * [1, 1, 0] + [0, 0, 40.0]
+    for name, towers, place in (
+        ("one_tower", list(site.towers)[:1], position),
+        ("one_tower_at_40_m", list(site.towers)[:1], level),
+        ("all_towers", list(site.towers), position),
+    ):
+        link = Link(3.4e9, dict.fromkeys(towers, single_element()), single_element())
+        poses = Poses(place, np.broadcast_to(np.eye(3), (len(place), 3, 3)))
+        scene = Scene.of(site, link, poses)
+        seconds, (_, paths) = timed(lambda s=scene, p=poses: s.with_bounces(site, p, crowns, 2))
+        found |= {f"crown_bounces_{name}_s": seconds, f"crown_bounces_{name}": len(paths)}
+    more = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024
+    return found | {"crown_bounces_limit_s": 20.0, "crown_bounces_more_mib": more, "crown_bounces_mib_limit": 500.0}
+
+
 def main(arguments: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a tenth of the size")
@@ -97,6 +121,7 @@ def main(arguments: list[str] | None = None) -> None:
     index_s, index = timed(lambda: CrownIndex(site.trees))
     direct_s, depth = timed(lambda: foliage_depth_m(start, np.zeros((len(start), 0, 3)), end, index))
     bounce_s, _ = timed(lambda: foliage_depth_m(start, bounce, end, index))
+    crowns = bounces_of(site, position)
     some = random.choice(np.flatnonzero(depth > 5), 20)
     errors = [abs(monte_carlo_m(start[i], end[i], site.trees, 400_000) - depth[i]) / depth[i] for i in some]
 
@@ -121,6 +146,7 @@ def main(arguments: list[str] | None = None) -> None:
         "chords_limit_s": 5.0,
         "monte_carlo_worst_relative": float(max(errors)),
         "monte_carlo_limit": 1e-3,
+        **crowns,
     }
     if options.json:
         print(json.dumps(result))

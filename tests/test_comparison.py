@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.comparison import (
     Compared,
+    audit_replays,
     compare_rank_series,
     compare_rss_series,
     metrics_beyond_panels,
@@ -22,6 +24,7 @@ from aerpaw_cmp.comparison import (
 from aerpaw_cmp.config import load_flight
 from aerpaw_cmp.flight import FlightData, gather, read_logs
 from aerpaw_cmp.replaying import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.run import _paths_of_pose
 
 ORIGIN = "2025-06-01T14:00:00Z"
 LW1 = (35.72750947, -78.69595819)
@@ -275,6 +278,55 @@ def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
     for by_k in changes.values():
         for one in by_k.values():
             assert one["share_changed"] == pytest.approx((one["n_lower"] + one["n_higher"]) / len(at))
+
+
+def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) -> None:
+    at = np.arange(0, 120, 0.5)
+
+    def replayed(rt: str) -> tuple[Any, Any]:
+        folder = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
+        folder.mkdir()
+        path = flight(folder, 120, rss={"USRP1": (at, free_space_db(at))}, rt=rt)
+        data = gathered(path)
+        trees = data.site.trees  # a wood beside the track, which runs east of LW1 at 40 m
+        rng = np.random.default_rng(3)
+        wood = dataclasses.replace(
+            trees, east_m=rng.uniform(20, 480, len(trees)), north_m=rng.uniform(-250, 250, len(trees)),
+        )  # fmt: skip
+        data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
+        return data, replay_rss(data, str)[0]
+
+    bare_data, bare = replayed("")
+    data, found = replayed(", foliage: opaque, paired_foliage: true")
+    off_data, off = replayed(", foliage: opaque, crown_reflections: false")
+    bounced = int(found.replay.paths.off_crown.sum())
+    assert bounced > 20
+    assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
+    assert not off.replay.paths.off_crown.any()
+    np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
+    # the picture of a pose has them, too, and no path that trees stop
+    pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
+    east, north, up = found.poses.position_m.T
+    track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
+    lines = [line.label for line in _paths_of_pose(data, data.site, track, pose) if line.label.startswith("LW1")]
+    here = found.replay.paths.select(found.replay.paths.pose == pose)
+    assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
+    assert len(lines) <= len(here)
+    # the run without trees has lost the paths over crowns as well
+    panel = compare_rss_series(data, data.rss[0], found).panel
+    columns = panel.per_sample
+    bare_dbm = bare.spread(bare.replay.rss_dbm[:, 0])
+    np.testing.assert_allclose(columns["simulated_without_trees_dbm"], bare_dbm, atol=1e-9)
+    np.testing.assert_allclose(columns["simulated_trees_in_leaf_dbm"], panel.simulated_dbm, atol=1e-9)
+    for some, one, expected in (
+        (data, found, {"crown_reflections": True, "paths_off_crowns": bounced}),
+        (off_data, off, {"crown_reflections": False, "paths_off_crowns": 0}),
+        (bare_data, bare, {}),
+    ):
+        rt = some.settings.rt.model_copy(update={"audit_links": 0})
+        quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
+        settings = audit_replays(quiet, [one], str).settings
+        assert {k: v for k, v in settings.items() if "crown" in k} == expected
 
 
 DIPOLES = """

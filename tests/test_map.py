@@ -18,6 +18,7 @@ from aerpaw_cmp.geodesy import SiteFrame
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.replay.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.replay.crowns import Crowns
 from aerpaw_cmp.replay.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.replay.replay import replay
 from aerpaw_cmp.site.dem import Dem
@@ -85,6 +86,34 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
     assert 0.1 < shaded.mean() < 0.6
     assert np.array_equal(np.isnan(found["attenuating"].rss_siso_dbm), np.isnan(found["none"].rss_siso_dbm))
     assert (found["attenuating"].singular_values[shaded] > 0).any()
+
+
+def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
+    crowns = Crowns(site.trees)
+    position = Grid.over_area(site.area_m, 25.0).positions_m(60.0)
+    poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
+
+    def loss(paths, source, target):
+        ends = source[paths.tower], paths.vertices_m, target[paths.pose]
+        return foliage_loss_db(*ends, crowns.index, Opaque(), paths.tree)
+
+    line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
+    found = {}
+    for on in (True, False):
+        channels = mapping.SiteChannels(site, settings(crown_reflections=on))
+        found[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
+        link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
+        one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
+        many, siso = (replay(site, w, poses, loss=loss, crowns=crowns if on else None) for w in (link, one))
+        np.testing.assert_allclose(found[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
+        rank = rank_of_singular_values(found[on]["opaque"].singular_values, [100.0])[..., 0]
+        np.testing.assert_array_equal(rank, channel_rank(many.h, 100.0))
+        assert channels.paths_off_crowns == siso.paths.off_crown.sum()
+        assert (channels.paths_off_crowns > 20) == on
+    for mode in ("none", "attenuating"):  # bit by bit
+        np.testing.assert_array_equal(found[True][mode].rss_siso_dbm, found[False][mode].rss_siso_dbm)
+        np.testing.assert_array_equal(found[True][mode].singular_values, found[False][mode].singular_values)
+    assert (found[True]["opaque"].rss_siso_dbm != found[False]["opaque"].rss_siso_dbm).any()
 
 
 def test_paths_of_infinite_loss_are_no_paths(site):

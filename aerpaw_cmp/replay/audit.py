@@ -11,8 +11,9 @@ import numpy as np
 from ..site.site import Site
 from ..units import FloatArray, IntArray
 from .arrays import Link, Poses
+from .crowns import Crowns
 from .image import planes_of
-from .paths import PathSet
+from .paths import PathSet, joined
 from .replay import Engine, Loss, Replay
 from .replay import replay as run_replay
 
@@ -119,6 +120,7 @@ def audit(
     samples: int = 1_000_000,
     batch: int = 50,
     loss: Loss | None = None,
+    crowns: Crowns | None = None,
     cache_dir: str | Path | None = None,
     ks: Sequence[float] = RANK_K,
 ) -> Audit:
@@ -134,7 +136,7 @@ def audit(
         Default: the engine that the replay did not take.
     links : int or None
         About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
-    max_depth, samples, batch, loss, cache_dir
+    max_depth, samples, batch, loss, crowns, cache_dir
         As given to the replay.
     ks : sequence of float
         Singular-value ratios of the rank comparison.
@@ -147,7 +149,16 @@ def audit(
     other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     checked = run_replay(
-        site, link, few, other, max_depth=max_depth, samples=samples, batch=batch, loss=loss, cache_dir=cache_dir
+        site,
+        link,
+        few,
+        other,
+        max_depth=max_depth,
+        samples=samples,
+        batch=batch,
+        loss=loss,
+        crowns=crowns,
+        cache_dir=cache_dir,
     )
     return Audit(
         engine=replay.engine,
@@ -169,8 +180,10 @@ def _spread(poses: Poses, count: int | None) -> IntArray:
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:
     """Differences of a replay from a reference that has only the poses ``chosen``."""
-    ours = _keys(replay, chosen)
-    theirs = _keys(reference, np.arange(len(chosen)))
+    # numbered together: the facets of crowns that a replay lists depend on its poses
+    plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
+    ours = _keys(replay, plane[0], chosen)
+    theirs = _keys(reference, plane[1], np.arange(len(chosen)))
     level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
     both = np.isfinite(level) & np.isfinite(level_reference)
     error = np.abs(level[both] - level_reference[both])
@@ -191,12 +204,12 @@ def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dic
     return {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference, k))) for k in ks}  # type: ignore[arg-type]
 
 
-def _keys(replay: Replay, chosen: IntArray) -> set[tuple[int, ...]]:
+def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> set[tuple[int, ...]]:
     """Paths as (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
     place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
     paths: PathSet = replay.paths.select(place[replay.paths.pose] >= 0)
-    plane = np.append(planes_of(replay.faces), -1)
+    plane = np.append(planes, -1)
     rows = np.column_stack([place[paths.pose], paths.tower, plane[paths.faces]])
     # without the padding: the two may have different depths
     return {tuple(n for n in row if n >= 0) for row in rows.tolist()}

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..errors import UsageError
-from ..site.materials import material
+from ..site.materials import face_material
 from ..units import AnyArray, ComplexArray, FloatArray, IntArray, db_from_power, wavelength_m
 from .arrays import Array, Link, Poses
 from .paths import Faces, PathSet
@@ -303,7 +303,7 @@ class _Materials:
 
     @classmethod
     def of(cls, faces: Faces, carrier_hz: float) -> _Materials:
-        known = {name: material(name) for name in set(faces.material)}
+        known = {name: face_material(name) for name in set(faces.material)}
         eta = [known[name].relative_permittivity(carrier_hz) for name in faces.material]
         thick = [known[name].thickness_m for name in faces.material]
         return cls(

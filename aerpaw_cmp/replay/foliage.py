@@ -1,4 +1,4 @@
-"""Loss in trees along traced paths, in closed form.
+"""Loss in trees along traced paths, in closed form; crowns that reflect are in :mod:`aerpaw_cmp.replay.crowns`.
 
 Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is cut with every
 crown near it; the chords add up to the path's depth in foliage, and a model turns depth into loss. Nothing is traced
@@ -183,7 +183,12 @@ def foliage_model(
 
 
 def foliage_loss_db(
-    source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, trees: Trees | CrownIndex, model: FoliageModel
+    source_m: FloatArray,
+    vertices_m: FloatArray,
+    target_m: FloatArray,
+    trees: Trees | CrownIndex,
+    model: FoliageModel,
+    bounced: IntArray | None = None,
 ) -> FloatArray:
     """Loss of each path in foliage [dB].
 
@@ -197,34 +202,51 @@ def foliage_loss_db(
         Keep an index when many batches of paths meet the same trees.
     model : FoliageModel
         Depth to loss.
+    bounced : (paths, depth) int, optional
+        Tree whose crown reflects at each vertex, -1 for none (:attr:`aerpaw_cmp.replay.paths.PathSet.tree`); at most
+        one per path. Only for :class:`Opaque` do crowns reflect: to any other model such a path does not exist.
 
     Returns
     -------
     ndarray, (paths,)
         The model's loss of the path's total depth; NaN where an end is not finite.
     """
+    opaque = isinstance(model, Opaque)
     if isinstance(model, NoFoliage):
-        return np.zeros(len(source_m))
-    index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
-    depth = foliage_depth_m(source_m, vertices_m, target_m, index)
-    if isinstance(model, Opaque):
-        depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
-    return model.loss_db(depth)
+        loss = np.zeros(len(source_m))
+    else:
+        index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+        depth = foliage_depth_m(source_m, vertices_m, target_m, index, bounced if opaque else None)
+        if opaque:
+            depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
+        loss = model.loss_db(depth)
+    if bounced is not None and not opaque:
+        loss[(bounced >= 0).any(axis=1)] = np.inf
+    return loss
 
 
 def foliage_depth_m(
-    source_m: FloatArray, vertices_m: FloatArray, target_m: FloatArray, trees: Trees | CrownIndex
+    source_m: FloatArray,
+    vertices_m: FloatArray,
+    target_m: FloatArray,
+    trees: Trees | CrownIndex,
+    bounced: IntArray | None = None,
 ) -> FloatArray:
-    """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`."""
+    """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`.
+
+    The crown off which a path bounces does not count on the two segments that meet there: a bounce is on its outside.
+    """
     source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
-    vertices = np.asarray(vertices_m, dtype=np.float64).reshape(len(source), -1, 3)
+    vertices = np.asarray(vertices_m, dtype=np.float64)
     index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
     depth = np.zeros(len(source))
     end = target
-    for k in range(vertices.shape[1] - 1, -2, -1):  # from the target back; an unused vertex is the next one
+    last = vertices.shape[1] - 1
+    for k in range(last, -2, -1):  # from the target back; an unused vertex is the next one
         start = source if k < 0 else np.where(np.isnan(vertices[:, k]), end, vertices[:, k])
         moved = (start != end).any(axis=1)
-        depth[moved] += index.chords_m(start[moved], end[moved])
+        own = None if bounced is None else bounced[moved][:, max(k, 0) : min(k, last - 1) + 2].max(axis=1, initial=-1)
+        depth[moved] += index.chords_m(start[moved], end[moved], own)
         end = start
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
@@ -244,20 +266,24 @@ class CrownIndex:
     def __init__(self, trees: Trees, shape: Shape = "cone") -> None:
         self.trees = trees
         self.shape: Shape = shape
+        self._trunks: CrownIndex | None = None
         base = trees.ground_m + trees.crown_base_m
         top = trees.ground_m + trees.height_m
         self._set(base, top, trees.crown_diameter_m / 2)
 
     def trunks(self) -> CrownIndex:
         """The trunks of the same trees, as cylinders from the ground to the crown."""
-        other = CrownIndex.__new__(CrownIndex)
-        other.trees, other.shape = self.trees, "cylinder"
-        ground = self.trees.ground_m
-        other._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
-        return other
+        if self._trunks is None:
+            other = CrownIndex.__new__(CrownIndex)
+            other.trees, other.shape, other._trunks = self.trees, "cylinder", None
+            ground = self.trees.ground_m
+            other._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
+            self._trunks = other
+        return self._trunks
 
     def _set(self, base_m: FloatArray, top_m: FloatArray, radius_m: FloatArray) -> None:
         solid = (radius_m > 0) & (top_m > base_m)
+        self._tree = np.flatnonzero(solid)
         #: columns: east, north, base, top, radius
         self._bodies = np.stack(
             [self.trees.east_m[solid], self.trees.north_m[solid], base_m[solid], top_m[solid], radius_m[solid]], axis=-1
@@ -297,8 +323,8 @@ class CrownIndex:
         self._row = np.zeros(int(self._shape2.prod()) + 1, dtype=np.int64)
         np.cumsum(np.bincount(cells, minlength=len(self._row) - 1), out=self._row[1:])
 
-    def chords_m(self, start_m: FloatArray, end_m: FloatArray) -> FloatArray:
-        """Length inside bodies of each segment (n,) [m]; ends (n, 3)."""
+    def chords_m(self, start_m: FloatArray, end_m: FloatArray, without: IntArray | None = None) -> FloatArray:
+        """Length inside bodies of each segment (n,) [m]; ends (n, 3); ``without`` (n,) a tree that does not count."""
         total = np.zeros(len(start_m))
         if not len(self._bodies) or not len(start_m):
             return total
@@ -313,7 +339,8 @@ class CrownIndex:
             used = done[begin - 1] if begin else 0
             stop = max(begin + 1, int(np.searchsorted(done, used + at_once, side="right")))
             some = live[begin:stop]
-            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop])
+            own = None if without is None else without[some]
+            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop], own)
             begin = stop
         return total
 
@@ -323,7 +350,13 @@ class CrownIndex:
         return _slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
 
     def _sum(
-        self, start: FloatArray, end: FloatArray, first: FloatArray, last: FloatArray, pieces: IntArray
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        first: FloatArray,
+        last: FloatArray,
+        pieces: IntArray,
+        without: IntArray | None,
     ) -> FloatArray:
         """Chords of a batch, looked up piece by piece; each body counts in the piece nearest to it."""
         move = end - start
@@ -345,6 +378,8 @@ class CrownIndex:
         east -= nearest * step_east
         north -= nearest * step_north
         close = east * east + north * north < self._bodies[body, 4] ** 2
+        if without is not None:
+            close &= self._tree[body] != without[owner]
         hit = np.flatnonzero(close & (np.minimum(turn, pieces[owner] - 1) == number[piece]))
         owner, body = owner[hit], body[hit]
         share = _chord_share(start[owner], move[owner], self._bodies[body], self.shape)

@@ -472,6 +472,7 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
     depth = np.concatenate([p.depth for p in pieces])
     sequence = np.concatenate([p.faces for p in pieces])
     vertices = np.concatenate([p.vertices_m for p in pieces])
+    tree = np.concatenate([p.tree for p in pieces])
     order = np.lexsort((*sequence.T[::-1], depth, tower, pose))
     if faces is not None and len(order):
         plane = planes_of(faces)
@@ -483,7 +484,7 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
             repeated[:] = True
             repeated[first] = False
         order = order[~repeated]
-    return PathSet(pose[order], tower[order], depth[order], sequence[order], vertices[order])
+    return PathSet(pose[order], tower[order], depth[order], sequence[order], vertices[order], tree[order])
 
 
 def planes_of(faces: Faces) -> IntArray:

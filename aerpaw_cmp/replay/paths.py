@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from shapely.geometry import Polygon
 
-from ..units import AnyArray, FloatArray, IntArray
+from ..units import AnyArray, BoolArray, FloatArray, IntArray
 
 
 @dataclass(frozen=True, slots=True)
@@ -28,7 +28,7 @@ class Faces:
     offset_m : (faces,)
         ``normal . x = offset_m`` on the face.
     material : tuple of str, length faces
-        Names in ``site.materials``.
+        Names that ``site.materials.face_material`` knows.
     label : tuple of str, length faces
         For reports, e.g. ``"ground"``, ``"barn wall 3"``.
     along, across : (faces, 3)
@@ -38,7 +38,8 @@ class Faces:
     polygon : tuple of Polygon or None, length faces
         The face in its plane, where it does not fill its bounds.
     solid : (faces,) int
-        Index of the building, -1 for the ground, which never hides anything.
+        Index of the building, -1 for the ground, which never hides anything. Faces of crowns, which only the paths
+        of :mod:`aerpaw_cmp.replay.crowns` bring along, count on from the last building by tree.
     """
 
     normal: FloatArray
@@ -71,6 +72,17 @@ class Faces:
         return len(self.normal)
 
 
+def joined(one: Faces, two: Faces) -> Faces:
+    """The faces of both, the first keeping their numbers."""
+    columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+    return Faces(
+        material=one.material + two.material,
+        label=one.label + two.label,
+        polygon=one.polygon + two.polygon,
+        **{name: np.concatenate([getattr(one, name), getattr(two, name)]) for name in columns},
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class PathSet:
     """All paths of a replay, sorted by pose, tower, depth, faces.
@@ -85,6 +97,8 @@ class PathSet:
         Face indices from tower to UAV, -1 where unused.
     vertices_m : (paths, max_depth, 3)
         Reflection points for array centres, NaN where unused.
+    tree : (paths, max_depth) int
+        Tree whose crown reflects, -1 where something else does; left out, no crown does.
     """
 
     pose: IntArray
@@ -92,13 +106,24 @@ class PathSet:
     depth: IntArray
     faces: IntArray
     vertices_m: FloatArray
+    tree: IntArray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if self.tree.shape != self.faces.shape:
+            object.__setattr__(self, "tree", np.full(self.faces.shape, -1, dtype=np.int64))
 
     def __len__(self) -> int:
         return len(self.pose)
 
+    @property
+    def off_crown(self) -> BoolArray:
+        """Paths (paths,) that bounce off a crown."""
+        return np.asarray((self.tree >= 0).any(axis=1))
+
     def select(self, rows: AnyArray) -> PathSet:
         """The paths of a mask or of indices."""
-        return PathSet(self.pose[rows], self.tower[rows], self.depth[rows], self.faces[rows], self.vertices_m[rows])
+        pose, tower, depth, tree = self.pose[rows], self.tower[rows], self.depth[rows], self.tree[rows]
+        return PathSet(pose, tower, depth, self.faces[rows], self.vertices_m[rows], tree)
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:

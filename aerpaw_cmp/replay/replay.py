@@ -17,6 +17,7 @@ from ..units import BoolArray, ComplexArray, FloatArray
 from . import image
 from .arrays import Link, Poses
 from .cache import PathCache
+from .crowns import Crowns
 from .faces import inside_solids, site_faces, smaller_than_fresnel_zone
 from .field import channel_matrices, mean_pair_power, rss_dbm
 from .paths import Faces, PathSet
@@ -79,6 +80,7 @@ def replay(
     samples: int = 1_000_000,
     batch: int = 50,
     loss: Loss | None = None,
+    crowns: Crowns | None = None,
     cache_dir: str | Path | None = None,
     relevance_db: float | None = None,
     drop_small_faces: bool = False,
@@ -101,6 +103,9 @@ def replay(
         ``sionna`` only: rays per tower, poses per call.
     loss : callable, optional
         Further loss per path [dB], such as foliage.
+    crowns : Crowns, optional
+        Crowns that reflect: their paths are added to those of the engine, whichever it is. What crowns stop is the
+        business of ``loss``.
     cache_dir : path, optional
         Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
@@ -139,6 +144,10 @@ def replay(
         paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
+    if crowns is not None:
+        scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
+        paths = image.merge([paths, bounces], max_depth, None)
+        left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
     result = _evaluate(scene, link, poses, paths, engine, loss)
     return replace(
         result,
@@ -201,6 +210,20 @@ class Scene:
         buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
         excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
         return cls(faces, sources, usable, excluded)
+
+    def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
+        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths."""
+        paths, faces = crowns.bounces(
+            self.faces,
+            self.sources_m,
+            poses.position_m,
+            max_depth=max_depth,
+            usable=self.usable,
+            excluded=self.excluded,
+            dem=site.dem,
+        )
+        more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
+        return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
 
 
 def _buried_towers(site: Site, link: Link) -> list[str]:

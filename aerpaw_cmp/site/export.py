@@ -9,18 +9,23 @@ from xml.sax.saxutils import quoteattr
 import numpy as np
 
 from ..errors import UsageError
-from ..units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
-from .materials import material
-from .meshes import CROWN, Mesh, site_meshes
+from .materials import (
+    CROWN,
+    CROWN_ATTENUATION_DB_PER_M,
+    CROWN_PERMITTIVITY,
+    lossy_conductivity_s_per_m,
+    material,
+)
+from .meshes import Mesh, site_meshes
 from .site import Site
 
 HALF_SPACE_THICKNESS_M = 1.0
 """Thickness given to ground in the export: a slab from which no echo of its second face returns."""
 
-CROWN_PERMITTIVITY = 1.1
 
-
-def export_scene(site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = 0.5) -> list[Path]:
+def export_scene(
+    site: Site, folder: str | Path, *, trees: bool = True, gamma_db_per_m: float = CROWN_ATTENUATION_DB_PER_M
+) -> list[Path]:
     """The site as ``scene.xml`` with ``meshes/*.ply``, which ``sionna.rt.load_scene`` opens.
 
     Parameters
@@ -75,7 +80,7 @@ def _bsdf_id(name: str) -> str:
 
 def _bsdf(name: str, gamma_db_per_m: float) -> str:
     if name == CROWN:
-        sigma = _conductivity(gamma_db_per_m)
+        sigma = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, gamma_db_per_m)
         values = {"relative_permittivity": CROWN_PERMITTIVITY, "conductivity": sigma, "thickness": 2.5}
         return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
     thickness = material(name).thickness_m
@@ -86,12 +91,6 @@ def _bsdf(name: str, gamma_db_per_m: float) -> str:
 
 def _floats(values: Mapping[str, float]) -> str:
     return "".join(f'<float name="{name}" value="{value:.6g}"/>' for name, value in values.items())
-
-
-def _conductivity(gamma_db_per_m: float) -> float:
-    """Conductivity [S/m] that attenuates by ``gamma``: 2 n a eps0 c for weak loss, whatever the frequency."""
-    neper_per_m = gamma_db_per_m / (20 / np.log(10))
-    return float(2 * np.sqrt(CROWN_PERMITTIVITY) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS)
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:

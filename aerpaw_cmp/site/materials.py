@@ -12,7 +12,7 @@ import math
 from dataclasses import dataclass
 
 from ..errors import UsageError
-from ..units import VACUUM_PERMITTIVITY_F_PER_M
+from ..units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
 
 Band = tuple[float, float, float, float, float, float]
 """Lowest and highest frequency [GHz], a, b, c, d."""
@@ -132,6 +132,40 @@ class Material:
 
 MATERIALS: tuple[str, ...] = tuple(_TABLE)
 """Names that :func:`material` knows."""
+
+CROWN = "vegetation"
+"""Name of the crowns' material; not of ITU-R P.2040, and nothing else is made of it."""
+
+CROWN_PERMITTIVITY = 1.1
+CROWN_ATTENUATION_DB_PER_M = 0.5
+"""Leaves and air, averaged. P.833 gives losses only; the permittivity decides the reflection, the loss hardly does."""
+
+
+def lossy_conductivity_s_per_m(permittivity: float, gamma_db_per_m: float) -> float:
+    """Conductivity that attenuates by ``gamma``: ``2 n a eps0 c`` for weak loss, whatever the frequency."""
+    neper_per_m = gamma_db_per_m / (20 / math.log(10))
+    return 2 * math.sqrt(permittivity) * neper_per_m * VACUUM_PERMITTIVITY_F_PER_M * SPEED_OF_LIGHT_MPS
+
+
+VEGETATION = Material(
+    CROWN,
+    (
+        (
+            0.03,
+            100.0,
+            CROWN_PERMITTIVITY,
+            0.0,
+            lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, CROWN_ATTENUATION_DB_PER_M),
+            0.0,
+        ),
+    ),
+)
+"""Crowns as a half-space, 30 MHz to 100 GHz (the scope of P.833)."""
+
+
+def face_material(name: str) -> Material:
+    """Material of a reflecting face: :data:`VEGETATION` for crowns, else :func:`material`."""
+    return VEGETATION if name == CROWN else material(name)
 
 
 def material(name: str) -> Material:

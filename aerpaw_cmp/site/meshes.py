@@ -15,17 +15,14 @@ import shapely
 from shapely.geometry import Polygon
 
 from ..units import FloatArray, IntArray
-from .materials import material
-from .site import Building, Site
+from .materials import CROWN, material
+from .site import Building, Site, Trees
 
 WALL_DEPTH_M = 0.5
 """Walls reach this far below the base of a building."""
 
 GROUND_MARGIN_M = 3000.0
 """The ground reaches this far beyond the area: reflections must not fall off its edge."""
-
-CROWN = "vegetation"
-"""Name of the crowns' material; not of ITU-R P.2040."""
 
 CROWN_SIDES = 8
 TRUNK_SIDES = 6
@@ -110,6 +107,19 @@ def _bodies(
     return vertices.reshape(-1, 3), triangles.reshape(-1, 3).astype(np.int64)
 
 
+def _crowns(trees: Trees) -> tuple[FloatArray, IntArray]:
+    """Crowns as pyramids with a bottom, inside the round cones."""
+    centre = np.column_stack([trees.east_m, trees.north_m])
+    base, top = trees.ground_m + trees.crown_base_m, trees.ground_m + trees.height_m
+    return _bodies(centre, base, top, trees.crown_diameter_m / 2, CROWN_SIDES, pointed=True)
+
+
+def crown_corners_m(trees: Trees) -> tuple[FloatArray, FloatArray]:
+    """Corners of the crowns of :func:`site_meshes`: rim (trees, CROWN_SIDES, 3), counter-clockwise from above; tip."""
+    corners = _crowns(trees)[0].reshape(len(trees), CROWN_SIDES + 2, 3)
+    return corners[:, :CROWN_SIDES], corners[:, CROWN_SIDES]
+
+
 def ground_mesh(site: Site, margin_m: float = GROUND_MARGIN_M) -> tuple[FloatArray, IntArray]:
     """The flat ground, up = 0: two triangles that face upwards."""
     west, east, south, north = site.area_m
@@ -142,14 +152,13 @@ def site_meshes(site: Site, *, trees: bool = True) -> Mapping[str, Mesh]:
     if trees and len(site.trees):
         t = site.trees
         centre = np.column_stack([t.east_m, t.north_m])
-        base, top = t.ground_m + t.crown_base_m, t.ground_m + t.height_m
+        base = t.ground_m + t.crown_base_m
         trunk = t.crown_base_m > 0
         if trunk.any():
             foot = t.ground_m[trunk] - WALL_DEPTH_M
             body = _bodies(centre[trunk], foot, base[trunk], t.trunk_diameter_m[trunk] / 2, TRUNK_SIDES, pointed=False)
             pieces.setdefault("wood", []).append(("trunks", *body))
-        crowns = _bodies(centre, base, top, t.crown_diameter_m / 2, CROWN_SIDES, pointed=True)
-        pieces[CROWN] = [("crowns", *crowns)]
+        pieces[CROWN] = [("crowns", *_crowns(t))]
     return {name: _joined(parts) for name, parts in pieces.items()}
 
 

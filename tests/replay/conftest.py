@@ -126,6 +126,7 @@ class Helpers:
     link = staticmethod(make_link)
     keys = staticmethod(path_keys)
     brute_force = staticmethod(brute_force)
+    covered = staticmethod(_covered)
     carrier_hz = CARRIER_HZ
 
 

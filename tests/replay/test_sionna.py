@@ -9,9 +9,10 @@ from shapely.geometry import box
 from aerpaw_cmp.errors import CheckError, UsageError
 from aerpaw_cmp.replay import audit, replay
 from aerpaw_cmp.replay.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.replay.crowns import Crowns
 from aerpaw_cmp.replay.field import mean_pair_power, rss_dbm
 from aerpaw_cmp.replay.replay import Scene
-from aerpaw_cmp.site.site import Building
+from aerpaw_cmp.site.site import Building, Trees
 from aerpaw_cmp.units import wavelength_m
 
 pytestmark = pytest.mark.sionna
@@ -75,6 +76,19 @@ def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
     assert report.reference == "image"
     assert report.missing_paths > 0
     assert report.extra_paths == 0
+
+
+def test_paths_over_crowns_join_those_that_sionna_finds(sionna, scenes, lone):
+    site, poses = lone
+    rng = np.random.default_rng(6)
+    near = rng.uniform(-100, 100, (2, 60))
+    like = np.ones(60)
+    stand = Trees(*near, 0 * like, 18 * like, 9 * like, 5 * like, 0.4 * like)
+    link, crowns = scenes.link(site), Crowns(stand)
+    exact = replay(site, link, poses, crowns=crowns)
+    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="", crowns=crowns)
+    assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
+    assert exact.paths.off_crown.sum() == traced.paths.off_crown.sum() > 3
 
 
 def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatch):

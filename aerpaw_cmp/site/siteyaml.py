@@ -6,11 +6,12 @@ docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``poly
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import shapely
@@ -19,7 +20,8 @@ from shapely.geometry import Point, Polygon
 
 from ..errors import UsageError
 from ..geodesy import SiteFrame
-from ..yamlfile import StrictModel, load_yaml, nearest
+from ..units import FloatArray
+from ..yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
 from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
@@ -170,6 +172,9 @@ class ForestModel(PolygonModel):
     source: str = ""
 
 
+OutlineT = TypeVar("OutlineT", bound=PolygonModel)
+
+
 class DistributionModel(StrictModel):
     """A size drawn from a normal distribution between limits."""
 
@@ -182,6 +187,22 @@ class DistributionModel(StrictModel):
 Size = Positive | DistributionModel
 
 
+class SingleTreeModel(StrictModel):
+    """A tree with sizes of its own; what is absent is drawn like that of all trees."""
+
+    at_m: tuple[float, float] | None = None
+    at_deg: tuple[float, float] | None = None
+    height_m: Positive | None = None
+    crown_diameter_m: Positive | None = None
+    trunk_diameter_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> SingleTreeModel:
+        if (self.at_m is None) == (self.at_deg is None):
+            raise ValueError("give at_m (east, north) or at_deg (latitude, longitude)")
+        return self
+
+
 class TreesModel(StrictModel):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
@@ -192,6 +213,7 @@ class TreesModel(StrictModel):
     crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
     points_m: list[tuple[float, float]] = Field(default_factory=list)
     points_deg: list[tuple[float, float]] = Field(default_factory=list)
+    single: list[SingleTreeModel] = Field(default_factory=list)
 
     def sizes(self) -> TreeSizes:
         """For the placement."""
@@ -258,7 +280,7 @@ def load_site(
     UsageError
         No such site, or the file is wrong (path and line are named).
     """
-    path, model = _find(name_or_path)
+    path, model, line_of = _find(name_or_path)
     changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
     model = model.model_copy(update={key: value for key, value in changes.items() if value is not None})
     try:
@@ -266,7 +288,27 @@ def load_site(
     except UsageError as error:
         if error.path is not None:
             raise
-        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+        line = line_of(error.location) if isinstance(error, _PlacedError) else None
+        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path, line=line) from None
+
+
+class _PlacedError(UsageError):
+    """A message about one key of a site.yaml."""
+
+    def __init__(self, error: UsageError, location: Location) -> None:
+        super().__init__(error.found, expected=error.expected, cause=error.cause)
+        self.location = location
+
+
+@contextmanager
+def _at(*location: Any) -> Iterator[None]:
+    """Messages from inside are about this key, unless they name a file or a nearer key."""
+    try:
+        yield
+    except UsageError as error:
+        if error.path is not None or isinstance(error, _PlacedError):
+            raise
+        raise _PlacedError(error, location) from None
 
 
 def site_model(name_or_path: str | Path) -> SiteModel:
@@ -274,10 +316,10 @@ def site_model(name_or_path: str | Path) -> SiteModel:
     return _find(name_or_path)[1]
 
 
-def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
+def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or path.is_file():
-        return str(path), load_yaml(path, SiteModel)
+        return str(path), *load_yaml_and_lines(path, SiteModel)
     name = str(name_or_path).lower().replace("-", "_").replace(" ", "_")
     if name not in PACKAGED:
         near = nearest(name, PACKAGED)
@@ -287,32 +329,39 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
             cause=f"did you mean '{near}'?" if near else None,
         )
     with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
-        return name, load_yaml(file, SiteModel)
+        return name, *load_yaml_and_lines(file, SiteModel)
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     """The site of a checked model; places the trees. ``folder`` is where relative paths start."""
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    dem = _dem(model, frame, folder or Path())
+    with _at("dem"):
+        dem = _dem(model, frame, folder or Path())
     datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     notes = list(model.notes)
-    towers = {name: _tower(name, tower, model, frame, datum, dem, notes) for name, tower in model.towers.items()}
-    area = _area(model.area_m, towers)
-    _check_towers(towers, model.area_m)
-    buildings = tuple(_building(item, frame, dem) for item in model.buildings)
+    towers = {}
+    for name, tower in model.towers.items():
+        with _at("towers", name):
+            towers[name] = _tower(name, tower, model, frame, datum, dem, notes)
+            _check_tower(towers[name], model.area_m)
+    with _at("area_m"):
+        area = _area(model.area_m, towers)
+    buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
     notes += _buried(towers, buildings)
     forests = tuple(
-        Forest(item.name, item.polygon(frame), item.trees_per_hectare, item.minimum_spacing_m, item.source)
-        for item in model.forests
+        Forest(item.name, outline, item.trees_per_hectare, item.minimum_spacing_m, item.source)
+        for item, outline in _outlines(model.forests, "forests", frame)
     )
+    with _at("trees"):
+        trees = _on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem)
     return Site(
         name=model.name,
         frame=frame,
         towers=towers,
         buildings=buildings,
         forests=forests,
-        trees=_on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem),
-        geofences=tuple(Geofence(item.name, item.polygon(frame)) for item in model.geofences),
+        trees=trees,
+        geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
         ground_material=model.ground_material,
         area_m=area,
         illustrative=model.illustrative,
@@ -320,6 +369,22 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         datum=datum,
         dem=dem,
     )
+
+
+def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
+    """East and north that maps of the site cover: ``area_m``, else 500 m around the towers."""
+    positions = []
+    for name, tower in model.towers.items():
+        chosen = _chosen_position(name, tower, model.coordinates, frame, [])
+        positions.append(frame.to_local(chosen.latitude_deg, chosen.longitude_deg))
+    east, north = np.array(positions).T
+    return _checked_area(model.area_m, east.tolist(), north.tolist())
+
+
+def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tuple[OutlineT, Polygon]]:
+    for index, item in enumerate(models):
+        with _at(key, index, "polygon_m" if item.polygon_deg is None else "polygon_deg"):
+            yield item, item.polygon(frame)
 
 
 def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
@@ -344,20 +409,18 @@ def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
     return replace(trees, ground_m=np.nan_to_num(dem.ground_m(trees.east_m, trees.north_m)))
 
 
-def _check_towers(towers: Mapping[str, Tower], area: Area | None) -> None:
+def _check_tower(tower: Tower, area: Area | None) -> None:
     """A tower kilometres off is a slip of the pen, not a site."""
-    for tower in towers.values():
-        away = math.hypot(tower.east_m, tower.north_m)
-        if area is not None:
-            east, north = _outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])
-            away = min(away, math.hypot(east, north))
-        if away > FAR_TOWER_M:
-            raise UsageError(
-                f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
-                f"from its site",
-                expected=f"at most {FAR_TOWER_M / 1000:g} km",
-                cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
-            )
+    away = math.hypot(tower.east_m, tower.north_m)
+    if area is not None:
+        away = min(away, math.hypot(_outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])))
+    if not away <= FAR_TOWER_M:
+        raise UsageError(
+            f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
+            f"from its site",
+            expected=f"at most {FAR_TOWER_M / 1000:g} km",
+            cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
+        )
 
 
 def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
@@ -426,8 +489,7 @@ def _chosen_position(
     return chosen
 
 
-def _building(model: BuildingModel, frame: SiteFrame, dem: Dem | None) -> Building:
-    footprint = model.polygon(frame)
+def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Building:
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
@@ -461,12 +523,39 @@ def _trees(
     if points:
         east, north = zip(*points, strict=True)
         parts.append(trees_at(east, north, sizes))  # type: ignore[arg-type]
+    if model.single:
+        parts.append(_single(model.single, sizes, frame))
     return join_trees(parts)
 
 
-def _area(area: tuple[float, float, float, float] | None, towers: Mapping[str, Tower]) -> Area:
-    east = [tower.east_m for tower in towers.values()]
-    north = [tower.north_m for tower in towers.values()]
+def _single(models: list[SingleTreeModel], sizes: TreeSizes, frame: SiteFrame) -> Trees:
+    """Trees with sizes of their own; crowns begin at the same share of the height as everywhere."""
+    points = []
+    for index, model in enumerate(models):
+        with _at("trees", "single", index):
+            points.append(model.at_m or _ring_from_degrees([model.at_deg or (0.0, 0.0)], frame, "trees.single")[0])
+    east, north = np.array(points, dtype=np.float64).T
+    drawn = trees_at(east, north, sizes)
+
+    def own(name: str) -> FloatArray:
+        stated = np.array([np.nan if (size := getattr(m, name)) is None else size for m in models], dtype=np.float64)
+        return np.where(np.isnan(stated), getattr(drawn, name), stated)
+
+    height = own("height_m")
+    return replace(
+        drawn,
+        height_m=height,
+        crown_base_m=height * sizes.crown_base_fraction,
+        crown_diameter_m=own("crown_diameter_m"),
+        trunk_diameter_m=own("trunk_diameter_m"),
+    )
+
+
+def _area(area: Area | None, towers: Mapping[str, Tower]) -> Area:
+    return _checked_area(area, [t.east_m for t in towers.values()], [t.north_m for t in towers.values()])
+
+
+def _checked_area(area: Area | None, east: list[float], north: list[float]) -> Area:
     if area is None:
         return (min(east) - 500.0, max(east) + 500.0, min(north) - 500.0, max(north) + 500.0)
     if not (area[0] < area[1] and area[2] < area[3]):

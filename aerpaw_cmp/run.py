@@ -239,7 +239,7 @@ def run_site_import(
 
 
 def run_site_show(
-    site: str,
+    site: str | None,
     out: Path,
     *,
     flight: Path | None = None,
@@ -247,19 +247,29 @@ def run_site_show(
     pose: int | None = None,
     export: bool = False,
 ) -> list[Path]:
-    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths."""
+    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
+
+    Without a site the flight's own is shown; with neither, the packaged one.
+    """
     from .report.site_view import write_site_view
     from .site.siteyaml import load_site
 
-    place, track, paths = load_site(site), None, ()
-    if flight is not None:
+    if pose is not None and flight is None:
+        raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
+    track, paths = None, ()
+    if flight is None:
+        place = load_site(site or "lake_wheeler")
+    else:
         from .comparison import track_of
         from .config import load_flight
         from .flight import gather, read_logs
 
         settings = load_flight(flight)
+        if site is not None:
+            file = str(Path(site).resolve()) if Path(site).is_file() else site
+            settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
-        track = track_of(data)
+        place, track = data.site, track_of(data)
         if pose is not None:
             paths = _paths_of_pose(data, place, track, pose)
     written = write_site_view(place, out, track=track, paths=paths)
@@ -288,7 +298,8 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     for index in range(len(found)):
         corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
         source = site.towers[towers[found.tower[index]]].position_m
-        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections"
+        count = int(found.depth[index])
+        label = f"{towers[found.tower[index]]}, {count} reflection{'' if count == 1 else 's'}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
 

@@ -383,6 +383,7 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
+    message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # members of an Enum, as they are written
     found = repr(item["input"])
     found = found if len(found) <= 60 else found[:57] + "..."
     return f"{where}: found {found}; expected {message}", None

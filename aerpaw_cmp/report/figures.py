@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..site.site import Site
+from ..site.site import Site, Trees
 from ..units import AnyArray, BoolArray, FloatArray
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
 from .export import k_key, safe_name
@@ -302,10 +302,7 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
             label=f"forest{invented}" if number == 0 else None,
         )  # fmt: skip
     if len(site.trees):
-        ax.scatter(
-            site.trees.east_m, site.trees.north_m, s=2, color="#5E8C4F", linewidths=0, rasterized=True, zorder=0.4,
-            label=f"tree{invented}",
-        )  # fmt: skip
+        _draw_crowns(ax, site.trees, f"tree{invented}")
     for number, building in enumerate(site.buildings):
         patch(
             building.footprint, facecolor=BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
@@ -329,6 +326,21 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
             )  # fmt: skip
     plan_axes(ax)
+
+
+def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
+    """Crowns to scale, each with a dot where the trunk stands."""
+    from matplotlib.collections import EllipseCollection
+
+    wide, places = trees.crown_diameter_m, np.column_stack([trees.east_m, trees.north_m])
+    crowns = EllipseCollection(
+        wide, wide, np.zeros(len(trees)), units="xy", offsets=places, offset_transform=ax.transData,
+        facecolor="#5E8C4F", alpha=0.45, linewidth=0, zorder=0.4,
+    )  # fmt: skip
+    crowns.set_rasterized(True)
+    ax.add_collection(crowns, autolim=False)
+    ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
+    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label=label)
 
 
 def plan_axes(ax: Axes) -> None:

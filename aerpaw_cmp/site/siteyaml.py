@@ -15,7 +15,7 @@ from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import shapely
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 from shapely.geometry import Point, Polygon
 
 from ..errors import UsageError
@@ -40,6 +40,9 @@ FAR_POLYGON_M = 100_000.0
 MAST_CLEARANCE_M = 8.0
 """No tree is placed at random closer to a tower: masts stand clear."""
 
+TALLEST_M = 1000.0
+"""A higher building or mast is in feet or centimetres; no structure on Earth reaches it."""
+
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
 Positive = Annotated[float, Field(gt=0)]
@@ -47,6 +50,15 @@ NotNegative = Annotated[float, Field(ge=0)]
 Ground = Literal["flat", "offsets", "dem"]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
+
+
+def _not_too_high(height_m: float) -> float:
+    if height_m > TALLEST_M:
+        raise ValueError(f"{height_m:g} m is higher than anything that stands on Earth; feet or centimetres?")
+    return height_m
+
+
+Structure = Annotated[Positive, AfterValidator(_not_too_high)]
 
 
 def _known_material(name: str) -> str:
@@ -70,7 +82,13 @@ def _problem(shape: Polygon) -> str | None:
     return None
 
 
-class HeightModel(StrictModel):
+class SiteBase(StrictModel):
+    """Settings of a site: every number is one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class HeightModel(SiteBase):
     """A height with its reference."""
 
     height_m: float
@@ -81,32 +99,38 @@ class HeightModel(StrictModel):
         return Height(self.height_m, self.reference)
 
 
-class OriginModel(StrictModel):
+class AbsoluteHeightModel(HeightModel):
+    """A height that does not count from the site itself."""
+
+    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL]
+
+
+class OriginModel(SiteBase):
     """Where east = north = up = 0."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    ground: HeightModel | None = None
+    ground: AbsoluteHeightModel | None = None
     takeoff_ground_m: float = 0.0
 
 
-class PositionModel(StrictModel):
+class PositionModel(SiteBase):
     """One published position of a tower."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    antenna_height_m: Positive | None = None
+    antenna_height_m: Structure | None = None
     source: str = ""
 
 
-class TowerModel(StrictModel):
+class TowerModel(SiteBase):
     """A tower, with one position or several published ones."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     source: str = ""
     positions: dict[str, PositionModel] = Field(default_factory=dict)
-    antenna_height_m: Positive | None = None
+    antenna_height_m: Structure | None = None
     antenna: HeightModel | None = None
     ground_offset_m: float | None = None
     ground: HeightModel | None = None
@@ -123,7 +147,7 @@ class TowerModel(StrictModel):
         return self
 
 
-class PolygonModel(StrictModel):
+class PolygonModel(SiteBase):
     """A named outline."""
 
     name: str
@@ -145,6 +169,7 @@ class PolygonModel(StrictModel):
     def polygon(self, frame: SiteFrame) -> Polygon:
         """In the site frame [m]; UsageError when it is not a simple polygon near the site."""
         if self.polygon_m is not None:
+            _check_near(self.polygon_m, self.name)
             shape = Polygon(self.polygon_m, self.holes_m)
         else:
             rings = [self.polygon_deg or [], *self.holes_deg]
@@ -158,7 +183,7 @@ class PolygonModel(StrictModel):
 class BuildingModel(PolygonModel):
     """A building with a flat roof."""
 
-    height_m: Positive
+    height_m: Structure
     base_m: float = 0.0
     material: MaterialName = "concrete"
     source: str = ""
@@ -175,19 +200,25 @@ class ForestModel(PolygonModel):
 OutlineT = TypeVar("OutlineT", bound=PolygonModel)
 
 
-class DistributionModel(StrictModel):
+class DistributionModel(SiteBase):
     """A size drawn from a normal distribution between limits."""
 
     mean: Positive
     deviation: NotNegative = 0.0
     minimum: NotNegative = 0.0
-    maximum: Positive = math.inf
+    maximum: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
 
 
-Size = Positive | DistributionModel
+def _which_size(value: Any) -> str:
+    return "distribution" if isinstance(value, dict | DistributionModel) else "number"
 
 
-class SingleTreeModel(StrictModel):
+Size = Annotated[  # told apart beforehand: a wrong number is one message, not one per member of the union
+    Annotated[Positive, Tag("number")] | Annotated[DistributionModel, Tag("distribution")], Discriminator(_which_size)
+]
+
+
+class SingleTreeModel(SiteBase):
     """A tree with sizes of its own; what is absent is drawn like that of all trees."""
 
     at_m: tuple[float, float] | None = None
@@ -203,7 +234,7 @@ class SingleTreeModel(StrictModel):
         return self
 
 
-class TreesModel(StrictModel):
+class TreesModel(SiteBase):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -225,7 +256,7 @@ class TreesModel(StrictModel):
         )
 
 
-class DemModel(StrictModel):
+class DemModel(SiteBase):
     """An elevation model; relative paths start at the folder of site.yaml."""
 
     path: str
@@ -233,7 +264,7 @@ class DemModel(StrictModel):
     reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
 
 
-class SiteModel(StrictModel):
+class SiteModel(SiteBase):
     """The whole of site.yaml."""
 
     name: str
@@ -343,11 +374,11 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     for name, tower in model.towers.items():
         with _at("towers", name):
             towers[name] = _tower(name, tower, model, frame, datum, dem, notes)
-            _check_tower(towers[name], model.area_m)
+            _check_tower(towers[name], model.area_m, frame)
     with _at("area_m"):
         area = _area(model.area_m, towers)
     buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
-    notes += _buried(towers, buildings)
+    notes += _buried(towers, buildings) + _overlaps(buildings)
     forests = tuple(
         Forest(item.name, outline, item.trees_per_hectare, item.minimum_spacing_m, item.source)
         for item, outline in _outlines(model.forests, "forests", frame)
@@ -389,7 +420,8 @@ def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tu
 
 def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
     if model.tower_ground == "dem" and model.dem is None:
-        raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
+        with _at("tower_ground"):
+            raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
     if model.dem is None or model.tower_ground not in (None, "dem"):
         return None
     return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
@@ -409,7 +441,7 @@ def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
     return replace(trees, ground_m=np.nan_to_num(dem.ground_m(trees.east_m, trees.north_m)))
 
 
-def _check_tower(tower: Tower, area: Area | None) -> None:
+def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
     """A tower kilometres off is a slip of the pen, not a site."""
     away = math.hypot(tower.east_m, tower.north_m)
     if area is not None:
@@ -419,8 +451,35 @@ def _check_tower(tower: Tower, area: Area | None) -> None:
             f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
             f"from its site",
             expected=f"at most {FAR_TOWER_M / 1000:g} km",
-            cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
+            cause=_why_far(tower, frame),
         )
+
+
+def _why_far(tower: Tower, frame: SiteFrame) -> str:
+    latitude, longitude = tower.latitude_deg, tower.longitude_deg
+    for cause, position in (
+        ("latitude and longitude are swapped", (longitude, latitude)),
+        ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
+        ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
+    ):
+        if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= FAR_TOWER_M:
+            return cause
+    return "a digit is wrong, or it belongs to another site"
+
+
+def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
+    """Warnings of buildings that stand in each other: walls inside walls reflect what they should not."""
+    if len(buildings) < 2:
+        return []
+    shapes = [building.footprint for building in buildings]
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = [(int(i), int(j)) for i, j in zip(one, two, strict=True) if i < j]
+    found = [(i, j) for i, j in pairs if shapes[i].intersection(shapes[j]).area > 0.1]
+    if not found:
+        return []
+    first = " and ".join(f"'{buildings[i].name}'" for i in found[0])
+    more = "" if len(found) == 1 else f" and {len(found) - 1} more pairs"
+    return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
 
 
 def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
@@ -455,10 +514,11 @@ def _tower(
         ground = float(dem.ground_m(east, north))
         if math.isnan(ground):
             raise UsageError(f"{what} is not on the elevation model", cause="the grid is too small for the site")
+    stated = model.ground_offset_m or 0.0
+    if model.ground is not None and (site.tower_ground == "offsets" or datum.origin_ground is not None):
+        stated = datum.up_m(model.ground.height(), f"{what}, ground")  # also where unused: mixing is refused
     if site.tower_ground == "offsets":
-        ground = model.ground_offset_m or 0.0
-        if model.ground is not None:
-            ground = datum.up_m(model.ground.height(), f"{what}, ground")
+        ground = stated
     height = model.antenna_height_m or chosen.antenna_height_m or 10.0
     if model.antenna is not None:
         height = datum.up_m(model.antenna.height(), f"{what}, antenna", ground_m=ground) - ground
@@ -509,8 +569,9 @@ def _trees(
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
     )
     sizes, parts = model.sizes(), []
-    for forest in forests:
-        placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
+    for index, forest in enumerate(forests):
+        with _at("forests", index):
+            placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)
         if len(placed) < wanted:
             notes.append(
@@ -518,6 +579,8 @@ def _trees(
             )
         parts.append(placed)
     points = list(model.points_m)
+    if points:
+        _check_near(points, "trees.points_m")
     if model.points_deg:
         points += _ring_from_degrees(model.points_deg, frame, "trees")
     if points:
@@ -533,6 +596,8 @@ def _single(models: list[SingleTreeModel], sizes: TreeSizes, frame: SiteFrame) -
     points = []
     for index, model in enumerate(models):
         with _at("trees", "single", index):
+            if model.at_m is not None:
+                _check_near([model.at_m], "trees.single")
             points.append(model.at_m or _ring_from_degrees([model.at_deg or (0.0, 0.0)], frame, "trees.single")[0])
     east, north = np.array(points, dtype=np.float64).T
     drawn = trees_at(east, north, sizes)
@@ -561,6 +626,16 @@ def _checked_area(area: Area | None, east: list[float], north: list[float]) -> A
     if not (area[0] < area[1] and area[2] < area[3]):
         raise UsageError(f"area_m is {list(area)}", expected="[east_min, east_max, north_min, north_max]")
     return area
+
+
+def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
+    away = max(math.hypot(*point) for point in points_m)
+    if away > FAR_POLYGON_M:
+        raise UsageError(
+            f"'{name}' reaches {away / 1000:.0f} km from the site's origin",
+            expected="metres east and north of the origin",
+            cause="map coordinates (UTM or State Plane, metres or feet) in place of metres from the origin",
+        )
 
 
 def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: str) -> list[tuple[float, float]]:

@@ -19,6 +19,7 @@ from typing import Any
 
 import numpy as np
 
+from .alternatives import p833_note
 from .compare.rank import singular_values
 from .errors import UsageError
 from .maps import export
@@ -539,6 +540,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
     return (
         f"Foliage {modes}: opaque stops whatever touches a crown or a trunk (the paper); attenuating takes "
         "ITU-R P.833 over the path's length in crowns; none leaves the trees out.",
+        *([note] if "attenuating" in modes and (note := p833_note(s.carrier_hz)) else []),
         "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
         f"Spread, condition number, correlation and interpolation are those of foliage {s.shown}.",
     )

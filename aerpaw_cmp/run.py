@@ -99,6 +99,7 @@ def run_report(
         settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files, logs_root)
+    from .alternatives import foliage_notes
     from .comparison import audit_replays, compare_rank_series, compare_rss_series
     from .replaying import estimate_clocks, replay_rank, replay_rss
 
@@ -127,7 +128,8 @@ def run_report(
         from .report.export import metrics as metrics_of
         from .report.export import write_report
 
-        record = _report_data(data, rss, rank, engine_record, speed, stages)
+        notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
+        record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -150,7 +152,13 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
 
 
 def _report_data(
-    data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
+    data: FlightData,
+    rss: list[Any],
+    rank: list[Any],
+    engine: Any,
+    speed: tuple[Any, ...],
+    notes: tuple[str, ...],
+    stages: Stages,
 ) -> Any:
     from .comparison import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
@@ -176,7 +184,7 @@ def _report_data(
         speed=speed,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *data.site.notes),
+        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
         stages_s=dict(stages.seconds),
     )

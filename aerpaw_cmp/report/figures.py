@@ -673,28 +673,35 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     ax.plot(middle[full], high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
 
 
-def seen_from_tower(panel: RssPanel) -> Figure:
-    """Where the tower's antenna sees the UAV, in the antenna's own frame, coloured by the residual."""
-    azimuth, elevation = panel.geometry["azimuth_deg"], panel.geometry["elevation_deg"]
+def seen_from_antennas(panel: RssPanel) -> Figure:
+    """Where the tower's antenna sees the UAV and the UAV's sees the tower, each in its own frame; colour: residual."""
+    seen = panel.geometry
+    views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
+    if {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen):
+        views.append(("tower, UAV antenna frame", seen["uav_azimuth_deg"], seen["uav_elevation_deg"]))
     residual = panel.residual_db
-    good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+    known = residual[np.isfinite(residual)]
+    reach = float(np.percentile(np.abs(known), 98)) if known.size else 1.0
     fig = figure((9.2, 3.6))
-    ax = fig.subplots()
-    reach = float(np.percentile(np.abs(residual[good]), 98)) if good.any() else 1.0
-    ax.plot(
-        azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
-        rasterized=True, label="not scored",
-    )  # fmt: skip
-    points = ax.scatter(
-        azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
-        rasterized=True, label="sample (colour: residual)",
-    )  # fmt: skip
-    ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
-    ax.set_facecolor("#F4F4F4")
-    ax.set_xlabel("Azimuth in the frame of the tower antenna [deg]")
-    ax.set_ylabel("Elevation [deg]")
-    colour_bar(fig, points, ax, "Measured - simulated [dB]")
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
+    axes = fig.subplots(1, len(views), squeeze=False)[0]
+    for ax, (words, azimuth, elevation) in zip(axes, views, strict=True):
+        good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+        ax.plot(
+            azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+            rasterized=True, label="not scored",
+        )  # fmt: skip
+        points = ax.scatter(
+            azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach,
+            linewidths=0, rasterized=True, label="sample (colour: residual)",
+        )  # fmt: skip
+        ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
+        ax.set_facecolor("#F4F4F4")
+        ax.set_xlim(-180, 180)
+        ax.set_xticks(range(-180, 181, 90))
+        ax.set_xlabel(f"Azimuth of the {words} [deg]")
+        ax.set_ylabel("Elevation in that frame [deg]")
+    colour_bar(fig, points, list(axes), "Measured - simulated [dB]")
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
     return fig
 
 
@@ -1115,11 +1122,12 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
             Plate(
                 name=f"rss_angles_{stem}",
                 section=section,
-                title=f"{panel.name}: from where the antenna sees the UAV",
-                caption="Azimuth and elevation of the UAV in the frame of the tower antenna. Patches of one colour "
-                "point to the antenna pattern or its mounting.",
-                alt=f"Azimuth and elevation at which {panel.name} sees the UAV, coloured by residual.",
-                draw=lambda: seen_from_tower(panel),
+                title=f"{panel.name}: from where the antennas see each other",
+                caption="Azimuth (from the boresight towards its left) and elevation of the UAV in the frame of the "
+                "tower antenna, and of the tower in the frame of the UAV antenna, which turns with the aircraft where "
+                "rt.attitude says so. Patches of one colour point to an antenna pattern or its mounting.",
+                alt=f"Azimuth and elevation at which the antennas of {panel.name} see each other, by residual.",
+                draw=lambda: seen_from_antennas(panel),
             )
         )
     return result

@@ -236,3 +236,21 @@ def test_residual_sign_is_measured_minus_simulated(report_data):
 def test_grey_steps_of_the_ranks_are_apart():
     grey = [np.dot(figures.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
     assert min(np.diff(grey)) > 0.12
+
+
+def test_both_antennas_are_shown_in_their_own_frames(small_report):
+    panel = small_report.rss[0]
+    n = len(panel.time)
+    own = {"tower_elevation_deg": np.linspace(-70, 70, n)}
+    with figures.style():
+        (one, _) = figures.seen_from_antennas(dataclasses.replace(panel, geometry={**panel.geometry, **own})).axes
+    drawn = one.collections[0].get_offsets()
+    assert drawn[:, 1].min() < -60, "the elevation in the antenna's frame, not the one above the horizon"
+    both = {**panel.geometry, **own, "uav_azimuth_deg": np.full(n, 12.0), "uav_elevation_deg": np.full(n, -8.0)}
+    with figures.style():
+        axes = figures.seen_from_antennas(dataclasses.replace(panel, geometry=both)).axes
+    assert [ax.get_xlabel() for ax in axes[:2]] == [
+        "Azimuth of the UAV, tower antenna frame [deg]",
+        "Azimuth of the tower, UAV antenna frame [deg]",
+    ]
+    assert {tuple(row) for row in axes[1].collections[0].get_offsets().tolist()} == {(12.0, -8.0)}

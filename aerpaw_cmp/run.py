@@ -292,14 +292,15 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     """Propagation paths of all towers to one point of the track, as polylines."""
     import numpy as np
 
-    from .replay.arrays import Poses
+    from .replay.arrays import Link, Poses, single_element
     from .replay.replay import replay
     from .report.site_view import PathLine
 
     if track is None or not 0 <= pose < len(track.time):
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
-    link = data.settings.link.rss.build(list(site.towers), data.folder)
+    # paths join the centres of the arrays: which elements they have does not matter
+    link = Link(data.settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=data.settings.rt.max_depth).paths
     towers = list(site.towers)
     lines = []

@@ -13,8 +13,6 @@ from aerpaw_cmp.replay.arrays import Array, Link, Poses, rotation_from_aircraft,
 from aerpaw_cmp.replay.replay import replay
 from aerpaw_cmp.track import Track
 
-LEVEL = (0.0, 0.0)
-
 
 class Witness:
     """Isotropic; keeps the directions it was asked for as unit vectors of the device (front, left, up)."""
@@ -78,12 +76,13 @@ def test_from_where_the_uav_antenna_sees_the_tower(scenes, attitude, mount, expe
         "velocity_north_mps": 0.0, "velocity_east_mps": 0.0, "velocity_down_mps": 0.0,
         "fix": 3, "satellites": 15, "line": [1, 2], "flag": "",
     })  # fmt: skip
-    rotation = Track(log, site.frame).pose_at(log["time"].to_numpy()[:1]).rotation
-    witness = Witness()
-    uav = Array(np.zeros((1, 3)), np.zeros(1), (witness,), mount_of(**mount))
-    replay(site, scenes.link(site, uav_array=uav), Poses(np.array([[-100.0, 0.0, 10.0]]), rotation), max_depth=0)
-    [asked] = [directions for directions in witness.asked if len(directions)]
-    np.testing.assert_allclose(asked[0], expected, atol=1e-6)
+    logged = Track(log, site.frame).pose_at(log["time"].to_numpy()[:1]).rotation
+    for rotation in (logged, rotation_from_aircraft(roll, pitch, yaw)[None]):  # of the report, and of simulate and tap
+        witness = Witness()
+        uav = Array(np.zeros((1, 3)), np.zeros(1), (witness,), mount_of(**mount))
+        replay(site, scenes.link(site, uav_array=uav), Poses(np.array([[-100.0, 0.0, 10.0]]), rotation), max_depth=0)
+        [asked] = [directions for directions in witness.asked if len(directions)]
+        np.testing.assert_allclose(asked[0], expected, atol=1e-6)
 
 
 def test_from_where_the_tower_sees_the_uav(scenes):

@@ -453,29 +453,45 @@ def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Disjoint shapes: of one height and material merged, lower ones cut where they lie under higher ones."""
     kept: list[_Shape] = []
     for group in _groups(shapes):
-        if len(group) == 1:
-            kept += group
-            continue
-        group.sort(key=lambda shape: -shape.height_m)
-        covered: BaseGeometry = Polygon()
-        merged: list[_Shape] = []
-        for shape in group:
-            free = _areas_only(shape.area.difference(covered))
-            covered = covered.union(shape.area)
-            last = merged[-1] if merged else None
-            if free.is_empty:
-                actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
-            elif last and abs(last.height_m - shape.height_m) <= SAME_HEIGHT_M and last.material == shape.material:
-                last.area = _areas_only(last.area.union(shape.area if last is merged[0] else free))
-                actions.append(f"{shape.source}: overlaps {last.source} at the same height; they were merged")
-            else:
-                merged.append(_Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material))
-                if last:
-                    actions.append(f"{shape.source}: the part under a higher building was cut away")
-        kept += merged
+        kept += group if len(group) == 1 else _higher_first(group, actions)
     return kept
+
+
+def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
+    group = sorted(group, key=lambda shape: -shape.height_m)
+    tree = shapely.STRtree([shape.area for shape in group])
+    home: list[_Shape | None] = []  # the kept shape that each one became or was merged into
+    pieces: dict[int, list[BaseGeometry]] = {}
+    for index, shape in enumerate(group):
+        higher = sorted(int(j) for j in tree.query(shape.area, predicate="intersects") if j < index)
+        covered = shapely.union_all([group[j].area for j in higher])
+        free = _areas_only(shape.area.difference(covered))
+        if free.is_empty:
+            actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
+            home.append(None)
+            continue
+        same = next((h for j in higher if (h := home[j]) is not None and _alike(h, shape)), None)
+        if same is None:
+            same = _Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material)
+            pieces[id(same)] = [free]
+            if shape.area.area - free.area > 0.01:
+                actions.append(f"{shape.source}: the part under a higher building was cut away")
+        else:
+            others = shapely.union_all([group[j].area for j in higher if home[j] is not same])
+            pieces[id(same)].append(shape.area.difference(others))
+            actions.append(f"{shape.source}: overlaps {same.source} at the same height; they were merged")
+        home.append(same)
+    kept = list({id(shape): shape for shape in home if shape is not None}.values())
+    for shape in kept:
+        shape.area = _areas_only(shapely.union_all(pieces[id(shape)]))
+    return kept
+
+
+def _alike(one: _Shape, other: _Shape) -> bool:
+    return abs(one.height_m - other.height_m) <= SAME_HEIGHT_M and one.material == other.material
 
 
 def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:

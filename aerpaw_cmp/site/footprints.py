@@ -44,6 +44,9 @@ SLIVER_M = 0.3
 MINIMUM_AREA_M2 = 2.0
 SAME_HEIGHT_M = 0.25
 
+OSM_KINDS = ("OSM XML", "Overpass JSON")
+"""Formats whose data are OpenStreetMap's."""
+
 FOREST_MARGIN_M = 1000.0
 """Forests are cut off this far outside the area of the site: trees there shadow nothing."""
 
@@ -69,13 +72,15 @@ class SingleTree:
 class Footprints:
     """What was found in map files, in the site frame, and what was done to it.
 
-    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``.
+    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
+    whose data they are.
     """
 
     buildings: list[Building] = field(default_factory=list)
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
     trees: list[SingleTree] = field(default_factory=list)
+    credits: list[str] = field(default_factory=list)
     actions: list[str] = field(default_factory=list)
 
 
@@ -138,6 +143,8 @@ def import_footprints(
         content = read_map_file(path)
         _check_place(content, frame, Path(path))
         result.actions += content.notes
+        if content.kind in OSM_KINDS:
+            result.credits.append(f"{Path(path).name}: (c) OpenStreetMap contributors, ODbL")
         _sort(content, Path(path), frame, untagged, default_height_m, shapes, result.actions)
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
@@ -577,7 +584,7 @@ def import_site(
         ],
         "geofences": [_outline_dict(g.name, g.area) for g in found.geofences],
         "illustrative": False,
-        "notes": [note for note in model.notes if "illustrative" not in note.lower()],
+        "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *found.credits],
     }
     content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in found.trees]}
     return SiteModel.model_validate(content), found.actions

@@ -386,3 +386,12 @@ def test_any_name_survives_site_yaml(tmp_path: Path, name: str) -> None:
     model, actions = import_site([tmp_path / "v.json"])
     write_site_yaml(model, tmp_path / "site.yaml", header=actions)
     assert [b.name for b in load_site(tmp_path / "site.yaml").buildings] == [name]
+
+
+def test_openstreetmap_is_named_in_the_notes(tmp_path: Path) -> None:
+    osm = Osm()
+    osm.way(square(50, 0), **BARN)
+    (tmp_path / "a.osm").write_text(osm.xml())
+    (tmp_path / "b.json").write_text(json.dumps(collection(feature(polygon(square(100, 0)), **BARN))))
+    model, _ = import_site([tmp_path / "a.osm", tmp_path / "b.json"])
+    assert [note for note in model.notes if "OpenStreetMap" in note] == ["a.osm: (c) OpenStreetMap contributors, ODbL"]

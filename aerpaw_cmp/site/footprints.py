@@ -603,13 +603,18 @@ def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
     return {"name": name, "polygon_m": ring(area.exterior), "holes_m": [ring(hole) for hole in area.interiors]}
 
 
+def _printable(text: str) -> str:
+    """Without control characters, which map data may hold and YAML refuses even in comments."""
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
 def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
     """Settings as a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
 
     ``header`` lines become comments at the top (what the import did).
     """
     content = model.model_dump(mode="json", exclude_defaults=True)
-    text = "".join(f"# {line}\n" for entry in header for line in str(entry).splitlines())
+    text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
     text += dump_yaml(content)
     path = Path(path)
     partial = path.with_name(path.name + ".partial")

@@ -388,6 +388,15 @@ def test_any_name_survives_site_yaml(tmp_path: Path, name: str) -> None:
     assert [b.name for b in load_site(tmp_path / "site.yaml").buildings] == [name]
 
 
+def test_control_characters_do_not_spoil_the_file(tmp_path: Path) -> None:
+    odd = feature(polygon(square(50, 0)), building="yes", height="\u0007\u001b[31m", name="bell\u0007")
+    (tmp_path / "v.json").write_text(json.dumps(collection({**odd, "id": "x\u0000\u2028\ny"})))
+    model, actions = import_site([tmp_path / "v.json"])
+    assert any("is not a length" in action for action in actions)
+    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    assert load_site(tmp_path / "site.yaml").buildings[0].name == "bell\u0007"
+
+
 def test_openstreetmap_is_named_in_the_notes(tmp_path: Path) -> None:
     osm = Osm()
     osm.way(square(50, 0), **BARN)

@@ -400,7 +400,7 @@ def bench(
         print(f"{name}: {ratio:.3g} times")
 
 
-@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML) to a site.yaml.")
+@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")
 def site_import(
     files: Annotated[list[Path], typer.Argument(help="Map files.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],

@@ -112,7 +112,7 @@ def import_footprints(
     Parameters
     ----------
     files : sequence of paths
-        GeoJSON, OSM XML, Overpass JSON or KML, told by content.
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ, told by content.
     frame : SiteFrame
         Of the site that they belong to.
     untagged : {"building", "forest", "geofence"}, optional
@@ -561,7 +561,7 @@ def import_site(
         The settings (see :func:`write_site_yaml`), and what was done.
     """
     if not files:
-        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON or KML files")
+        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
     found = import_footprints(files, frame, area_m=extent_m(model, frame), **options)

@@ -1,4 +1,4 @@
-"""Outlines from map files, as they are: GeoJSON, OSM XML, Overpass JSON, KML. Cleaning is :mod:`.footprints`' job.
+"""Outlines from map files, as they are: GeoJSON, OSM XML, Overpass JSON, KML, KMZ. Cleaning is :mod:`.footprints`' job.
 
 An element that cannot be used is left out and listed, with its line; only a file that is no map file is an error.
 """

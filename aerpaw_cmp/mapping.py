@@ -55,6 +55,7 @@ from .replay.foliage import CrownIndex, foliage_loss_db, foliage_model
 from .replay.paths import PathSet
 from .replay.replay import Engine, Replay, replay
 from .report import maps_data as page
+from .report.export import make_folder
 from .site.site import Site
 from .units import AnyArray, ComplexArray, FloatArray, wavelength_m
 
@@ -601,7 +602,7 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     written = [
         export.write_csv(folder / "layers.csv", grid, site.frame, every),
         export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),

@@ -116,6 +116,15 @@ def test_usage_errors_are_one_line_and_exit_code_2(capsys: pytest.CaptureFixture
         assert "Traceback" not in capsys.readouterr().err
 
 
+@pytest.mark.parametrize("command", [["report", SAMPLE / "flight.yaml", "--audit", "none"], ["site", "show"]])
+def test_a_file_in_the_way_of_the_folder(
+    command: list[object], tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "taken").write_text("")
+    assert main([str(a) for a in (*command, "-o", tmp_path / "taken" / "x")]) == 2
+    assert "a file is in the way" in capsys.readouterr().err
+
+
 @pytest.mark.sionna
 def test_bench_json(capsys: pytest.CaptureFixture[str]) -> None:
     result = json.loads(out_of(capsys, "bench", "--quick", "--poses", "6", "--json"))

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import UsageError
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 
 if TYPE_CHECKING:
@@ -318,10 +319,23 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
 
 
+def make_folder(folder: Path) -> Path:
+    """The folder, made when missing; UsageError where it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        cause = "a file is in the way, or there is no right to write here"
+        raise UsageError(f"the folder cannot be made ({error.strerror})", cause=cause, path=folder) from None
+    return folder
+
+
 def write_atomic(path: Path, content: str | bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:40]}.", dir=path.parent)
+    """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
+    make_folder(path.parent)
+    try:
+        handle, temporary = tempfile.mkstemp(prefix=f".{path.name[:40]}.", dir=path.parent)
+    except OSError as error:
+        raise UsageError(f"cannot be written ({error.strerror})", path=path) from None
     try:
         with os.fdopen(handle, "wb") as stream:
             stream.write(content.encode("utf-8") if isinstance(content, str) else content)
@@ -368,7 +382,7 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     from . import figures, html
 
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     written = [write_atomic(folder / "metrics.json", numbers)]
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):

@@ -179,11 +179,11 @@ def _solid_ground(ax: Any, site: Site, invented: str) -> None:
 
     flat = [_flat(outline(forest.area), 0.0) for forest in site.forests]
     if flat:
-        ax.add_collection3d(
-            Poly3DCollection(
-                flat, facecolor=figures.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
-            )
+        areas = Poly3DCollection(
+            flat, facecolor=figures.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
         )
+        # matplotlib 3.11 would scale by corners that polygons of unlike length do not have; the limits are set anyway
+        ax.add_collection3d(areas, autolim=False)
     for number, fence in enumerate(site.geofences):
         line = np.asarray(fence.area.exterior.coords)[:, :2]
         ax.plot(
@@ -226,7 +226,7 @@ def _solid_buildings(ax: Any, buildings: Sequence[Building], invented: str) -> N
         faces, facecolor="#B5B5B5", edgecolor="black", linewidth=0.4, label=f"building{invented}", zorder=4
     )
     prisms.set_rasterized(len(faces) > 300)
-    ax.add_collection3d(prisms)
+    ax.add_collection3d(prisms, autolim=False)
 
 
 def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
@@ -244,7 +244,7 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
         crowns, facecolor="#7FAE6E", edgecolor="#3F6136", linewidth=0.25, label=f"tree{invented}{part}", zorder=3
     )
     cones.set_rasterized(True)
-    ax.add_collection3d(cones)
+    ax.add_collection3d(cones, autolim=False)
 
 
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
+from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.report import figures, site_view
 from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
@@ -140,3 +141,25 @@ def test_crowns_on_the_plan_are_to_scale(report_data):
     [crowns] = [c for c in ax.collections if type(c).__name__ == "EllipseCollection"]
     assert crowns.get_offsets().tolist() == [[5.0, 7.0]]
     assert crowns.get_widths().tolist() == [14.0]
+
+
+def test_a_file_in_the_way_is_one_message(report_data, tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UsageError, match=r"the folder cannot be made .*a file is in the way"):
+        site_view.write_site_view(Site("nothing", report_data.site.frame, {}), tmp_path / "taken" / "show")
+
+
+def test_the_picture_is_scaled_by_corners_that_exist(report_data, monkeypatch):
+    """Polygons of unlike length leave matplotlib cells that were never filled: their garbage must not be asked for."""
+    empty = np.empty
+    monkeypatch.setattr(np, "empty", lambda *a, **k: full(empty(*a, **k)))
+
+    def full(array):
+        if array.dtype == float:
+            array.ravel()[::2], array.ravel()[1::2] = 1.7e308, -1.7e308
+        return array
+
+    shapes = (box(0, 0, 10, 10), Polygon([(50, 0), (80, 0), (90, 20), (70, 40), (50, 30)]))
+    forests = tuple(Forest(f"f{n}", shape) for n, shape in enumerate(shapes))
+    with figures.style():
+        figures.save(site_view.solid(dataclasses.replace(report_data.site, forests=forests)))

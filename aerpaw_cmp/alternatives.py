@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from typing import Any
 
 import numpy as np
@@ -14,6 +14,7 @@ from .config import PortSettings
 from .flight import FlightData, RssSeries
 from .replay.arrays import Array, Link, Poses
 from .replay.field import Fields, channel_matrices, mean_pair_power, rss_dbm
+from .replay.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from .replay.replay import Loss
 from .replaying import Replayed, attitude_rotation, path_loss
 from .site.antennas import Isotropic
@@ -88,6 +89,36 @@ def foliage_alternatives(data: FlightData, replayed: Replayed) -> dict[str, Fiel
             data, replayed, path_loss(data, carrier, foliage=foliage, leaves=leaves)
         )
     return found
+
+
+def foliage_notes(data: FlightData, carriers_hz: Collection[float]) -> tuple[str, ...]:
+    """What a report must say of the foliage models that it used: where they are stretched or assumed."""
+    rt = data.settings.rt
+    if not len(data.site.trees) or not (rt.foliage == "attenuating" or (rt.paired_foliage and rt.foliage != "opaque")):
+        return ()
+    notes = []
+    if rt.foliage_model == "p833" and (rt.gamma_db_per_m is None or rt.maximum_loss_db is None):
+        notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
+    if rt.leaves == "out" or rt.paired_foliage:
+        what = "gamma" if rt.foliage_model == "p833" else "the loss"
+        notes.append(
+            f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
+            "tool: ITU-R P.833 gives about 20 % near 1 GHz, and no number at this carrier."
+        )
+    return tuple(notes)
+
+
+def p833_note(carrier_hz: float) -> str | None:
+    """That P.833's table is continued beyond its end, or None within it."""
+    low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
+    if low <= carrier_hz / 1e6 <= high:
+        return None
+    model = P833.at(carrier_hz)
+    return (
+        f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
+        f"to {high:g} MHz. Continued it gives gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
+        "dB in leaf; other continuations give 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
+    )
 
 
 def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, Any]:

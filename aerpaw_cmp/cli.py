@@ -377,7 +377,7 @@ def bench(
         print(f"{name}: {ratio:.3g} times")
 
 
-@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML) to a site.yaml.")
+@site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")
 def site_import(
     files: Annotated[list[Path], typer.Argument(help="Map files.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
@@ -394,7 +394,7 @@ def site_import(
 
 @site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
 def site_show(
-    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,

@@ -398,7 +398,9 @@ def _geometry(data: FlightData, tower: str, replayed: Replayed) -> dict[str, Flo
     )
     seen["azimuth_deg"] = seen["tower_azimuth_deg"]  # residuals are drawn in the frame of the antenna
     out = {"position_m": position, "altitude_m": position[:, 2]}
-    for name in ("distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "uav_elevation_deg"):
+    for name in (
+        "distance_m", "elevation_deg", "azimuth_deg", "tower_elevation_deg", "uav_azimuth_deg", "uav_elevation_deg",
+    ):  # fmt: skip
         out[name] = replayed.spread(seen[name])
     if replayed.track is not None:
         out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)

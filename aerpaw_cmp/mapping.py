@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 
+from .alternatives import p833_note
 from .compare.rank import singular_values
 from .errors import UsageError
 from .maps import export
@@ -53,6 +54,7 @@ from .replay.foliage import CrownIndex, foliage_loss_db, foliage_model
 from .replay.paths import PathSet
 from .replay.replay import Engine, Replay, Scene, replay
 from .report import maps_data as page
+from .report.export import make_folder
 from .site.site import Site
 from .units import AnyArray, ComplexArray, FloatArray, wavelength_m
 
@@ -557,6 +559,7 @@ def _notes(outcome: MapOutcome) -> tuple[str, ...]:
         f"Foliage {modes}: opaque stops whatever touches a crown or a trunk (the paper); attenuating takes "
         "ITU-R P.833 over the path's length in crowns; none leaves the trees out.",
         *_crown_note(outcome),
+        *([note] if "attenuating" in modes and (note := p833_note(s.carrier_hz)) else []),
         "Arrays (MIMO): RSS with equal feed in phase at the tower, mean over the UAV's elements; SISO: one element.",
         f"Spread, condition number, correlation and interpolation are those of foliage {s.shown}.",
     )
@@ -630,7 +633,7 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     written = [
         export.write_csv(folder / "layers.csv", grid, site.frame, every),
         export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),

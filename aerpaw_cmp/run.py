@@ -107,6 +107,7 @@ def run_report(
         settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files, logs_root)
+    from .alternatives import foliage_notes
     from .comparison import audit_replays, compare_rank_series, compare_rss_series
     from .replaying import estimate_clocks, replay_rank, replay_rss
 
@@ -135,7 +136,8 @@ def run_report(
         from .report.export import metrics as metrics_of
         from .report.export import write_report
 
-        record = _report_data(data, rss, rank, engine_record, speed, stages)
+        notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
+        record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -158,7 +160,13 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
 
 
 def _report_data(
-    data: FlightData, rss: list[Any], rank: list[Any], engine: Any, speed: tuple[Any, ...], stages: Stages
+    data: FlightData,
+    rss: list[Any],
+    rank: list[Any],
+    engine: Any,
+    speed: tuple[Any, ...],
+    notes: tuple[str, ...],
+    stages: Stages,
 ) -> Any:
     from .comparison import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
     from .report.data import ReportData
@@ -184,7 +192,7 @@ def _report_data(
         speed=speed,
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *data.site.notes),
+        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
         stages_s=dict(stages.seconds),
     )
@@ -247,7 +255,7 @@ def run_site_import(
 
 
 def run_site_show(
-    site: str,
+    site: str | None,
     out: Path,
     *,
     flight: Path | None = None,
@@ -255,19 +263,29 @@ def run_site_show(
     pose: int | None = None,
     export: bool = False,
 ) -> list[Path]:
-    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths."""
+    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
+
+    Without a site the flight's own is shown; with neither, the packaged one.
+    """
     from .report.site_view import write_site_view
     from .site.siteyaml import load_site
 
-    place, track, paths = load_site(site), None, ()
-    if flight is not None:
+    if pose is not None and flight is None:
+        raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
+    track, paths = None, ()
+    if flight is None:
+        place = load_site(site or "lake_wheeler")
+    else:
         from .comparison import track_of
         from .config import load_flight
         from .flight import gather, read_logs
 
         settings = load_flight(flight)
+        if site is not None:
+            file = str(Path(site).resolve()) if Path(site).is_file() else site
+            settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
-        track = track_of(data)
+        place, track = data.site, track_of(data)
         if pose is not None:
             paths = _paths_of_pose(data, place, track, pose)
     written = write_site_view(place, out, track=track, paths=paths)
@@ -284,7 +302,7 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
 
     import numpy as np
 
-    from .replay.arrays import Poses
+    from .replay.arrays import Link, Poses, single_element
     from .replay.replay import replay
     from .replaying import path_loss, reflecting_crowns
     from .report.site_view import PathLine
@@ -292,7 +310,8 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     if track is None or not 0 <= pose < len(track.time):
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
-    link = data.settings.link.rss.build(list(site.towers), data.folder)
+    # paths join the centres of the arrays: which elements they have does not matter
+    link = Link(data.settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
     data = dataclasses.replace(data, site=site)
     crowns, depth = reflecting_crowns(data), data.settings.rt.max_depth
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
@@ -305,8 +324,8 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
     for index in range(len(found)):
         corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
         source = site.towers[towers[found.tower[index]]].position_m
-        off = ", one off a crown" if found.off_crown[index] else ""
-        label = f"{towers[found.tower[index]]}, {int(found.depth[index])} reflections{off}"
+        count, off = int(found.depth[index]), ", one off a crown" if found.off_crown[index] else ""
+        label = f"{towers[found.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
 

@@ -14,8 +14,9 @@ import math
 import re
 import types
 import typing
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
+from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -48,6 +49,7 @@ _WORDS: dict[str, Any] = {
 }
 
 Location = tuple[Any, ...]
+LineOf = Callable[[Location], "int | None"]
 ModelT = TypeVar("ModelT", bound=pydantic.BaseModel)
 
 
@@ -95,9 +97,49 @@ def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:
     return parse_yaml(_read_text(Path(path)), model, path)
 
 
+def load_yaml_and_lines(path: str | Path, model: type[ModelT]) -> tuple[ModelT, LineOf]:
+    """As :func:`load_yaml`, and a function that gives the line of a key such as ``("towers", "LW1")``.
+
+    For checks that need more than the file, whose messages shall name the line too.
+    """
+    document = _parse(_read_text(Path(path)), path)
+    return _checked(document, model, path), document.line
+
+
+def dump_yaml(content: Mapping[str, Any]) -> str:
+    """Settings as YAML text that :func:`load_yaml` reads back to the same values.
+
+    PyYAML writes for YAML 1.1, where ``1e3`` is a word; words that YAML 1.2 reads as something else are quoted here.
+    """
+    return str(
+        yaml.dump(content, Dumper=_dumper(), sort_keys=False, allow_unicode=True, default_flow_style=None, width=118)
+    )
+
+
+@cache
+def _dumper() -> Any:
+    base: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
+
+    class Dumper(base):  # type: ignore[misc]
+        """Quotes what our reader would not take for a word."""
+
+        def ignore_aliases(self, _: Any) -> bool:
+            return True  # equal lists are written out: '&id001' helps no reader
+
+    def word(dumper: Any, text: str) -> Any:
+        quoted = not isinstance(_plain_value(text), str)
+        return dumper.represent_scalar(_TAG + "str", text, style="'" if quoted else None)
+
+    Dumper.add_representer(str, word)
+    return Dumper
+
+
 def parse_yaml(text: str, model: type[ModelT], path: str | Path | None = None) -> ModelT:
     """YAML text as a checked model; ``path`` is for the messages only."""
-    document = _parse(text, path)
+    return _checked(_parse(text, path), model, path)
+
+
+def _checked(document: _Document, model: type[ModelT], path: str | Path | None) -> ModelT:
     if document.value is None:
         raise UsageError(
             "the file holds no settings", expected=f"keys such as {_listed(_field_names(model)[:4])}", path=path
@@ -291,15 +333,20 @@ class _Builder:
                 self._fail(event, f"the tag '{short}' is not allowed")
         elif event.tag is not None or not event.implicit[0]:
             return text  # quoted, block text, or !!str
-        if text in _WORDS:
-            return _WORDS[text]
-        if _INT.match(text) and len(text) < 40:
-            return int(text)
-        if _HEX.match(text) and len(text) < 40:
-            return int(text, 16)
-        if _FLOAT.match(text):
-            return float(text)
-        return text
+        return _plain_value(text)
+
+
+def _plain_value(text: str) -> Any:
+    """What an unquoted scalar means by the core schema of YAML 1.2."""
+    if text in _WORDS:
+        return _WORDS[text]
+    if _INT.match(text) and len(text) < 40:
+        return int(text)
+    if _HEX.match(text) and len(text) < 40:
+        return int(text, 16)
+    if _FLOAT.match(text):
+        return float(text)
+    return text
 
 
 # ---------------------------------------------------------------- pydantic's findings in our words
@@ -336,6 +383,7 @@ def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | Non
     message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
+    message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # members of an Enum, as they are written
     found = repr(item["input"])
     found = found if len(found) <= 60 else found[:57] + "..."
     return f"{where}: found {found}; expected {message}", None

@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.alternatives import foliage_notes
 from aerpaw_cmp.comparison import (
     Compared,
     audit_replays,
@@ -327,6 +328,43 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
         quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
         settings = audit_replays(quiet, [one], str).settings
         assert {k: v for k, v in settings.items() if "crown" in k} == expected
+
+
+def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path: Path) -> None:
+    at = np.arange(0, 10, 0.5)
+    series = {"USRP1": (at, free_space_db(at))}
+
+    def notes(rt: str, *carriers_hz: float) -> str:
+        return " ".join(foliage_notes(gathered(flight(tmp_path, 20, rss=series, rt=rt)), carriers_hz))
+
+    assert notes("", 3.4e9) == ""
+    assert notes(", foliage: opaque", 3.4e9) == ""
+    stretched = notes(", foliage: attenuating", 3.4e9)
+    assert "extrapolation of ITU-R P.833, whose table of woodland covers 105.9 to 2117.5 MHz" in stretched
+    assert "gamma = 0.47 dB/m and A_m = 42 dB" in stretched
+    assert "out of leaf" not in stretched
+    assert notes(", foliage: attenuating", 2.0e9) == ""
+    assert "Trees at 2.6 GHz" in notes(", foliage: attenuating", 2.0e9, 2.6e9)
+    assert notes(", foliage: attenuating, gamma_db_per_m: 0.6, maximum_loss_db: 40", 3.4e9) == ""
+    assert "divided by 1.2. That is an assumption" in notes(", foliage: attenuating, leaves: out", 2e9)
+    assert "the loss in leaf divided by 1.2" in notes(", paired_foliage: true, foliage_model: weissberger", 2e9)
+
+
+def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
+    """A tower antenna tilted by 90 degrees sees what is overhead at its horizon, and what is level overhead or below."""
+    at = np.arange(0, 30, 0.5)
+    tilted = DIPOLES.replace(", installed_db: [2.0, 0.0]}", "}, pitch_deg: 90")
+    path = flight(tmp_path, 40, rss={"USRP1": (at, free_space_db(at))}, more=tilted)
+    data = gathered(path)
+    (replayed,) = replay_rss(data, str)
+    seen = compare_rss_series(data, data.rss[0], replayed).panel.geometry
+    mount = replayed.link.tower_arrays["LW1"].mount
+    ray = replayed.poses.position_m - data.site.towers["LW1"].position_m
+    upward = np.degrees(np.arcsin(ray @ mount[:, 2] / np.linalg.norm(ray, axis=1)))
+    good = np.isfinite(seen["tower_elevation_deg"])
+    np.testing.assert_allclose(seen["tower_elevation_deg"][good], upward, atol=1e-6)
+    assert np.abs(seen["tower_elevation_deg"] - seen["elevation_deg"])[good].max() > 20
+    assert {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen)
 
 
 DIPOLES = """

@@ -3,6 +3,7 @@
 import json
 import os
 import runpy
+import types
 import zipfile
 from dataclasses import replace
 from pathlib import Path
@@ -345,3 +346,13 @@ def test_kriging_bridges_blocks_of_a_real_flight():
         assert rmse["Kriging"] < 0.6 * rmse["mean"]
         assert rmse["replay + Kriging"] < rmse["Kriging"]
         assert rmse["replay + Kriging"] < 0.7 * rmse["replay + mean"]
+
+
+def test_the_notes_say_where_p833_is_continued():
+    def notes(**change):
+        bare = types.SimpleNamespace(trees=())
+        return " ".join(mapping._notes(types.SimpleNamespace(settings=settings(**change), site=bare)))
+
+    assert "Trees at 3.4 GHz: an extrapolation of ITU-R P.833" in notes(foliage=("opaque", "attenuating"))
+    assert "extrapolation" not in notes(foliage=("opaque", "none"))
+    assert "extrapolation" not in notes(foliage=("attenuating",), carrier_hz=1.8e9)

@@ -188,7 +188,8 @@ class RssPanel:
     fitted : tuple of str
         Names of the numbers that were fitted on the very data they are scored on.
     geometry : mapping
-        Keys of :data:`GEOMETRY` to arrays (n,), for the residual plots.
+        Keys of :data:`GEOMETRY` to arrays (n,), for the residual plots; ``tower_elevation_deg`` besides, the elevation
+        of the UAV in the frame of the tower antenna.
     line_of_sight : (n,) bool, optional
         For the residual plots.
     variants : tuple of Variant

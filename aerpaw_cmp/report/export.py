@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..errors import UsageError
 from ..files import whole
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 
@@ -317,11 +318,24 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
 
 
+def make_folder(folder: Path) -> Path:
+    """The folder, made when missing; UsageError where it cannot be."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        cause = "a file is in the way, or there is no right to write here"
+        raise UsageError(f"the folder cannot be made ({error.strerror})", cause=cause, path=folder) from None
+    return folder
+
+
 def write_atomic(path: Path, content: str | bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never a part."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with whole(path) as part:
-        part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+    """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
+    make_folder(path.parent)
+    try:
+        with whole(path) as part:
+            part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+    except OSError as error:
+        raise UsageError(f"cannot be written ({error.strerror or error})", path=path) from None
     return path
 
 
@@ -360,7 +374,7 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     from . import figures, html
 
     folder = Path(folder)
-    folder.mkdir(parents=True, exist_ok=True)
+    make_folder(folder)
     numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     written = [write_atomic(folder / "metrics.json", numbers)]
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..site.site import Site
+from ..site.site import Site, Trees
 from ..units import AnyArray, BoolArray, FloatArray
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
 from .export import k_key, safe_name
@@ -342,10 +342,7 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
             label=f"forest{invented}" if number == 0 else None,
         )  # fmt: skip
     if len(site.trees):
-        ax.scatter(
-            site.trees.east_m, site.trees.north_m, s=2, color="#5E8C4F", linewidths=0, rasterized=True, zorder=0.4,
-            label=f"tree{invented}",
-        )  # fmt: skip
+        _draw_crowns(ax, site.trees, f"tree{invented}")
     for number, building in enumerate(site.buildings):
         patch(
             building.footprint, facecolor=BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
@@ -369,6 +366,21 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
                 bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
             )  # fmt: skip
     plan_axes(ax)
+
+
+def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
+    """Crowns to scale, each with a dot where the trunk stands."""
+    from matplotlib.collections import EllipseCollection
+
+    wide, places = trees.crown_diameter_m, np.column_stack([trees.east_m, trees.north_m])
+    crowns = EllipseCollection(
+        wide, wide, np.zeros(len(trees)), units="xy", offsets=places, offset_transform=ax.transData,
+        facecolor="#5E8C4F", alpha=0.45, linewidth=0, zorder=0.4,
+    )  # fmt: skip
+    crowns.set_rasterized(True)
+    ax.add_collection(crowns, autolim=False)
+    ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
+    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label=label)
 
 
 def plan_axes(ax: Axes) -> None:
@@ -745,32 +757,36 @@ def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, few
     return levels
 
 
-def seen_from_tower(panel: RssPanel) -> Figure:
-    """Where the tower's antenna sees the UAV, in the antenna's own frame, coloured by the residual."""
-    azimuth, elevation = panel.geometry["azimuth_deg"], panel.geometry["elevation_deg"]
+def seen_from_antennas(panel: RssPanel) -> Figure:
+    """Where the tower's antenna sees the UAV and the UAV's sees the tower, each in its own frame; colour: residual."""
+    seen = panel.geometry
+    views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
+    if {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen):
+        views.append(("tower, UAV antenna frame", seen["uav_azimuth_deg"], seen["uav_elevation_deg"]))
     residual = panel.residual_db
-    good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+    known = residual[np.isfinite(residual)]
+    reach = float(np.percentile(np.abs(known), 98)) if known.size else 1.0
     fig = figure((9.2, 3.6))
-    ax = fig.subplots()
-    reach = float(np.percentile(np.abs(residual[good]), 98)) if good.any() else 1.0
-    if (~good).any():
-        ax.plot(
-            azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
-            rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
+    axes = fig.subplots(1, len(views), squeeze=False)[0]
+    for ax, (words, azimuth, elevation) in zip(axes, views, strict=True):
+        good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+        if (~good).any():
+            ax.plot(
+                azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+                rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
+            )  # fmt: skip
+        points = ax.scatter(
+            azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach,
+            linewidths=0, rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
         )  # fmt: skip
-    points = ax.scatter(
-        azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach, linewidths=0,
-        rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
-    )  # fmt: skip
-    span = max(float(np.ptp(azimuth[good])), 1.0) if good.any() else 360.0
-    nearest = float(np.min(np.abs(azimuth[good]), initial=180.0))
-    if nearest < 0.3 * span:  # farther away it would squeeze the flight into a corner
         ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
-    ax.set_facecolor("#F4F4F4")
-    ax.set_xlabel("Azimuth in the frame of the tower antenna (0: boresight) [deg]")
-    ax.set_ylabel("Elevation [deg]")
-    colour_bar(fig, points, ax, "Measured − simulated [dB]", beyond(residual[good], -reach, reach))
-    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
+        ax.set_facecolor("#F4F4F4")
+        ax.set_xlim(-180, 180)
+        ax.set_xticks(range(-180, 181, 90))
+        ax.set_xlabel(f"Azimuth of the {words} [deg]")
+        ax.set_ylabel("Elevation in that frame [deg]")
+    colour_bar(fig, points, list(axes), "Measured − simulated [dB]", beyond(known, -reach, reach))
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
     return fig
 
 
@@ -1253,11 +1269,12 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
             Plate(
                 name=f"rss_angles_{stem}",
                 section=section,
-                title=f"{panel.name}: from where the antenna sees the UAV",
-                caption="Azimuth and elevation of the UAV in the frame of the tower antenna. Patches of one colour "
-                "point to the antenna pattern or its mounting.",
-                alt=f"Azimuth and elevation at which {panel.name} sees the UAV, coloured by residual.",
-                draw=lambda: seen_from_tower(panel),
+                title=f"{panel.name}: from where the antennas see each other",
+                caption="Azimuth (from the boresight towards its left) and elevation of the UAV in the frame of the "
+                "tower antenna, and of the tower in the frame of the UAV antenna, which turns with the aircraft where "
+                "rt.attitude says so. Patches of one colour point to an antenna pattern or its mounting.",
+                alt=f"Azimuth and elevation at which the antennas of {panel.name} see each other, by residual.",
+                draw=lambda: seen_from_antennas(panel),
             )
         )
     return result

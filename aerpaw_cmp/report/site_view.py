@@ -13,6 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import shapely
+from shapely.geometry import Polygon
 
 from ..site.site import Building, Site, Trees
 from ..units import FloatArray
@@ -30,6 +32,9 @@ FLIGHT_POINTS = 2000
 
 PATH_COLOURS = ("#111111", "#D55E00", "#009E73", "#CC79A7")
 """By number of reflections: none, one, two, more."""
+UAV_MARK: dict[str, Any] = {
+    "marker": "o", "markersize": 7, "color": "#F0C000", "markeredgecolor": "black", "linestyle": "none", "zorder": 8,
+}  # fmt: skip
 PATH_DASHES = ("-", (0, (5, 2)), (0, (1, 1.5)), (0, (6, 2, 1, 2)))
 
 
@@ -53,7 +58,11 @@ def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ())
         for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
             points.append(np.array([*corner, building.base_m + building.height_m]))
     for forest in site.forests:
-        points += [np.array([*corner, 0.0]) for corner in np.asarray(forest.area.exterior.coords)[:, :2]]
+        points += list(_flat(np.asarray(forest.area.exterior.coords)[:, :2], 0.0))
+    for fence in site.geofences:
+        points += list(_flat(np.asarray(fence.area.exterior.coords)[:, :2], 0.0))
+    if len(trees := site.trees):
+        points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
     if track is not None and len(track.time):
         points += list(np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // 500)])
     points += [vertex for path in paths for vertex in path.points_m]
@@ -67,6 +76,11 @@ def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ())
     return np.array(
         [[low[0] - margin, high[0] + margin], [low[1] - margin, high[1] + margin], [ground, max(high[2] * 1.1, 30.0)]]
     )
+
+
+def uav_of(paths: Sequence[PathLine]) -> FloatArray | None:
+    """Where the paths of one pose end (3,), or None without paths."""
+    return np.asarray(paths[0].points_m[-1], dtype=np.float64) if paths else None
 
 
 def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> Figure:
@@ -89,6 +103,9 @@ def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ())
             linewidth=1.2, zorder=4.5, label=None if kind in seen else reflections_label(kind),
         )  # fmt: skip
         seen.add(kind)
+    if (uav := uav_of(paths)) is not None:
+        ax.plot(*uav[:2], **UAV_MARK, label=f"UAV, {uav[2]:.0f} m up")
+    ax.set_axisbelow(True)
     ax.set_xlim(*limits[0])
     ax.set_ylim(*limits[1])
     ax.set_title(site.name, wrap=True)
@@ -104,6 +121,7 @@ def reflections_label(kind: int) -> str:
 
 def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> Figure:
     """Perspective picture; heights are stretched where the site is wide, and the axis says by how much."""
+    from matplotlib import patheffects
     from mpl_toolkits.mplot3d import Axes3D  # noqa: F401 - registers the projection
 
     limits = view_limits(site, track, paths)
@@ -120,7 +138,11 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
             [tower.east_m] * 2, [tower.north_m] * 2, [tower.ground_m, tower.position_m[2]], color=figures.TOWER,
             linewidth=2.2, zorder=5, label="tower" if number == 0 else None,
         )  # fmt: skip
-        ax.text(*tower.position_m, f" {tower.name}", fontsize=8, fontweight="bold", zorder=8)
+        halo = [patheffects.withStroke(linewidth=2.5, foreground="white")]
+        ax.text(
+            *tower.position_m, f" {tower.name}", fontsize=8, fontweight="bold", zorder=8, path_effects=halo,
+            verticalalignment="bottom",
+        )  # fmt: skip
     if track is not None and len(track.time):
         step = max(1, len(track.time) // FLIGHT_POINTS)
         ax.plot(
@@ -135,6 +157,9 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
             label=None if kind in seen else reflections_label(kind),
         )  # fmt: skip
         seen.add(kind)
+    if (uav := uav_of(paths)) is not None:
+        ax.plot(*[[value] for value in uav], **UAV_MARK, label=f"UAV, {uav[2]:.0f} m up")
+    ax.set_title(site.name, wrap=True)
     ax.set(xlim=limits[0], ylim=limits[1], zlim=limits[2])
     ax.set_box_aspect((width, height, up * stretch), zoom=1.2)
     ax.view_init(elev=32, azim=-62)
@@ -152,14 +177,31 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
 def _solid_ground(ax: Any, site: Site, invented: str) -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    rings = [np.asarray(forest.area.exterior.coords)[:, :2] for forest in site.forests]
-    flat = [np.column_stack([ring, np.zeros(len(ring))]) for ring in rings]
+    flat = [_flat(outline(forest.area), 0.0) for forest in site.forests]
     if flat:
-        ax.add_collection3d(
-            Poly3DCollection(
-                flat, facecolor=figures.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
-            )
+        areas = Poly3DCollection(
+            flat, facecolor=figures.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
         )
+        # matplotlib 3.11 would scale by corners that polygons of unlike length do not have; the limits are set anyway
+        ax.add_collection3d(areas, autolim=False)
+    for number, fence in enumerate(site.geofences):
+        line = np.asarray(fence.area.exterior.coords)[:, :2]
+        ax.plot(
+            *_flat(line, 0.0).T, color="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=2,
+            label="geofence" if number == 0 else None,
+        )  # fmt: skip
+
+
+def outline(area: Polygon) -> FloatArray:
+    """Corners (n, 2) of an area as one line that also runs round its holes, so that filling it leaves them empty."""
+    area = shapely.orient_polygons(area)
+    outer = np.asarray(area.exterior.coords)[:, :2]
+    holes = [part for ring in area.interiors for part in (np.asarray(ring.coords)[:, :2], outer[:1])]
+    return np.concatenate([outer, *holes])
+
+
+def _flat(line_m: FloatArray, up_m: float) -> FloatArray:
+    return np.column_stack([line_m, np.full(len(line_m), up_m)])
 
 
 def walls(building: Building) -> list[FloatArray]:
@@ -170,8 +212,7 @@ def walls(building: Building) -> list[FloatArray]:
         corners = np.asarray(ring.coords)[:, :2]
         for (e0, n0), (e1, n1) in pairwise(corners):
             result.append(np.array([[e0, n0, base], [e1, n1, base], [e1, n1, top], [e0, n0, top]]))
-    outline = np.asarray(building.footprint.exterior.coords)[:, :2]
-    result.append(np.column_stack([outline, np.full(len(outline), top)]))
+    result.append(_flat(outline(building.footprint), top))
     return result
 
 
@@ -185,7 +226,7 @@ def _solid_buildings(ax: Any, buildings: Sequence[Building], invented: str) -> N
         faces, facecolor="#B5B5B5", edgecolor="black", linewidth=0.4, label=f"building{invented}", zorder=4
     )
     prisms.set_rasterized(len(faces) > 300)
-    ax.add_collection3d(prisms)
+    ax.add_collection3d(prisms, autolim=False)
 
 
 def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
@@ -203,7 +244,7 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
         crowns, facecolor="#7FAE6E", edgecolor="#3F6136", linewidth=0.25, label=f"tree{invented}{part}", zorder=3
     )
     cones.set_rasterized(True)
-    ax.add_collection3d(cones)
+    ax.add_collection3d(cones, autolim=False)
 
 
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
@@ -223,7 +264,8 @@ def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
         "buildings": [
             {"name": b.name, "height": b.height_m, "faces": [listed(face) for face in walls(b)]} for b in site.buildings
         ],
-        "forests": [listed(f.area.exterior.coords) for f in site.forests],
+        "forests": [listed(outline(f.area)) for f in site.forests],
+        "fences": [listed(g.area.exterior.coords) for g in site.geofences],
         "trees": listed(np.column_stack([getattr(trees, c)[pick] for c in columns])) if len(pick) else [],
         "towers": [{"name": t.name, "at": listed([t.east_m, t.north_m, t.ground_m]), "top": float(t.position_m[2])}
                    for t in site.towers.values()],

@@ -13,9 +13,10 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -29,6 +30,9 @@ HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 
 MAXIMUM_EFFICIENCY = 1.12
 """Mean gain over the sphere that a file may have: no antenna radiates more than it gets, 0.5 dB is calibration."""
+
+MINIMUM_EFFICIENCY = 0.01
+"""A mean gain below -20 dB is a field in other units, or normalised; measured antennas lie near 0.5."""
 
 HIGHEST_DBI = 60.0
 """No element has more gain; a file that says so holds something else."""
@@ -282,16 +286,35 @@ def _read_rows(path: Path) -> _Rows:
         elif started and line.strip():
             values.append(_numbers(line, path, number))
             rows.lines.append(number)
+    _check_last_line(text, rows, path)
     if not values:
         raise InputError("no pattern found", expected="a header line 'Phi  Theta  E Total. dB ...' and rows", path=path)
     rows.values = np.array(values)
     return rows
 
 
+def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
+    """A file without a last line end whose last number is shorter than all above it was cut off inside that number."""
+    if not rows.lines or text.endswith(("\n", "\r")):
+        return
+    lines = text.splitlines()
+    places = [len(lines[number - 1].split()[-1].rpartition(".")[2]) for number in rows.lines]
+    if len(places) > 1 and len(set(places[:-1])) == 1 and places[-1] < places[0]:
+        raise InputError(
+            f"the last number, '{lines[rows.lines[-1] - 1].split()[-1]}', has fewer digits than those above it",
+            cause="the line was cut off",
+            path=path,
+            line=rows.lines[-1],
+        )
+
+
 def _check_header(line: str, path: Path, number: int) -> None:
     found = [cell.strip().lower() for cell in line.split("\t")]
     if len(found) != 7 or not all(cell.startswith(column) for cell, column in zip(found, _COLUMNS, strict=True)):
-        raise InputError(f"the columns are {', '.join(found)}", expected=", ".join(_COLUMNS), path=path, line=number)
+        cause = "the columns are not separated by tabs" if len(found) == 1 else None
+        raise InputError(
+            f"the columns are {', '.join(found)}", expected=", ".join(_COLUMNS), cause=cause, path=path, line=number
+        )
 
 
 def _numbers(line: str, path: Path, number: int) -> list[float]:
@@ -301,10 +324,11 @@ def _numbers(line: str, path: Path, number: int) -> list[float]:
     except ValueError:
         row = []
     if len(row) != 7 or not all(math.isfinite(cell) for cell in row):
+        cause = "the line was cut off" if len(cells) < 7 else None
         raise InputError(
             f"{len(cells)} fields: '{line.strip()[:60]}'",
             expected="7 numbers",
-            cause="the line was cut off" if len(cells) < 7 else None,
+            cause="decimal commas in place of points" if re.search(r"\d,\d", line) else cause,
             path=path,
             line=number,
         )
@@ -359,8 +383,9 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
             f"{int((seen != 1).sum())} directions are missing or given twice, the first at phi "
             f"{math.degrees(phi[i]):.1f} deg, theta {math.degrees(theta[j]):.1f} deg ({what})",
             expected=f"each of {len(phi)} x {len(theta)} directions once",
-            cause="the file was cut off" if what == "missing" else None,
+            cause="the file was cut off, or a line is lost" if what == "missing" else "a line was copied",
             path=path,
+            line=None if what == "missing" else rows.lines[np.flatnonzero((at_phi == i) & (at_theta == j))[1]],
         )
     folded = theta[0] < -0.1
     span = np.pi if folded else 2 * np.pi
@@ -421,11 +446,11 @@ def _points_along_phi(e_theta: ComplexArray, e_phi: ComplexArray) -> bool:
 
 
 def _check_power(pattern: MeasuredPattern, path: Path) -> None:
-    if not 0 < pattern.efficiency <= MAXIMUM_EFFICIENCY:
+    if not MINIMUM_EFFICIENCY <= pattern.efficiency <= MAXIMUM_EFFICIENCY:
         raise InputError(
             f"the mean gain over the sphere is {float(db_from_power(pattern.efficiency)):.1f} dB "
             f"(peak {pattern.peak_gain_dbi:.1f} dBi)",
-            expected="a mean of at most 0 dB",
+            expected=f"a mean of {float(db_from_power(MINIMUM_EFFICIENCY)):g} to 0 dB",
             cause="the values are not gain over isotropic",
             path=path,
         )
@@ -468,14 +493,16 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     if not {"theta2", "phi2"} <= set(content):
         raise InputError("no variables 'theta2' and 'phi2'", expected="a file of gain grids (rad_pat.mat)", path=path)
     elevation, azimuth = np.ravel(content["theta2"]).astype(float), np.ravel(content["phi2"]).astype(float)
-    shape = (len(elevation), len(azimuth))
-    grids = [key for key, value in content.items() if isinstance(value, np.ndarray) and value.shape == shape]
-    if variable not in grids:
-        raise UsageError(f"no gain grid '{variable}'", expected="one of " + ", ".join(grids), path=path)
+    gain = _grid_of(content, variable, (len(elevation), len(azimuth)), path)
     _check_angles(elevation, azimuth, path)
-    gain = np.asarray(content[variable], dtype=float)
     if not np.isfinite(gain).all():
-        raise InputError(f"'{variable}' has {int((~np.isfinite(gain)).sum())} values that are no numbers", path=path)
+        row, column = np.argwhere(~np.isfinite(gain))[0]
+        raise InputError(
+            f"'{variable}' has {int((~np.isfinite(gain)).sum())} values that are no numbers, the first at elevation "
+            f"{elevation[row]:g} deg, azimuth {azimuth[column]:g} deg",
+            expected="dBi in every direction",
+            path=path,
+        )
     if gain.max() > HIGHEST_DBI:
         raise InputError(f"'{variable}' reaches {gain.max():g}", expected=f"dBi, at most {HIGHEST_DBI:g}", path=path)
     by_azimuth = np.argsort(np.round(azimuth % 360.0, 6) % 360.0)
@@ -485,6 +512,26 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     return pattern
 
 
+def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], path: Path) -> FloatArray:
+    """The grid of that name, if it has a row per elevation and a column per azimuth."""
+    found = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
+    grids = sorted(key for key, size in found.items() if size == shape)
+    if variable in grids:
+        return np.asarray(content[variable], dtype=float)
+    rows = f"{shape[0]} elevations x {shape[1]} azimuths"
+    if variable not in found:
+        raise UsageError(
+            f"no gain grid '{variable}'", expected=f"one of {', '.join(grids) or 'none'} ({rows})", path=path
+        )
+    size = found[variable]
+    raise UsageError(
+        f"'{variable}' has {' x '.join(map(str, size))} values",
+        expected=rows,
+        cause="rows and columns are swapped" if size == shape[::-1] else "rows or columns are missing",
+        path=path,
+    )
+
+
 def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> None:
     wanted_elevation = np.linspace(-90, 90, len(elevation))
     wanted_azimuth = np.arange(len(azimuth)) * (360.0 / len(azimuth))
@@ -492,10 +539,18 @@ def _check_angles(elevation: FloatArray, azimuth: FloatArray, path: Path) -> Non
         ("elevation (theta2)", np.sort(elevation), wanted_elevation),
         ("azimuth (phi2)", np.sort(np.round(azimuth % 360.0, 6) % 360.0), wanted_azimuth),
     ):
-        if np.abs(found - wanted).max() > 0.05:
-            raise InputError(
-                f"{what} runs from {found[0]:g} to {found[-1]:g} in {len(found)} values",
-                expected=f"{wanted[0]:g} to {wanted[-1]:g} deg, equally spaced",
-                cause="radians instead of degrees" if np.abs(found).max() < 7 else "angles are missing",
-                path=path,
-            )
+        if len(found) >= 3 and np.abs(found - wanted).max() <= 0.05:  # false for NaN too
+            continue
+        cause = "angles are missing"
+        if len(found) >= 3 and 0 < np.abs(found).max() < 7:
+            cause = "radians instead of degrees"
+        elif len(set(found.tolist())) < len(found):
+            cause = "a direction stands twice, such as 0 and 360 deg"
+        elif len(found) >= 3 and np.abs(found - 90 - wanted).max() <= 0.05:
+            cause = "zenith angles in place of elevation"
+        raise InputError(
+            f"{what} runs from {found.min(initial=np.inf):g} to {found.max(initial=-np.inf):g} in {len(found)} values",
+            expected=f"{wanted[0]:g} to {wanted[-1]:g} deg, equally spaced" if len(found) >= 3 else "a whole sphere",
+            cause=cause,
+            path=path,
+        )

@@ -19,6 +19,9 @@ from ..geodesy import SiteFrame
 from ..units import BoolArray, FloatArray
 
 EARTH_RADIUS_M = 6_371_000.0
+LOWEST_M, HIGHEST_M = -500.0, 9000.0
+"""Ground on Earth lies between; other values are gaps that the file does not declare, or other units."""
+
 MAX_BYTES = 512 * 1024 * 1024
 _SAMPLES_AT_ONCE = 1_000_000
 
@@ -68,20 +71,33 @@ class Dem:
                     cause="they are metres or feet: another crs",
                 )
         if np.isnan(self.absolute_m(0.0, 0.0)):
+            gap = self._covers_origin()
             raise InputError(
                 "the elevation model has no height at the site's origin",
                 expected="a grid that covers the site",
-                cause="another place, another crs, or latitude and longitude swapped",
+                cause="its cells there are gaps (nodata)"
+                if gap
+                else "another place, another crs, or latitude and longitude swapped",
             )
 
-    def absolute_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
-        """Height of the ground in the grid's own reference [m]; bilinear, NaN outside."""
+    def _covers_origin(self) -> bool:
+        """Whether the origin lies within the grid, whatever its cells hold."""
+        column, row = self._cell(0.0, 0.0)
+        rows, columns = self.height_m.shape
+        return bool(0 <= column <= columns - 1 and 0 <= row <= rows - 1)
+
+    def _cell(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
+        """Column and row, with fractions, of places."""
         x, y = np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64)
         if self._to_grid is not None:
             latitude, longitude = self.frame.to_geographic(x, y)
             x, y = (np.asarray(value) for value in self._to_grid.transform(longitude, latitude))
+        return (x - self.west) / self.step_x, (y - self.south) / self.step_y
+
+    def absolute_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:
+        """Height of the ground in the grid's own reference [m]; bilinear, NaN outside."""
         rows, columns = self.height_m.shape
-        column, row = (x - self.west) / self.step_x, (y - self.south) / self.step_y
+        column, row = self._cell(east_m, north_m)
         inside = (column >= 0) & (column <= columns - 1) & (row >= 0) & (row <= rows - 1)
         column, row = np.where(inside, column, 0.0), np.where(inside, row, 0.0)
         i = np.minimum(row.astype(np.int64), max(rows - 2, 0))
@@ -178,43 +194,74 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
 
 def _read_ascii(path: Path, frame: SiteFrame, crs: str) -> Dem:
     try:
-        lines = path.read_text(encoding="ascii").splitlines()
+        lines = path.read_bytes().decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise InputError("not text", expected="an ESRI ASCII grid", path=path) from None
+    header, begin = _ascii_header(lines, path)
+    rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
+    gap = header.get("nodata_value", -9999.0)
+    values: list[FloatArray] = []
+    for number, line in enumerate(lines[begin:], start=begin + 1):
+        if line.strip():
+            values.append(_ascii_cells(line, gap, path, number))
+    flat = np.concatenate(values) if values else np.zeros(0)
+    if flat.size != rows * columns:
+        raise InputError(
+            f"{flat.size} cells",
+            expected=f"{rows} x {columns}",
+            cause="the file was cut off" if flat.size < rows * columns else "nrows or ncols is wrong",
+            path=path,
+            line=len(lines),
+        )
+    west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
+    south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
+    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame)
+
+
+def _ascii_header(lines: list[str], path: Path) -> tuple[dict[str, float], int]:
+    """Values of the header, and the number of its lines."""
     header: dict[str, float] = {}
-    while len(header) < len(lines) and (word := lines[len(header)].split()) and word[0][0].isalpha():
+    begin = 0
+    while begin < len(lines) and (word := lines[begin].split()) and word[0][0].isalpha() and word[0].lower() != "nan":
+        begin += 1
         try:
             header[word[0].lower()] = float(word[1])
         except (IndexError, ValueError):
-            raise InputError(f"'{lines[len(header)][:40]}' is no header", path=path, line=len(header) + 1) from None
+            raise InputError(f"'{lines[begin - 1][:40]}' is no header", path=path, line=begin) from None
     missing = {"ncols", "nrows", "cellsize"} - set(header)
     if missing or not ({"xllcorner", "xllcenter"} & set(header) and {"yllcorner", "yllcenter"} & set(header)):
         raise InputError(
             "not an ESRI ASCII grid", expected="ncols, nrows, xllcorner, yllcorner, cellsize", path=path, line=1
         )
-    rows, columns, step = int(header["nrows"]), int(header["ncols"]), header["cellsize"]
-    values: list[FloatArray] = []
-    for number, line in enumerate(lines[len(header) :], start=len(header) + 1):
-        if not line.strip():
-            continue
-        try:
-            row = np.array(line.split(), dtype=np.float64)
-        except ValueError:
-            raise InputError("a cell is not a number", path=path, line=number) from None
-        values.append(row)
-    flat = np.concatenate(values) if values else np.zeros(0)
-    if rows < 2 or columns < 2 or step <= 0 or flat.size != rows * columns:
+    for name in ("ncols", "nrows"):
+        if not (2 <= header[name] <= 1e6 and header[name] == int(header[name])):
+            raise InputError(f"{name} is {header[name]:g}", expected="a whole number from 2 on", path=path)
+    if not (0 < header["cellsize"] < np.inf):
+        raise InputError(f"cellsize is {header['cellsize']:g}", expected="a positive number", path=path)
+    return header, begin
+
+
+def _ascii_cells(line: str, gap: float, path: Path, number: int) -> FloatArray:
+    try:
+        row = np.array(line.split(), dtype=np.float64)
+    except ValueError:
+        cause = "decimal commas in place of points" if "," in line else None
+        raise InputError("a cell is not a number", cause=cause, path=path, line=number) from None
+    return _plausible(np.where(row == gap, np.nan, row), path, number)
+
+
+def _plausible(height_m: FloatArray, path: Path, line: int | None = None) -> FloatArray:
+    """The heights, if each is a gap or one that ground on Earth can have."""
+    wrong = height_m[(height_m < LOWEST_M) | (height_m > HIGHEST_M)]
+    if wrong.size:
         raise InputError(
-            f"{flat.size} cells",
-            expected=f"{rows} x {columns}",
-            cause="the file was cut off",
+            f"a height of {wrong[0]:g} m",
+            expected=f"{LOWEST_M:g} to {HIGHEST_M:g} m",
+            cause="a gap that the file's NODATA value does not declare, or feet or centimetres",
             path=path,
-            line=len(lines),
+            line=line,
         )
-    flat = np.where(flat == header.get("nodata_value", -9999.0), np.nan, flat)
-    west = header.get("xllcenter", header.get("xllcorner", 0.0) + step / 2)
-    south = header.get("yllcenter", header.get("yllcorner", 0.0) + step / 2)
-    return _placed(path, Dem, flat.reshape(rows, columns)[::-1], west, south, step, step, crs, frame)
+    return height_m
 
 
 def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
@@ -228,12 +275,24 @@ def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # our own message says it
             with rasterio.open(path) as image:
+                if image.count != 1:
+                    raise InputError(
+                        f"{image.count} bands",
+                        expected="one band of heights",
+                        cause="a picture, not heights",
+                        path=path,
+                    )
                 band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
-                transform, crs = image.transform, image.crs
+                transform, crs, unit = image.transform, image.crs, str(image.units[0] or "").lower()
     except rasterio.errors.RasterioError as error:
         raise InputError(f"not a GeoTIFF ({error})", path=path) from None
     if crs is None or transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
         raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so", path=path)
+    if unit.startswith(("f", "us survey f")):
+        raise InputError(
+            f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts", path=path
+        )
+    band = _plausible(band, path)
     west = transform.c + transform.a / 2
     south = transform.f + transform.e * (band.shape[0] - 0.5)
     return _placed(path, Dem, band[::-1], west, south, transform.a, -transform.e, crs.to_string(), frame)

@@ -1,36 +1,37 @@
 """Buildings, forests and geofences from map files: classified, projected, repaired, with a list of what was done.
 
-Heights: the ``height`` tag, else ``building:levels`` times 3 m, else a default. Overlapping buildings of one height
-become one; of different heights the higher keeps the ground. Holes stay. Slivers and duplicates go.
+Heights: the ``height`` tag, else ``building:levels`` times 3 m, else a default. Parts of a building keep the ground
+before its outline. Overlapping buildings of one height become one; of different heights the higher keeps the ground.
+Holes stay. Slivers and duplicates go. Single trees keep their tagged sizes; tree rows become trees along their line.
 """
 
 from __future__ import annotations
 
 import math
-import re
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, get_args
 
 import numpy as np
 import shapely
-import yaml
-from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from ..errors import InputError, UsageError
 from ..files import whole
 from ..geodesy import SiteFrame
-from .mapfiles import MapFile, Outline, Position, read_map_file
-from .materials import MATERIALS
+from ..units import FloatArray
+from ..yamlfile import dump_yaml
+from .mapfiles import read_map_file
+from .outlines import MapFile, Outline, Position, TreeLine
 from .site import Building, Forest, Geofence
-from .siteyaml import SiteModel, site_model
+from .siteyaml import SiteModel, extent_m, site_model
+from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metres, positive_metres
 
 LEVEL_M = 3.0
 DEFAULT_HEIGHT_M = 6.0
-FOOT_M = 0.3048
 TALLEST_M = 300.0
 FAR_M = 20_000.0
 """Outlines farther from the origin are not of this site."""
@@ -44,29 +45,43 @@ SLIVER_M = 0.3
 MINIMUM_AREA_M2 = 2.0
 SAME_HEIGHT_M = 0.25
 
-Kind = Literal["building", "forest", "geofence"]
+OSM_KINDS = ("OSM XML", "Overpass JSON")
+"""Formats whose data are OpenStreetMap's."""
 
-_FOREST_TAGS = (("landuse", "forest"), ("natural", "wood"), ("landcover", "trees"))
-_MATERIAL_WORDS = {
-    "steel": "metal",
-    "aluminium": "metal",
-    "sheet": "metal",
-    "stone": "marble",
-    "timber_framing": "wood",
-}
+FOREST_MARGIN_M = 1000.0
+"""Forests are cut off this far outside the area of the site: trees there shadow nothing."""
+
+TALLEST_TREE_M = 120.0
+ROW_SPACING_M = 10.0
+"""Distance of the trees of a row without a tagged crown diameter: the default crowns touch."""
+
+MAXIMUM_ROW_TREES = 10_000
+
+
+@dataclass(frozen=True, slots=True)
+class SingleTree:
+    """A tree of a map file in the site frame [m]; sizes that it does not state are None."""
+
+    east_m: float
+    north_m: float
+    height_m: float | None = None
+    crown_diameter_m: float | None = None
+    trunk_diameter_m: float | None = None
 
 
 @dataclass(slots=True)
 class Footprints:
     """What was found in map files, in the site frame, and what was done to it.
 
-    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``.
+    ``actions`` are sentences for the user; those that ask for a look begin with ``warning:``. ``credits`` name those
+    whose data they are.
     """
 
     buildings: list[Building] = field(default_factory=list)
     forests: list[Forest] = field(default_factory=list)
     geofences: list[Geofence] = field(default_factory=list)
-    trees_m: list[tuple[float, float]] = field(default_factory=list)
+    trees: list[SingleTree] = field(default_factory=list)
+    credits: list[str] = field(default_factory=list)
     actions: list[str] = field(default_factory=list)
 
 
@@ -80,6 +95,7 @@ class _Shape:
     height_m: float = 0.0
     stated: bool = False
     material: str = "concrete"
+    part: bool = False
 
 
 def import_footprints(
@@ -90,13 +106,14 @@ def import_footprints(
     default_height_m: float = DEFAULT_HEIGHT_M,
     trees_per_hectare: float = 100.0,
     minimum_spacing_m: float = 4.0,
+    area_m: tuple[float, float, float, float] | None = None,
 ) -> Footprints:
     """Outlines of map files as records of the site.
 
     Parameters
     ----------
     files : sequence of paths
-        GeoJSON, OSM XML, Overpass JSON or KML, told by content.
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ, told by content.
     frame : SiteFrame
         Of the site that they belong to.
     untagged : {"building", "forest", "geofence"}, optional
@@ -105,6 +122,8 @@ def import_footprints(
         Of buildings without height and levels.
     trees_per_hectare, minimum_spacing_m : float
         Of all forests found.
+    area_m : (east_min, east_max, north_min, north_max), optional
+        Of the site; forests are cut off :data:`FOREST_MARGIN_M` outside.
 
     Returns
     -------
@@ -114,38 +133,106 @@ def import_footprints(
     ------
     InputError
         Unreadable file, swapped coordinates, a file of another place, heights that cannot be metres, or no area.
+    UsageError
+        ``untagged`` is no kind of area.
     """
+    if untagged is not None and untagged not in get_args(Kind):
+        raise UsageError(f"untagged areas as '{untagged}'", expected="one of " + ", ".join(get_args(Kind)))
     result = Footprints()
     shapes: dict[Kind, list[_Shape]] = {"building": [], "forest": [], "geofence": []}
     for path in files:
         content = read_map_file(path)
         _check_place(content, frame, Path(path))
-        skipped: Counter[str] = Counter()
-        for outline in content.outlines:
-            kind = _kind(outline, content.kind, untagged)
-            if kind is None:
-                skipped[_main_tag(outline)] += 1
-                continue
-            result.actions += [f"{outline.source}: {problem}" for problem in outline.broken]
-            shape = _project(outline, frame, result.actions)
-            if shape is not None:
-                if kind == "building":
-                    _describe(shape, outline, default_height_m, Path(path), result.actions)
-                shapes[kind].append(shape)
-        if skipped:
-            listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
-            result.actions.append(f"{Path(path).name}: left out, neither building nor forest: {listed}")
-        if content.trees:
-            east, north = frame.to_local(*np.array(content.trees).T)
-            result.trees_m += list(zip(east.tolist(), north.tolist(), strict=True))
+        result.actions += content.notes
+        if content.kind in OSM_KINDS:
+            result.credits.append(f"{Path(path).name}: (c) OpenStreetMap contributors, ODbL")
+        _sort(content, Path(path), frame, untagged, default_height_m, shapes, result.actions)
+        for tree in content.trees:
+            result.trees += _single_trees(tree, frame, result.actions)
     _warn_of_feet(shapes["building"], result.actions)
+    near = None if area_m is None else box(area_m[0], area_m[2], area_m[1], area_m[3]).buffer(FOREST_MARGIN_M)
+    shapes["forest"] = _cut_off(shapes["forest"], near, result.actions)
     _fill(result, shapes, trees_per_hectare, minimum_spacing_m)
-    if not (result.buildings or result.forests or result.geofences or result.trees_m):
+    if not (result.buildings or result.forests or result.geofences or result.trees):
         raise InputError(
             "no building, forest, geofence or tree found in " + ", ".join(Path(f).name for f in files),
-            cause=result.actions[-1] if result.actions else "the areas carry no tags; say what they are",
+            cause="; ".join(result.actions[-3:]) or "the map is empty",
         )
     return result
+
+
+def _sort(
+    content: MapFile,
+    path: Path,
+    frame: SiteFrame,
+    untagged: Kind | None,
+    default_height_m: float,
+    shapes: dict[Kind, list[_Shape]],
+    actions: list[str],
+) -> None:
+    """Each outline of a file to the shapes of its kind; what has none is counted."""
+    skipped: Counter[str] = Counter()
+    for outline in content.outlines:
+        kind = kind_of(outline.tags) or untagged or ("geofence" if content.kind == "KML" else None)
+        if kind is None:
+            skipped[main_tag(outline.tags)] += 1
+            continue
+        actions += [f"{outline.source}: {problem}" for problem in dict.fromkeys(outline.broken)]
+        shape = _project(outline, frame, actions)
+        if shape is not None:
+            if kind == "building":
+                _describe(shape, outline, default_height_m, path, actions)
+            shapes[kind].append(shape)
+    if skipped:
+        listed = ", ".join(f"{count} {tag}" for tag, count in skipped.most_common(5))
+        more = "" if len(skipped) <= 5 else f" and {len(skipped) - 5} other tags"
+        hint = "; '--untagged building' takes areas without tags for buildings" if skipped["untagged"] else ""
+        actions.append(f"{path.name}: left out, neither building nor forest: {listed}{more}{hint}")
+
+
+def _single_trees(tree: TreeLine, frame: SiteFrame, actions: list[str]) -> list[SingleTree]:
+    """A tree with its tagged sizes, or those of a row, a crown's diameter apart."""
+    notes: list[str] = []
+    height = positive_metres(tree.tags, ("height", "est_height"), notes)
+    if height is not None and height > TALLEST_TREE_M:
+        notes.append(f"a tree {height:g} m high; feet or centimetres? The site's default holds")
+        height = None
+    crown = positive_metres(tree.tags, ("diameter_crown", "crown_diameter"), notes)
+    girth = positive_metres(tree.tags, ("circumference",), notes)
+    points = np.stack(frame.to_local(*np.array(tree.positions, dtype=np.float64).reshape(-1, 2).T), axis=1)
+    points = points[np.isfinite(points).all(axis=1)]
+    if not len(points) or float(np.hypot(*points.mean(axis=0))) > FAR_M:
+        actions.append(f"{tree.source}: a tree left out, it does not stand at the site")
+        return []
+    if len(points) > 1:
+        points = _along(points, crown or ROW_SPACING_M)
+        notes.append(f"{len(points)} trees were placed along the row, {crown or ROW_SPACING_M:g} m apart")
+    actions += [f"{tree.source}: {note}" for note in notes]
+    trunk = None if girth is None else girth / math.pi
+    return [SingleTree(float(east), float(north), height, crown, trunk) for east, north in points]
+
+
+def _along(line_m: FloatArray, spacing_m: float) -> FloatArray:
+    """Points (n, 2) on a line (corners, 2) from its beginning to its end, about ``spacing_m`` apart."""
+    line = LineString(line_m)
+    count = min(max(round(line.length / max(spacing_m, 0.5)), 1), MAXIMUM_ROW_TREES)
+    return np.asarray(shapely.get_coordinates(line.interpolate(np.linspace(0.0, 1.0, count + 1), normalized=True)))
+
+
+def _cut_off(shapes: list[_Shape], near: Polygon | None, actions: list[str]) -> list[_Shape]:
+    """Forests without what lies far outside the site."""
+    kept = []
+    for shape in shapes:
+        inside = shape.area if near is None else _areas_only(shape.area.intersection(near))
+        if inside.area < 0.999 * shape.area.area:
+            lost = (shape.area.area - inside.area) / 1e4
+            actions.append(
+                f"{shape.source}: {lost:.0f} ha more than {FOREST_MARGIN_M:g} m outside the site's area were cut away"
+            )
+            shape.area = inside
+        if not inside.is_empty:
+            kept.append(shape)
+    return kept
 
 
 def _fill(
@@ -153,7 +240,7 @@ def _fill(
 ) -> None:
     actions = result.actions
     for name, shape, area in _parts(
-        _without_overlaps(_without_duplicates(shapes["building"], actions), actions), actions
+        _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions), actions
     ):
         result.buildings.append(Building(name, area, round(shape.height_m, 2), 0.0, shape.material, shape.source))
     for name, shape, area in _parts(_first_keeps(_without_duplicates(shapes["forest"], actions), actions), actions):
@@ -165,29 +252,10 @@ def _fill(
 # ---------------------------------------------------------------- what an outline is, and where
 
 
-def _kind(outline: Outline, file_kind: str, untagged: Kind | None) -> Kind | None:
-    tags = {key.lower(): value.lower() for key, value in outline.tags.items()}
-    if tags.get("building", tags.get("building:part", "no")) not in ("no", "", "none"):
-        return "building"
-    if any(tags.get(key) == value for key, value in _FOREST_TAGS):
-        return "forest"
-    word = tags.get("kind", tags.get("type", ""))
-    for kind in ("building", "forest", "geofence"):
-        if word == kind or (kind == "geofence" and kind in tags):
-            return kind  # type: ignore[return-value]
-    return untagged or ("geofence" if file_kind == "KML" else None)
-
-
-def _main_tag(outline: Outline) -> str:
-    for key in ("highway", "landuse", "natural", "waterway", "leisure", "amenity", "barrier"):
-        if key in outline.tags:
-            return f"{key}={outline.tags[key]}"
-    return "untagged"
-
-
 def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
     """Refuses a file whose outlines all lie elsewhere, and says so when swapping would bring them here."""
-    positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer] + content.trees
+    positions = [p for outline in content.outlines for outer, _ in outline.parts for p in outer]
+    positions += [p for tree in content.trees for p in tree.positions]
     if not positions:
         return
     latitude, longitude = np.array(positions).T
@@ -232,14 +300,19 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
             notes.append("crosses the antimeridian; its parts were joined")
         ring = _ring(outer, frame)
         if ring is None:
-            notes.append("an outer ring with fewer than 3 distinct points was left out")
+            notes.append(_why_no_ring(outer))
             continue
         area = _repaired(ring, notes, "a self-crossing ring was repaired")
         inner = [shape for shape in (_ring(hole, frame) for hole in holes) if shape is not None]
         if len(inner) < len(holes):
             notes.append("a hole with fewer than 3 distinct points was left out")
         if inner:
-            area = area.difference(shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner]))
+            without = shapely.union_all([_repaired(hole, notes, "a hole was repaired") for hole in inner])
+            if not without.intersects(area):
+                notes.append("a hole outside its outline was left out")
+            area = area.difference(without)
+            if area.is_empty:
+                notes.append("its holes cover all of it")
         areas.append(area)
     actions += [f"{outline.source}: {note}" for note in dict.fromkeys(notes)]
     union = _areas_only(shapely.union_all(areas))
@@ -248,9 +321,22 @@ def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape |
         return None
     if math.hypot(union.centroid.x, union.centroid.y) > FAR_M:
         away = math.hypot(union.centroid.x, union.centroid.y) / 1000
-        actions.append(f"{outline.source}: left out, it lies {away:.0f} km from the site")
+        first = np.array(outline.parts[0][0][0])
+        swapped = _distance_m(first[1], first[0], frame) <= FAR_M
+        hint = "; latitude and longitude are swapped" if swapped else ""
+        actions.append(f"warning: {outline.source}: left out, it lies {away:.0f} km from the site{hint}")
         return None
-    return _Shape(outline.name, outline.source, union)
+    return _Shape(outline.name, outline.source, union, part=is_part(outline.tags))
+
+
+def _why_no_ring(positions: Sequence[Position]) -> str:
+    for latitude, longitude in positions:
+        if abs(latitude) > 90 or abs(longitude) > 540:
+            return (
+                f"an outer ring with latitude {latitude:g}, longitude {longitude:g} was left out; "
+                "metres or feet in place of degrees"
+            )
+    return "an outer ring with fewer than 3 distinct points was left out"
 
 
 def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
@@ -278,24 +364,26 @@ def _areas_only(shape: BaseGeometry) -> BaseGeometry:
 
 def _describe(shape: _Shape, outline: Outline, default_m: float, path: Path, actions: list[str]) -> None:
     tags = {key.lower(): value for key, value in outline.tags.items()}
-    written = tags.get("height") or tags.get("building:height") or tags.get("height_m")
-    height = _metres(written) if written else None
-    if written and height is None:
-        actions.append(f"{shape.source}: the height '{written}' is not a length; levels or the default hold")
-    levels = _number(tags.get("building:levels", tags.get("levels", "")))
+    notes: list[str] = []
+    height = positive_metres(tags, ("height", "building:height", "height_m", "est_height"), notes)
+    levels = levels_of(tags, notes)
     shape.stated = height is not None
     if height is None:
         height = levels * LEVEL_M if levels else default_m
+        notes = [f"{note}; it is drawn {height:g} m high" for note in notes]
+    lowest = tags.get("min_height", tags.get("building:min_level", "0"))
+    if (metres(lowest) or 0.0) > 0:
+        notes.append("it begins above the ground (min_height, min_level), but is drawn from the ground up")
+    actions += [f"{shape.source}: {note}" for note in notes]
     if not 0 < height <= TALLEST_M:
         raise InputError(
             f"{shape.source}: a building {height:g} m high",
             expected=f"0 to {TALLEST_M:g} m",
-            cause="feet or centimetres in place of metres" if height > 0 else None,
+            cause="feet or centimetres in place of metres",
             path=path,
         )
     shape.height_m = height
-    word = tags.get("building:material", "").lower()
-    shape.material = _MATERIAL_WORDS.get(word, word if word in MATERIALS else "concrete")
+    shape.material = material_of(tags)
     if height > 2 * LEVEL_M and levels and 2.7 <= height / (levels * LEVEL_M) <= 4.5:
         shape.stated = False  # counted by _warn_of_feet
         actions.append(f"warning: {shape.source}: {height:g} m for {levels:g} levels; are these feet?")
@@ -309,24 +397,6 @@ def _warn_of_feet(shapes: list[_Shape], actions: list[str]) -> None:
             f"warning: the median stated height of {len(stated)} buildings is {np.median(stated):.0f} m; "
             "if the file is in feet, give the heights a unit ('20 ft')"
         )
-
-
-def _number(text: str) -> float | None:
-    try:
-        value = float(text)
-    except ValueError:
-        return None
-    return value if math.isfinite(value) and value > 0 else None
-
-
-def _metres(text: str) -> float | None:
-    """Length of an OSM tag: ``12``, ``12 m``, ``40 ft``, ``40'``, ``39'4"``."""
-    text = text.strip().lower().replace(",", ".")
-    if match := re.fullmatch(r"(-?\d+(?:\.\d+)?)\s*(m|metres?|meters?|ft|feet|foot)?", text):
-        return float(match.group(1)) * (FOOT_M if (match.group(2) or "m").startswith("f") else 1.0)
-    if match := re.fullmatch(r"(\d+(?:\.\d+)?)\s*'\s*(?:(\d+(?:\.\d+)?)\s*(?:\"|''))?", text):
-        return (float(match.group(1)) + float(match.group(2) or 0) / 12) * FOOT_M
-    return None
 
 
 # ---------------------------------------------------------------- cleaning
@@ -373,30 +443,63 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
     return list(groups.values())
 
 
+def _parts_first(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Outlines without the ground of their parts: where parts are mapped, theirs are the heights."""
+    parts = [shape for shape in shapes if shape.part]
+    if not parts:
+        return shapes
+    tree, kept = shapely.STRtree([shape.area for shape in parts]), []
+    for shape in shapes:
+        inside = [] if shape.part else [parts[int(i)].area for i in tree.query(shape.area, predicate="intersects")]
+        rest = _areas_only(shape.area.difference(shapely.union_all(inside))) if inside else shape.area
+        if rest.area < 0.98 * shape.area.area:
+            actions.append(f"{shape.source}: gives way to its mapped parts")
+            shape.area = rest
+        if not rest.is_empty:
+            kept.append(shape)
+    return kept
+
+
 def _without_overlaps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
+    """Disjoint shapes: of one height and material merged, lower ones cut where they lie under higher ones."""
     kept: list[_Shape] = []
     for group in _groups(shapes):
-        if len(group) == 1:
-            kept += group
-            continue
-        group.sort(key=lambda shape: -shape.height_m)
-        covered: BaseGeometry = Polygon()
-        merged: list[_Shape] = []
-        for shape in group:
-            free = _areas_only(shape.area.difference(covered))
-            covered = covered.union(shape.area)
-            last = merged[-1] if merged else None
-            if free.is_empty:
-                actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
-            elif last and abs(last.height_m - shape.height_m) <= SAME_HEIGHT_M and last.material == shape.material:
-                last.area = _areas_only(last.area.union(shape.area if last is merged[0] else free))
-                actions.append(f"{shape.source}: overlaps {last.source} at the same height; they were merged")
-            else:
-                merged.append(_Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material))
-                if last:
-                    actions.append(f"{shape.source}: the part under a higher building was cut away")
-        kept += merged
+        kept += group if len(group) == 1 else _higher_first(group, actions)
     return kept
+
+
+def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
+    group = sorted(group, key=lambda shape: -shape.height_m)
+    tree = shapely.STRtree([shape.area for shape in group])
+    home: list[_Shape | None] = []  # the kept shape that each one became or was merged into
+    pieces: dict[int, list[BaseGeometry]] = {}
+    for index, shape in enumerate(group):
+        higher = sorted(int(j) for j in tree.query(shape.area, predicate="intersects") if j < index)
+        covered = shapely.union_all([group[j].area for j in higher])
+        free = _areas_only(shape.area.difference(covered))
+        if free.is_empty:
+            actions.append(f"{shape.source}: left out, it lies inside buildings at least as high")
+            home.append(None)
+            continue
+        same = next((h for j in higher if (h := home[j]) is not None and _alike(h, shape)), None)
+        if same is None:
+            same = _Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material)
+            pieces[id(same)] = [free]
+            if shape.area.area - free.area > 0.01:
+                actions.append(f"{shape.source}: the part under a higher building was cut away")
+        else:
+            others = shapely.union_all([group[j].area for j in higher if home[j] is not same])
+            pieces[id(same)].append(shape.area.difference(others))
+            actions.append(f"{shape.source}: overlaps {same.source} at the same height; they were merged")
+        home.append(same)
+    kept = list({id(shape): shape for shape in home if shape is not None}.values())
+    for shape in kept:
+        shape.area = _areas_only(shapely.union_all(pieces[id(shape)]))
+    return kept
+
+
+def _alike(one: _Shape, other: _Shape) -> bool:
+    return abs(one.height_m - other.height_m) <= SAME_HEIGHT_M and one.material == other.material
 
 
 def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
@@ -459,9 +562,10 @@ def import_site(
         The settings (see :func:`write_site_yaml`), and what was done.
     """
     if not files:
-        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON or KML files")
+        raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
     model = site_model(base)
-    found = import_footprints(files, SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg), **options)
+    frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
+    found = import_footprints(files, frame, area_m=extent_m(model, frame), **options)
     content = model.model_dump()
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
@@ -481,10 +585,16 @@ def import_site(
         ],
         "geofences": [_outline_dict(g.name, g.area) for g in found.geofences],
         "illustrative": False,
-        "notes": [note for note in model.notes if "illustrative" not in note.lower()],
+        "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *found.credits],
     }
-    content["trees"]["points_m"] = [(round(east, 2), round(north, 2)) for east, north in found.trees_m]
+    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in found.trees]}
     return SiteModel.model_validate(content), found.actions
+
+
+def _tree_dict(tree: SingleTree) -> dict[str, Any]:
+    sizes = {name: getattr(tree, name) for name in ("height_m", "crown_diameter_m", "trunk_diameter_m")}
+    known = {name: round(size, 2) for name, size in sizes.items() if size is not None}
+    return {"at_m": (round(tree.east_m, 2), round(tree.north_m, 2)), **known}
 
 
 def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
@@ -494,15 +604,19 @@ def _outline_dict(name: str, area: Polygon) -> dict[str, Any]:
     return {"name": name, "polygon_m": ring(area.exterior), "holes_m": [ring(hole) for hole in area.interiors]}
 
 
+def _printable(text: str) -> str:
+    """Without control characters, which map data may hold and YAML refuses even in comments."""
+    return "".join(character if character.isprintable() else "?" for character in text)
+
+
 def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
     """Settings as a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
 
     ``header`` lines become comments at the top (what the import did).
     """
     content = model.model_dump(mode="json", exclude_defaults=True)
-    dumper: Any = getattr(yaml, "CSafeDumper", yaml.SafeDumper)
-    text = "".join(f"# {line}\n" for entry in header for line in str(entry).splitlines())
-    text += yaml.dump(content, Dumper=dumper, sort_keys=False, allow_unicode=True, default_flow_style=None, width=118)
+    text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
+    text += dump_yaml(content)
     try:
         with whole(Path(path)) as part:
             part.write_text(text, encoding="utf-8")

@@ -1,55 +1,36 @@
-"""Outlines from map files, as they are: GeoJSON, OSM XML, Overpass JSON, KML. Cleaning is :mod:`.footprints`' job."""
+"""Outlines from map files, as they are: GeoJSON, OSM XML, Overpass JSON, KML, KMZ. Cleaning is :mod:`.footprints`' job.
+
+An element that cannot be used is left out and listed, with its line; only a file that is no map file is an error.
+"""
 
 from __future__ import annotations
 
+import io
 import json
-import math
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field
+import re
+import zipfile
+from collections import Counter
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
+from xml.parsers import expat
 
 from ..errors import InputError
-
-Position = tuple[float, float]
-"""Latitude, longitude [deg]."""
+from .osmfiles import read_elements
+from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 
 MAX_BYTES = 512 * 1024 * 1024
+FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 
-
-@dataclass(slots=True)
-class Outline:
-    """One area of a map file.
-
-    Parameters
-    ----------
-    name : str
-        Its name, or file and id.
-    source : str
-        File name and id.
-    tags : mapping of str to str
-        As in the file.
-    parts : list of (outer ring, hole rings)
-        Positions in degrees, as written.
-    broken : list of str
-        What was wrong while reading it.
-    """
-
-    name: str
-    source: str
-    tags: Mapping[str, str]
-    parts: list[tuple[list[Position], list[list[Position]]]] = field(default_factory=list)
-    broken: list[str] = field(default_factory=list)
-
-
-@dataclass(slots=True)
-class MapFile:
-    """All outlines of a file, and the single trees."""
-
-    kind: str
-    outlines: list[Outline] = field(default_factory=list)
-    trees: list[Position] = field(default_factory=list)
+_OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
+    (b"\x1f\x8b", "gzip-compressed data", "unpack it with gunzip"),
+    (b"BZh", "bzip2-compressed data", "unpack it with bunzip2"),
+    (b"\xff\xfe", "UTF-16 text", "save it as UTF-8"),
+    (b"\xfe\xff", "UTF-16 text", "save it as UTF-8"),
+    (b"\x00\x00\x27\x0a", "a shapefile", "ogr2ogr -f GeoJSON -t_srs EPSG:4326 makes GeoJSON of it"),
+    (b"SQLite format 3", "a GeoPackage or another SQLite file", "ogr2ogr -f GeoJSON -t_srs EPSG:4326 makes GeoJSON"),
+)
 
 
 def read_map_file(path: str | Path) -> MapFile:
@@ -58,7 +39,7 @@ def read_map_file(path: str | Path) -> MapFile:
     Raises
     ------
     InputError
-        No such file, none of the four formats, not WGS84, coordinates that are no numbers.
+        No such file, none of the formats, or not WGS84.
     """
     path = Path(path)
     try:
@@ -67,237 +48,284 @@ def read_map_file(path: str | Path) -> MapFile:
         data = path.read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
+    if data.startswith(b"PK\x03\x04"):
+        data = _unzipped(data, path)
     start = data[:4096].lstrip(b"\xef\xbb\xbf \t\r\n")
     if not data.strip():
-        raise InputError("the file is empty", expected="GeoJSON, OSM XML, Overpass JSON or KML", path=path)
+        raise InputError("the file is empty", expected=FORMATS, path=path)
     if start.startswith(b"version https://git-lfs"):
         raise InputError("a Git-LFS pointer in place of the data", cause="'git lfs pull' was not run", path=path)
     if start[:1] in (b"{", b"["):
         return _from_json(data, path)
     if start[:1] == b"<":
         return _from_xml(data, path)
-    raise InputError("not a map file", expected="GeoJSON, OSM XML, Overpass JSON or KML", path=path)
+    for magic, what, remedy in _OTHER_KINDS:
+        if data.startswith(magic):
+            raise InputError(f"{what}, not a map file of text", expected=FORMATS, cause=remedy, path=path)
+    if b"OSMHeader" in data[:64]:
+        raise InputError(
+            "OSM data in PBF", expected=FORMATS, cause="'osmium cat in.pbf -o out.osm' unpacks it", path=path
+        )
+    raise InputError("not a map file", expected=FORMATS, path=path)
+
+
+def _unzipped(data: bytes, path: Path) -> bytes:
+    """The first KML file of a KMZ archive."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = [entry for entry in archive.infolist() if entry.filename.lower().endswith(".kml")]
+            if not names:
+                raise InputError("an archive without a .kml file", expected="KMZ", path=path)
+            main = next((entry for entry in names if entry.filename.lower() == "doc.kml"), names[0])
+            if main.file_size > MAX_BYTES:
+                raise InputError(
+                    f"{main.filename} has {main.file_size} bytes", expected=f"at most {MAX_BYTES}", path=path
+                )
+            with archive.open(main) as file:
+                return file.read(MAX_BYTES)
+    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
+        raise InputError(f"not a KMZ archive ({error})", cause="the file was cut off", path=path) from None
 
 
 def _from_json(data: bytes, path: Path) -> MapFile:
     try:
-        content = json.loads(data.decode("utf-8-sig"))
+        text = data.decode("utf-8-sig")
+        content = json.loads(text)
     except json.JSONDecodeError as error:
-        raise InputError(f"not JSON: {error.msg}", path=path, line=error.lineno) from None
-    except (UnicodeDecodeError, RecursionError):
-        raise InputError("not JSON text", path=path) from None
-    try:
-        if isinstance(content, dict) and isinstance(content.get("elements"), list):
-            return _osm("Overpass JSON", content["elements"], path)
-        if isinstance(content, dict) and "type" in content:
-            return _geojson(content, path)
-    except (TypeError, KeyError, AttributeError, IndexError) as error:
-        raise InputError(f"an element is not as it should be ({error!r})", path=path) from None
+        cause = "the file was cut off" if error.pos >= len(text.rstrip()) - 1 else None
+        raise InputError(f"not JSON: {error.msg}", cause=cause, path=path, line=error.lineno) from None
+    except UnicodeDecodeError as error:
+        line = data.count(b"\n", 0, error.start) + 1
+        raise InputError(
+            "not JSON text: a byte that is not UTF-8", cause="save it as UTF-8", path=path, line=line
+        ) from None
+    except (RecursionError, ValueError):
+        raise InputError("not JSON text: nested too deep, or a number too long", path=path) from None
+    if isinstance(content, dict) and isinstance(content.get("elements"), list):
+        result = read_elements("Overpass JSON", content["elements"], path, _lines_of(text, "elements"))
+        if remark := content.get("remark"):
+            result.notes.append(f"warning: {path.name}: the Overpass server says: {str(remark)[:200]}")
+        return result
+    if isinstance(content, dict) and "type" in content:
+        return _geojson(content, path, _lines_of(text, "features"))
     raise InputError("JSON, but neither GeoJSON nor Overpass", expected="a 'type' or 'elements' member", path=path)
+
+
+def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
+    """Line of the n-th element of a list in a JSON text; the text is read again, so this is for messages only."""
+
+    def line(index: int) -> int | None:
+        start = re.search(rf'"{member}"\s*:\s*\[', text)
+        if start is None:
+            return None
+        decoder, gap, at = json.JSONDecoder(), re.compile(r"[\s,]*"), start.end()
+        for _ in range(index + 1):
+            at = gap.match(text, at).end()  # type: ignore[union-attr]
+            begin = at
+            try:
+                _, at = decoder.raw_decode(text, at)
+            except json.JSONDecodeError:
+                return None
+        return text.count("\n", 0, begin) + 1
+
+    return line
 
 
 # ---------------------------------------------------------------- GeoJSON (RFC 7946)
 
+_GEOMETRIES = (
+    "Point", "MultiPoint", "LineString", "MultiLineString", "Polygon", "MultiPolygon", "GeometryCollection",
+)  # fmt: skip
 
-def _geojson(content: dict[str, Any], path: Path) -> MapFile:
-    crs = str((content.get("crs") or {}).get("properties", {}).get("name", "CRS84"))
-    if not any(code in crs for code in ("CRS84", "4326", "4979")):
-        raise InputError(f"coordinates in {crs}", expected="WGS84 longitude and latitude (RFC 7946)", path=path)
-    result = MapFile("GeoJSON")
+
+def _geojson(content: dict[str, Any], path: Path, line_of: Callable[[int], int | None]) -> MapFile:
+    _check_crs(content.get("crs"), path)
+    result, lines = MapFile("GeoJSON"), Counter[str]()
     kind = content["type"]
-    features = content["features"] if kind == "FeatureCollection" else [content]
+    if kind not in (*_GEOMETRIES, "Feature", "FeatureCollection"):
+        raise InputError(f"JSON of type '{kind}'", expected="GeoJSON: a FeatureCollection of areas", path=path)
+    features = content.get("features") if kind == "FeatureCollection" else [content]
+    if not isinstance(features, list):
+        raise InputError("a FeatureCollection without a list of features", expected="'features': [...]", path=path)
     for number, feature in enumerate(features, start=1):
-        is_feature = feature.get("type") == "Feature"
-        tags = {str(k): str(v) for k, v in ((feature.get("properties") or {}) if is_feature else {}).items()}
-        nested = feature.get("properties", {}).get("tags") if is_feature and feature.get("properties") else None
-        if isinstance(nested, dict):
-            tags.update({str(k): str(v) for k, v in nested.items()})
-        identity = str(feature.get("id", tags.get("@id", number)))
-        identity = f"feature {identity}" if identity.isdigit() else identity
-        outline = Outline(tags.get("name") or f"{identity}", f"{path.name}: {identity}", tags)
-        _geometry(feature.get("geometry") if is_feature else feature, outline, result, path)
-        if outline.parts or outline.broken:
-            result.outlines.append(outline)
+        part = MapFile("GeoJSON")
+        try:
+            _feature(feature, number, part, lines, path)
+        except BROKEN_ELEMENT as error:
+            result.notes.append(left_out(path, line_of(number - 1), f"feature {number}", error))
+        else:
+            result.take(part)
+    if lines:
+        listed = ", ".join(f"{count} {what}" for what, count in lines.most_common())
+        result.notes.append(f"{path.name}: left out, not areas: {listed}")
     return result
 
 
-def _geometry(geometry: dict[str, Any] | None, outline: Outline, result: MapFile, path: Path) -> None:
-    kind = (geometry or {}).get("type")
-    if geometry is None or kind is None:
+def _check_crs(crs: Any, path: Path) -> None:
+    """GeoJSON of before RFC 7946 may name a coordinate system; only WGS84 can be used."""
+    named = crs.get("properties") if isinstance(crs, dict) else crs
+    name = str(named.get("name", "CRS84") if isinstance(named, dict) else named or "CRS84")
+    if not any(code in name for code in ("CRS84", "4326", "4979")):
+        raise InputError(
+            f"coordinates in {name}",
+            expected="WGS84 longitude and latitude (RFC 7946)",
+            cause="exported in projected coordinates; ogr2ogr -t_srs EPSG:4326 converts them",
+            path=path,
+        )
+
+
+def _feature(feature: Any, number: int, result: MapFile, lines: Counter[str], path: Path) -> None:
+    is_feature = feature.get("type") == "Feature"
+    properties = (feature.get("properties") or {}) if is_feature else {}
+    tags = _words(properties)
+    if isinstance(nested := properties.get("tags"), dict):
+        tags.update(_words(nested))
+    identity = str(feature.get("id", tags.get("@id", number)))
+    identity = f"feature {identity}" if identity.isdigit() else identity
+    outline = Outline(tags.get("name") or f"{identity}", f"{path.name}: {identity}", tags)
+    geometry = feature.get("geometry") if is_feature else feature
+    if geometry is None:
+        lines["without geometry"] += 1
         return
+    _geometry(geometry, outline, result, lines, path)
+    if outline.parts or outline.broken:
+        result.outlines.append(outline)
+
+
+def _words(properties: dict[str, Any]) -> dict[str, str]:
+    return {str(key): str(value) for key, value in properties.items() if value is not None}
+
+
+def _geometry(geometry: dict[str, Any], outline: Outline, result: MapFile, lines: Counter[str], path: Path) -> None:
+    kind, where = geometry.get("type"), outline.source
     if kind == "GeometryCollection":
         for part in geometry["geometries"]:
-            _geometry(part, outline, result, path)
+            _geometry(part, outline, result, lines, path)
     elif kind in ("Polygon", "MultiPolygon"):
         polygons = [geometry["coordinates"]] if kind == "Polygon" else geometry["coordinates"]
         for rings in polygons:
-            where = outline.source
-            outer, *holes = [[_lonlat(point, where, path) for point in ring] for ring in rings] or [[]]
+            outer, *holes = [[lonlat(point, where, path) for point in ring] for ring in rings] or [[]]
+            if any(ring and ring[0] != ring[-1] for ring in (outer, *holes)):
+                outline.broken.append("a ring is not closed; its ends were joined by a straight line")
             outline.parts.append((outer, holes))
     elif kind in ("Point", "MultiPoint") and outline.tags.get("natural") == "tree":
         points = [geometry["coordinates"]] if kind == "Point" else geometry["coordinates"]
-        result.trees += [_lonlat(point, outline.source, path) for point in points]
+        result.trees += [TreeLine(where, outline.tags, (lonlat(point, where, path),)) for point in points]
+    elif kind in ("LineString", "MultiLineString") and outline.tags.get("natural") == "tree_row":
+        rows = [geometry["coordinates"]] if kind == "LineString" else geometry["coordinates"]
+        result.trees += [TreeLine(where, outline.tags, tuple(lonlat(p, where, path) for p in row)) for row in rows]
+    elif kind in _GEOMETRIES:
+        lines[str(kind)] += 1
+    else:
+        raise InputError(f"it is not as it should be: a geometry of type {kind!r}", path=path)
 
 
-def _lonlat(point: Any, where: str, path: Path) -> Position:
-    try:
-        longitude, latitude = float(point[0]), float(point[1])
-    except (TypeError, ValueError, IndexError):
-        raise InputError(f"{where}: the position {str(point)[:40]} is not longitude, latitude", path=path) from None
-    if not (math.isfinite(latitude) and math.isfinite(longitude)):
-        raise InputError(f"{where}: a coordinate is not a number", path=path)
-    return latitude, longitude
-
-
-# ---------------------------------------------------------------- OpenStreetMap, XML or Overpass JSON
+# ---------------------------------------------------------------- XML
 
 
 def _from_xml(data: bytes, path: Path) -> MapFile:
+    if b"<html" in data[:4096].lower():
+        raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
     if b"<!DOCTYPE" in data[:65536] or b"<!ENTITY" in data[:65536]:
         raise InputError("the XML declares entities", expected="plain OSM or KML", path=path)
     try:
         root = ElementTree.fromstring(data)
-    except ElementTree.ParseError as error:
-        line = error.position[0]
-        raise InputError(f"not XML: {error.msg}", cause="the file was cut off?", path=path, line=line) from None
-    tag = root.tag.rpartition("}")[2]
+    except (ElementTree.ParseError, ValueError, LookupError) as error:
+        line = error.position[0] if isinstance(error, ElementTree.ParseError) else None
+        found = str(error).split(": line")[0]
+        raise InputError(f"not XML: {found}", cause="the file was cut off?", path=path, line=line) from None
+    tag = _plain(root.tag)
     if tag == "kml":
-        return _kml(root, path)
+        return _kml(root, path, data)
     if tag == "osm":
-        return _osm("OSM XML", _osm_elements(root), path)
+        return read_elements("OSM XML", _osm_elements(root), path, lambda n: _xml_line(data, None, n))
     raise InputError(f"XML of '{tag}'", expected="OSM ('osm') or KML ('kml')", path=path)
+
+
+def _plain(tag: str) -> str:
+    """A tag without its namespace."""
+    return tag.rpartition("}")[2]
+
+
+def _xml_line(data: bytes, name: str | None, index: int) -> int | None:
+    """Line of the n-th element of a name, or child of the root; the data are read again, for messages only."""
+    lines: list[int] = []
+    depth = [0]
+    parser = expat.ParserCreate()
+
+    def start(tag: str, _: Any) -> None:
+        depth[0] += 1
+        if (depth[0] == 2) if name is None else (tag.rpartition(":")[2] == name):
+            lines.append(parser.CurrentLineNumber)
+
+    def end(_: str) -> None:
+        depth[0] -= 1
+
+    parser.StartElementHandler, parser.EndElementHandler = start, end
+    parser.Parse(data, True)
+    return lines[index] if index < len(lines) else None
 
 
 def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
     """OSM XML as Overpass elements."""
     for item in root:
-        element: dict[str, Any] = {"type": item.tag, "id": item.get("id")}
-        element["tags"] = {tag.get("k", ""): tag.get("v", "") for tag in item.iter("tag")}
-        if item.tag == "node":
-            element |= {"lat": item.get("lat"), "lon": item.get("lon")}
-        elif item.tag == "way":
-            element["nodes"] = [reference.get("ref") for reference in item.iter("nd")]
-        elif item.tag == "relation":
-            element["members"] = [dict(member.attrib) for member in item.iter("member")]
+        element: dict[str, Any] = {
+            "type": _plain(item.tag),
+            **{key: item.get(key) for key in _KEPT if key in item.attrib},
+        }
+        element["tags"] = {tag.get("k", ""): tag.get("v", "") for tag in _named(item, "tag")}
+        if element["type"] == "way":
+            element["nodes"] = [reference.get("ref") for reference in _named(item, "nd")]
+        elif element["type"] == "relation":
+            element["members"] = [dict(member.attrib) for member in _named(item, "member")]
         yield element
 
 
-def _osm(kind: str, elements: Iterable[dict[str, Any]], path: Path) -> MapFile:
-    nodes: dict[str, Position] = {}
-    ways: dict[str, dict[str, Any]] = {}
-    relations: list[dict[str, Any]] = []
-    result = MapFile(kind)
-    for element in elements:
-        if element["type"] == "node" and element.get("lat") is not None:
-            position = _lonlat((element["lon"], element["lat"]), f"node {element['id']}", path)
-            nodes[str(element["id"])] = position
-            if (element.get("tags") or {}).get("natural") == "tree":
-                result.trees.append(position)
-        elif element["type"] == "way":
-            ways[str(element["id"])] = element
-        elif element["type"] == "relation":
-            relations.append(element)
-    for number, way in ways.items():
-        if way.get("tags"):
-            outline = _outline(way, f"way {number}", path)
-            ring = _way(way, nodes, outline, path)
-            if ring and ring[0] != ring[-1]:
-                continue  # a line: a road, a fence
-            outline.parts.append((ring, []))
-            result.outlines.append(outline)
-    for relation in relations:
-        if (relation.get("tags") or {}).get("type") == "multipolygon":
-            outline = _outline(relation, f"relation {relation['id']}", path)
-            _multipolygon(relation, ways, nodes, outline, path)
-            result.outlines.append(outline)
-    return result
+_KEPT = {"id", "lat", "lon", "visible", "action"}
 
 
-def _outline(element: dict[str, Any], identity: str, path: Path) -> Outline:
-    tags = {str(k): str(v) for k, v in (element.get("tags") or {}).items()}
-    return Outline(tags.get("name") or identity, f"{path.name}: {identity}", tags)
-
-
-def _way(way: dict[str, Any], nodes: dict[str, Position], outline: Outline, path: Path) -> list[Position]:
-    if isinstance(way.get("geometry"), list):
-        points = [point for point in way["geometry"] if point]
-        return [_lonlat((point["lon"], point["lat"]), outline.source, path) for point in points]
-    references = [str(reference) for reference in way.get("nodes") or []]
-    lost = [reference for reference in references if reference not in nodes]
-    if lost:
-        outline.broken.append(f"{len(lost)} of {len(references)} nodes are not in the file")
-    return [nodes[reference] for reference in references if reference in nodes]
-
-
-def _multipolygon(
-    relation: dict[str, Any],
-    ways: dict[str, dict[str, Any]],
-    nodes: dict[str, Position],
-    outline: Outline,
-    path: Path,
-) -> None:
-    lines: dict[str, list[list[Position]]] = {"outer": [], "inner": []}
-    for member in relation.get("members") or []:
-        way = member if isinstance(member.get("geometry"), list) else ways.get(str(member.get("ref")))
-        if member.get("type") != "way":
-            continue
-        if way is None:
-            outline.broken.append(f"way {member.get('ref')} is not in the file")
-            continue
-        lines["inner" if member.get("role") == "inner" else "outer"].append(_way(way, nodes, outline, path))
-    outer, inner = (_join_rings(lines[role], outline) for role in ("outer", "inner"))
-    # which hole belongs to which outer ring is found when the rings are cleaned: holes go with all of them
-    outline.parts += [(ring, inner) for ring in outer]
-
-
-def _join_rings(lines: list[list[Position]], outline: Outline) -> list[list[Position]]:
-    """Closed rings from pieces that share end points."""
-    rings, open_ = [], [list(line) for line in lines if len(line) > 1]
-    while open_:
-        ring = open_.pop()
-        grown = True
-        while ring[0] != ring[-1] and grown:
-            grown = False
-            for index, piece in enumerate(open_):
-                if ring[-1] in (piece[0], piece[-1]):
-                    ring += (piece if ring[-1] == piece[0] else piece[::-1])[1:]
-                    del open_[index]
-                    grown = True
-                    break
-        if ring[0] != ring[-1]:
-            outline.broken.append("a ring is not closed; its ends were joined by a straight line")
-            ring.append(ring[0])
-        rings.append(ring)
-    return rings
+def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
+    return (element for element in root.iter() if _plain(element.tag) == name)
 
 
 # ---------------------------------------------------------------- KML
 
 
-def _kml(root: ElementTree.Element, path: Path) -> MapFile:
-    result = MapFile("KML")
+def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
+    result, lines = MapFile("KML"), Counter[str]()
     for number, placemark in enumerate(_named(root, "Placemark"), start=1):
-        tags = {}
-        for data in _named(placemark, "Data"):
-            tags[data.get("name", "")] = next((str(v.text or "") for v in _named(data, "value")), "")
-        for data in _named(placemark, "SimpleData"):
-            tags[data.get("name", "")] = str(data.text or "")
-        name = next((str(n.text or "").strip() for n in placemark if n.tag.rpartition("}")[2] == "name"), "")
+        name = next((str(n.text or "").strip() for n in placemark if _plain(n.tag) == "name"), "")
         identity = name or f"placemark {number}"
-        outline = Outline(identity, f"{path.name}: {identity}", tags)
-        for polygon in _named(placemark, "Polygon"):
-            outer = [_kml_ring(b, outline, path) for b in _named(polygon, "outerBoundaryIs")]
-            holes = [_kml_ring(b, outline, path) for b in _named(polygon, "innerBoundaryIs")]
-            outline.parts += [(ring, holes) for ring in outer]
+        outline = Outline(identity, f"{path.name}: {identity}", _kml_tags(placemark))
+        try:
+            for polygon in _named(placemark, "Polygon"):
+                outer = [_kml_ring(b, outline, path) for b in _named(polygon, "outerBoundaryIs")]
+                holes = [_kml_ring(b, outline, path) for b in _named(polygon, "innerBoundaryIs")]
+                outline.parts += [(ring, holes) for ring in outer]
+        except BROKEN_ELEMENT as error:
+            line = _xml_line(data, "Placemark", number - 1)
+            result.notes.append(left_out(path, line, f"placemark '{identity}'", error))
+            continue
         if outline.parts:
             result.outlines.append(outline)
+            continue
+        for what in ("LineString", "Point", "LinearRing", "Model", "Track"):
+            lines[what] += sum(1 for _ in _named(placemark, what))
+    if listed := ", ".join(f"{count} {what}" for what, count in lines.most_common() if count):
+        result.notes.append(f"{path.name}: left out, not areas: {listed}")
     return result
 
 
-def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element]:
-    return (element for element in root.iter() if element.tag.rpartition("}")[2] == name)
+def _kml_tags(placemark: ElementTree.Element) -> dict[str, str]:
+    tags = {}
+    for data in _named(placemark, "Data"):
+        tags[data.get("name", "")] = next((str(v.text or "") for v in _named(data, "value")), "")
+    for data in _named(placemark, "SimpleData"):
+        tags[data.get("name", "")] = str(data.text or "")
+    return tags
 
 
 def _kml_ring(boundary: ElementTree.Element, outline: Outline, path: Path) -> list[Position]:
     text = " ".join(str(c.text or "") for c in _named(boundary, "coordinates"))
-    return [_lonlat(point.split(","), outline.source, path) for point in text.split()]
+    text = re.sub(r"\s*,\s*", ",", text)  # 'longitude, latitude' with a blank is common and can mean nothing else
+    return [lonlat(point.split(","), outline.source, path) for point in text.split()]

@@ -6,20 +6,22 @@ docs/site.md shows every key. Polygons are ``polygon_m`` (east, north) or ``poly
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from dataclasses import replace
 from importlib import resources
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeVar
 
 import numpy as np
 import shapely
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 from shapely.geometry import Point, Polygon
 
 from ..errors import UsageError
 from ..geodesy import SiteFrame
-from ..yamlfile import StrictModel, load_yaml, nearest
+from ..units import FloatArray
+from ..yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
 from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
@@ -35,8 +37,14 @@ FAR_TOWER_M = 10_000.0
 FAR_POLYGON_M = 100_000.0
 """An outline that reaches farther from the origin is refused."""
 
+OVERLAP_M = 0.5
+"""Buildings that overlap by less, everywhere, are not told of."""
+
 MAST_CLEARANCE_M = 8.0
 """No tree is placed at random closer to a tower: masts stand clear."""
+
+TALLEST_M = 1000.0
+"""A higher building or mast is in feet or centimetres; no structure on Earth reaches it."""
 
 Latitude = Annotated[float, Field(ge=-90, le=90)]
 Longitude = Annotated[float, Field(ge=-180, le=180)]
@@ -45,6 +53,15 @@ NotNegative = Annotated[float, Field(ge=0)]
 Ground = Literal["flat", "offsets", "dem"]
 Area = tuple[float, float, float, float]
 Ring = Annotated[list[tuple[float, float]], Field(min_length=3)]
+
+
+def _not_too_high(height_m: float) -> float:
+    if height_m > TALLEST_M:
+        raise ValueError(f"{height_m:g} m is higher than anything that stands on Earth; feet or centimetres?")
+    return height_m
+
+
+Structure = Annotated[Positive, AfterValidator(_not_too_high)]
 
 
 def _known_material(name: str) -> str:
@@ -68,7 +85,13 @@ def _problem(shape: Polygon) -> str | None:
     return None
 
 
-class HeightModel(StrictModel):
+class SiteBase(StrictModel):
+    """Settings of a site: every number is one."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class HeightModel(SiteBase):
     """A height with its reference."""
 
     height_m: float
@@ -79,32 +102,38 @@ class HeightModel(StrictModel):
         return Height(self.height_m, self.reference)
 
 
-class OriginModel(StrictModel):
+class AbsoluteHeightModel(HeightModel):
+    """A height that does not count from the site itself."""
+
+    reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL]
+
+
+class OriginModel(SiteBase):
     """Where east = north = up = 0."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    ground: HeightModel | None = None
+    ground: AbsoluteHeightModel | None = None
     takeoff_ground_m: float = 0.0
 
 
-class PositionModel(StrictModel):
+class PositionModel(SiteBase):
     """One published position of a tower."""
 
     latitude_deg: Latitude
     longitude_deg: Longitude
-    antenna_height_m: Positive | None = None
+    antenna_height_m: Structure | None = None
     source: str = ""
 
 
-class TowerModel(StrictModel):
+class TowerModel(SiteBase):
     """A tower, with one position or several published ones."""
 
     latitude_deg: Latitude | None = None
     longitude_deg: Longitude | None = None
     source: str = ""
     positions: dict[str, PositionModel] = Field(default_factory=dict)
-    antenna_height_m: Positive | None = None
+    antenna_height_m: Structure | None = None
     antenna: HeightModel | None = None
     ground_offset_m: float | None = None
     ground: HeightModel | None = None
@@ -121,7 +150,7 @@ class TowerModel(StrictModel):
         return self
 
 
-class PolygonModel(StrictModel):
+class PolygonModel(SiteBase):
     """A named outline."""
 
     name: str
@@ -143,6 +172,7 @@ class PolygonModel(StrictModel):
     def polygon(self, frame: SiteFrame) -> Polygon:
         """In the site frame [m]; UsageError when it is not a simple polygon near the site."""
         if self.polygon_m is not None:
+            _check_near(self.polygon_m, self.name)
             shape = Polygon(self.polygon_m, self.holes_m)
         else:
             rings = [self.polygon_deg or [], *self.holes_deg]
@@ -156,7 +186,7 @@ class PolygonModel(StrictModel):
 class BuildingModel(PolygonModel):
     """A building with a flat roof."""
 
-    height_m: Positive
+    height_m: Structure
     base_m: float = 0.0
     material: MaterialName = "concrete"
     source: str = ""
@@ -170,19 +200,44 @@ class ForestModel(PolygonModel):
     source: str = ""
 
 
-class DistributionModel(StrictModel):
+OutlineT = TypeVar("OutlineT", bound=PolygonModel)
+
+
+class DistributionModel(SiteBase):
     """A size drawn from a normal distribution between limits."""
 
     mean: Positive
     deviation: NotNegative = 0.0
     minimum: NotNegative = 0.0
-    maximum: Positive = math.inf
+    maximum: Annotated[float, Field(gt=0, allow_inf_nan=True)] = math.inf
 
 
-Size = Positive | DistributionModel
+def _which_size(value: Any) -> str:
+    return "distribution" if isinstance(value, dict | DistributionModel) else "number"
 
 
-class TreesModel(StrictModel):
+Size = Annotated[  # told apart beforehand: a wrong number is one message, not one per member of the union
+    Annotated[Positive, Tag("number")] | Annotated[DistributionModel, Tag("distribution")], Discriminator(_which_size)
+]
+
+
+class SingleTreeModel(SiteBase):
+    """A tree with sizes of its own; what is absent is drawn like that of all trees."""
+
+    at_m: tuple[float, float] | None = None
+    at_deg: tuple[float, float] | None = None
+    height_m: Positive | None = None
+    crown_diameter_m: Positive | None = None
+    trunk_diameter_m: Positive | None = None
+
+    @model_validator(mode="after")
+    def _one_way(self) -> SingleTreeModel:
+        if (self.at_m is None) == (self.at_deg is None):
+            raise ValueError("give at_m (east, north) or at_deg (latitude, longitude)")
+        return self
+
+
+class TreesModel(SiteBase):
     """Sizes of all trees, the seed of the placement, and single trees."""
 
     seed: Annotated[int, Field(ge=0)] = 0
@@ -192,6 +247,7 @@ class TreesModel(StrictModel):
     crown_base_fraction: Annotated[float, Field(ge=0, lt=1)] = 0.25
     points_m: list[tuple[float, float]] = Field(default_factory=list)
     points_deg: list[tuple[float, float]] = Field(default_factory=list)
+    single: list[SingleTreeModel] = Field(default_factory=list)
 
     def sizes(self) -> TreeSizes:
         """For the placement."""
@@ -203,7 +259,7 @@ class TreesModel(StrictModel):
         )
 
 
-class DemModel(StrictModel):
+class DemModel(SiteBase):
     """An elevation model; relative paths start at the folder of site.yaml."""
 
     path: str
@@ -211,7 +267,7 @@ class DemModel(StrictModel):
     reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
 
 
-class SiteModel(StrictModel):
+class SiteModel(SiteBase):
     """The whole of site.yaml."""
 
     name: str
@@ -258,7 +314,7 @@ def load_site(
     UsageError
         No such site, or the file is wrong (path and line are named).
     """
-    path, model = _find(name_or_path)
+    path, model, line_of = _find(name_or_path)
     changes: dict[str, Any] = {"coordinates": coordinates, "tower_ground": tower_ground}
     model = model.model_copy(update={key: value for key, value in changes.items() if value is not None})
     try:
@@ -266,7 +322,27 @@ def load_site(
     except UsageError as error:
         if error.path is not None:
             raise
-        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+        line = line_of(error.location) if isinstance(error, _PlacedError) else None
+        raise UsageError(error.found, expected=error.expected, cause=error.cause, path=path, line=line) from None
+
+
+class _PlacedError(UsageError):
+    """A message about one key of a site.yaml."""
+
+    def __init__(self, error: UsageError, location: Location) -> None:
+        super().__init__(error.found, expected=error.expected, cause=error.cause)
+        self.location = location
+
+
+@contextmanager
+def _at(*location: Any) -> Iterator[None]:
+    """Messages from inside are about this key, unless they name a file or a nearer key."""
+    try:
+        yield
+    except UsageError as error:
+        if error.path is not None or isinstance(error, _PlacedError):
+            raise
+        raise _PlacedError(error, location) from None
 
 
 def site_model(name_or_path: str | Path) -> SiteModel:
@@ -274,10 +350,10 @@ def site_model(name_or_path: str | Path) -> SiteModel:
     return _find(name_or_path)[1]
 
 
-def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
+def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
     path = Path(name_or_path)
     if path.suffix in (".yaml", ".yml") or path.is_file():
-        return str(path), load_yaml(path, SiteModel)
+        return str(path), *load_yaml_and_lines(path, SiteModel)
     name = str(name_or_path).lower().replace("-", "_").replace(" ", "_")
     if name not in PACKAGED:
         near = nearest(name, PACKAGED)
@@ -287,32 +363,39 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel]:
             cause=f"did you mean '{near}'?" if near else None,
         )
     with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
-        return name, load_yaml(file, SiteModel)
+        return name, *load_yaml_and_lines(file, SiteModel)
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     """The site of a checked model; places the trees. ``folder`` is where relative paths start."""
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    dem = _dem(model, frame, folder or Path())
+    with _at("dem"):
+        dem = _dem(model, frame, folder or Path())
     datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     notes = list(model.notes)
-    towers = {name: _tower(name, tower, model, frame, datum, dem, notes) for name, tower in model.towers.items()}
-    area = _area(model.area_m, towers)
-    _check_towers(towers, model.area_m)
-    buildings = tuple(_building(item, frame, dem) for item in model.buildings)
-    notes += _buried(towers, buildings)
+    towers = {}
+    for name, tower in model.towers.items():
+        with _at("towers", name):
+            towers[name] = _tower(name, tower, model, frame, datum, dem, notes)
+            _check_tower(towers[name], model.area_m, frame)
+    with _at("area_m"):
+        area = _area(model.area_m, towers)
+    buildings = tuple(_building(item, outline, dem) for item, outline in _outlines(model.buildings, "buildings", frame))
+    notes += _buried(towers, buildings) + _overlaps(buildings)
     forests = tuple(
-        Forest(item.name, item.polygon(frame), item.trees_per_hectare, item.minimum_spacing_m, item.source)
-        for item in model.forests
+        Forest(item.name, outline, item.trees_per_hectare, item.minimum_spacing_m, item.source)
+        for item, outline in _outlines(model.forests, "forests", frame)
     )
+    with _at("trees"):
+        trees = _on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem)
     return Site(
         name=model.name,
         frame=frame,
         towers=towers,
         buildings=buildings,
         forests=forests,
-        trees=_on_ground(_trees(model.trees, forests, buildings, towers, frame, notes), dem),
-        geofences=tuple(Geofence(item.name, item.polygon(frame)) for item in model.geofences),
+        trees=trees,
+        geofences=tuple(Geofence(item.name, area) for item, area in _outlines(model.geofences, "geofences", frame)),
         ground_material=model.ground_material,
         area_m=area,
         illustrative=model.illustrative,
@@ -322,9 +405,26 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     )
 
 
+def extent_m(model: SiteModel, frame: SiteFrame) -> Area:
+    """East and north that maps of the site cover: ``area_m``, else 500 m around the towers."""
+    positions = []
+    for name, tower in model.towers.items():
+        chosen = _chosen_position(name, tower, model.coordinates, frame, [])
+        positions.append(frame.to_local(chosen.latitude_deg, chosen.longitude_deg))
+    east, north = np.array(positions).T
+    return _checked_area(model.area_m, east.tolist(), north.tolist())
+
+
+def _outlines(models: list[OutlineT], key: str, frame: SiteFrame) -> Iterator[tuple[OutlineT, Polygon]]:
+    for index, item in enumerate(models):
+        with _at(key, index, "polygon_m" if item.polygon_deg is None else "polygon_deg"):
+            yield item, item.polygon(frame)
+
+
 def _dem(model: SiteModel, frame: SiteFrame, folder: Path) -> Dem | None:
     if model.tower_ground == "dem" and model.dem is None:
-        raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
+        with _at("tower_ground"):
+            raise UsageError("tower_ground is 'dem', but there is no elevation model", expected="the key 'dem'")
     if model.dem is None or model.tower_ground not in (None, "dem"):
         return None
     return read_dem(folder / model.dem.path, frame, crs=model.dem.crs)
@@ -344,20 +444,46 @@ def _on_ground(trees: Trees, dem: Dem | None) -> Trees:
     return replace(trees, ground_m=np.nan_to_num(dem.ground_m(trees.east_m, trees.north_m)))
 
 
-def _check_towers(towers: Mapping[str, Tower], area: Area | None) -> None:
+def _check_tower(tower: Tower, area: Area | None, frame: SiteFrame) -> None:
     """A tower kilometres off is a slip of the pen, not a site."""
-    for tower in towers.values():
-        away = math.hypot(tower.east_m, tower.north_m)
-        if area is not None:
-            east, north = _outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])
-            away = min(away, math.hypot(east, north))
-        if away > FAR_TOWER_M:
-            raise UsageError(
-                f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
-                f"from its site",
-                expected=f"at most {FAR_TOWER_M / 1000:g} km",
-                cause="a digit is wrong, latitude and longitude are swapped, or it belongs to another site",
-            )
+    away = math.hypot(tower.east_m, tower.north_m)
+    if area is not None:
+        away = min(away, math.hypot(_outside(tower.east_m, *area[:2]), _outside(tower.north_m, *area[2:])))
+    if not away <= FAR_TOWER_M:
+        raise UsageError(
+            f"tower '{tower.name}' ({tower.latitude_deg:.5f}, {tower.longitude_deg:.5f}) lies {away / 1000:.1f} km "
+            f"from its site",
+            expected=f"at most {FAR_TOWER_M / 1000:g} km",
+            cause=_why_far(tower, frame),
+        )
+
+
+def _why_far(tower: Tower, frame: SiteFrame) -> str:
+    latitude, longitude = tower.latitude_deg, tower.longitude_deg
+    for cause, position in (
+        ("latitude and longitude are swapped", (longitude, latitude)),
+        ("the sign of the longitude is wrong: west is negative", (latitude, -longitude)),
+        ("the sign of the latitude is wrong: south is negative", (-latitude, longitude)),
+    ):
+        if abs(position[0]) <= 90 and float(np.hypot(*frame.to_local(*position))) <= FAR_TOWER_M:
+            return cause
+    return "a digit is wrong, or it belongs to another site"
+
+
+def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
+    """Warnings of buildings that stand in each other: walls inside walls reflect what they should not."""
+    if len(buildings) < 2:
+        return []
+    shapes = [building.footprint for building in buildings]
+    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = [(int(i), int(j)) for i, j in zip(one, two, strict=True) if i < j]
+    # outlines simplified by 'site import' may still overlap by some decimetres
+    found = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
+    if not found:
+        return []
+    first = " and ".join(f"'{buildings[i].name}'" for i in found[0])
+    more = "" if len(found) == 1 else f" and {len(found) - 1} more pairs"
+    return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
 
 
 def _buried(towers: Mapping[str, Tower], buildings: tuple[Building, ...]) -> list[str]:
@@ -392,10 +518,11 @@ def _tower(
         ground = float(dem.ground_m(east, north))
         if math.isnan(ground):
             raise UsageError(f"{what} is not on the elevation model", cause="the grid is too small for the site")
+    stated = model.ground_offset_m or 0.0
+    if model.ground is not None and (site.tower_ground == "offsets" or datum.origin_ground is not None):
+        stated = datum.up_m(model.ground.height(), f"{what}, ground")  # also where unused: mixing is refused
     if site.tower_ground == "offsets":
-        ground = model.ground_offset_m or 0.0
-        if model.ground is not None:
-            ground = datum.up_m(model.ground.height(), f"{what}, ground")
+        ground = stated
     height = model.antenna_height_m or chosen.antenna_height_m or 10.0
     if model.antenna is not None:
         height = datum.up_m(model.antenna.height(), f"{what}, antenna", ground_m=ground) - ground
@@ -426,8 +553,7 @@ def _chosen_position(
     return chosen
 
 
-def _building(model: BuildingModel, frame: SiteFrame, dem: Dem | None) -> Building:
-    footprint = model.polygon(frame)
+def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Building:
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
@@ -447,8 +573,9 @@ def _trees(
         + [Point(tower.east_m, tower.north_m).buffer(MAST_CLEARANCE_M) for tower in towers.values()]
     )
     sizes, parts = model.sizes(), []
-    for forest in forests:
-        placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
+    for index, forest in enumerate(forests):
+        with _at("forests", index):
+            placed = place_trees(forest, sizes, seed=model.seed, keep_clear=clear)
         wanted = wanted_trees(forest, clear)
         if len(placed) < wanted:
             notes.append(
@@ -456,22 +583,63 @@ def _trees(
             )
         parts.append(placed)
     points = list(model.points_m)
+    if points:
+        _check_near(points, "trees.points_m")
     if model.points_deg:
         points += _ring_from_degrees(model.points_deg, frame, "trees")
     if points:
         east, north = zip(*points, strict=True)
         parts.append(trees_at(east, north, sizes))  # type: ignore[arg-type]
+    if model.single:
+        parts.append(_single(model.single, sizes, frame))
     return join_trees(parts)
 
 
-def _area(area: tuple[float, float, float, float] | None, towers: Mapping[str, Tower]) -> Area:
-    east = [tower.east_m for tower in towers.values()]
-    north = [tower.north_m for tower in towers.values()]
+def _single(models: list[SingleTreeModel], sizes: TreeSizes, frame: SiteFrame) -> Trees:
+    """Trees with sizes of their own; crowns begin at the same share of the height as everywhere."""
+    points = []
+    for index, model in enumerate(models):
+        with _at("trees", "single", index):
+            if model.at_m is not None:
+                _check_near([model.at_m], "trees.single")
+            points.append(model.at_m or _ring_from_degrees([model.at_deg or (0.0, 0.0)], frame, "trees.single")[0])
+    east, north = np.array(points, dtype=np.float64).T
+    drawn = trees_at(east, north, sizes)
+
+    def own(name: str) -> FloatArray:
+        stated = np.array([np.nan if (size := getattr(m, name)) is None else size for m in models], dtype=np.float64)
+        return np.where(np.isnan(stated), getattr(drawn, name), stated)
+
+    height = own("height_m")
+    return replace(
+        drawn,
+        height_m=height,
+        crown_base_m=height * sizes.crown_base_fraction,
+        crown_diameter_m=own("crown_diameter_m"),
+        trunk_diameter_m=own("trunk_diameter_m"),
+    )
+
+
+def _area(area: Area | None, towers: Mapping[str, Tower]) -> Area:
+    return _checked_area(area, [t.east_m for t in towers.values()], [t.north_m for t in towers.values()])
+
+
+def _checked_area(area: Area | None, east: list[float], north: list[float]) -> Area:
     if area is None:
         return (min(east) - 500.0, max(east) + 500.0, min(north) - 500.0, max(north) + 500.0)
     if not (area[0] < area[1] and area[2] < area[3]):
         raise UsageError(f"area_m is {list(area)}", expected="[east_min, east_max, north_min, north_max]")
     return area
+
+
+def _check_near(points_m: list[tuple[float, float]], name: str) -> None:
+    away = max(math.hypot(*point) for point in points_m)
+    if away > FAR_POLYGON_M:
+        raise UsageError(
+            f"'{name}' reaches {away / 1000:.0f} km from the site's origin",
+            expected="metres east and north of the origin",
+            cause="map coordinates (UTM or State Plane, metres or feet) in place of metres from the origin",
+        )
 
 
 def _ring_from_degrees(ring: list[tuple[float, float]], frame: SiteFrame, name: str) -> list[tuple[float, float]]:

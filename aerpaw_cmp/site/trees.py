@@ -167,7 +167,9 @@ def _scatter(area: BaseGeometry, wanted: int, spacing_m: float, random: np.rando
         return placed
     if wanted > MAXIMUM_TREES:
         raise UsageError(
-            f"a forest of {area.area / 1e6:.0f} km2 asks for {wanted} trees", expected=f"at most {MAXIMUM_TREES}"
+            f"a forest of {area.area / 1e4:.0f} ha asks for {wanted} trees",
+            expected=f"at most {MAXIMUM_TREES}",
+            cause="trees_per_hectare is too high, or the outline reaches far outside the site",
         )
     shapely.prepare(area)
     east_min, north_min, east_max, north_max = area.bounds

@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.report import export
 from aerpaw_cmp.report.data import Engine
 
@@ -129,7 +130,7 @@ def test_a_failed_write_leaves_the_old_file_and_no_rubbish(tmp_path, monkeypatch
         raise OSError("no space left on device")
 
     monkeypatch.setattr(export.Path, "replace", fail)
-    with pytest.raises(OSError, match="no space"):
+    with pytest.raises(UsageError, match="no space"):
         export.write_atomic(path, "new")
     assert [p.name for p in tmp_path.iterdir()] == ["metrics.json"]
     assert path.read_text() == "old"

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
+from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.report import figures, site_view
 from aerpaw_cmp.report.site_view import PathLine
-from aerpaw_cmp.site.site import Building, Site, Trees
+from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
 
 
 @pytest.fixture
@@ -102,3 +103,63 @@ def test_ten_thousand_trees_keep_the_files_small(report_data):
     with figures.style():
         svg, _ = figures.save(site_view.solid(site))
     assert len(svg) < 500_000
+
+
+def test_holes_stay_empty_and_fences_are_drawn(report_data):
+    """Filling the line of an area with holes covers exactly the area; the page and the pictures show geofences."""
+    ring = Polygon([(0, 0), (30, 0), (30, 30), (0, 30)], [[(10, 10), (10, 20), (20, 20), (20, 10)]])
+    line = site_view.outline(ring)
+    east, north = line.T
+    assert abs(np.sum(east * np.roll(north, -1) - np.roll(east, -1) * north)) / 2 == pytest.approx(ring.area)
+    site = dataclasses.replace(
+        report_data.site,
+        forests=(Forest("wood", ring),),
+        geofences=(Geofence("fence", box(-900, -900, 900, 1900)),),
+    )
+    scene = scene_of(site_view.viewer(site))
+    assert scene["forests"] == [line.tolist()]
+    assert scene["fences"][0][0] == [900.0, -900.0]
+    assert site_view.view_limits(site, None)[0, 0] < -900
+    for draw in (site_view.plan, site_view.solid):
+        with figures.style():
+            labels = draw(site).axes[0].get_legend_handles_labels()[1]
+        assert "geofence" in labels
+
+
+def test_the_pose_of_the_paths_is_marked(report_data, paths):
+    for draw in (site_view.plan, site_view.solid):
+        with figures.style():
+            labels = draw(report_data.site, report_data.track, paths).axes[0].get_legend_handles_labels()[1]
+        assert "UAV, 40 m up" in labels
+        assert {"line of sight", "one reflection", "flight", "tower"} <= set(labels)
+
+
+def test_crowns_on_the_plan_are_to_scale(report_data):
+    trees = Trees(*(np.array([v]) for v in (5.0, 7.0, 0.0, 30.0, 14.0, 7.5, 0.4)))
+    with figures.style():
+        ax = site_view.plan(dataclasses.replace(report_data.site, trees=trees)).axes[0]
+    [crowns] = [c for c in ax.collections if type(c).__name__ == "EllipseCollection"]
+    assert crowns.get_offsets().tolist() == [[5.0, 7.0]]
+    assert crowns.get_widths().tolist() == [14.0]
+
+
+def test_a_file_in_the_way_is_one_message(report_data, tmp_path):
+    (tmp_path / "taken").write_text("")
+    with pytest.raises(UsageError, match=r"the folder cannot be made .*a file is in the way"):
+        site_view.write_site_view(Site("nothing", report_data.site.frame, {}), tmp_path / "taken" / "show")
+
+
+def test_the_picture_is_scaled_by_corners_that_exist(report_data, monkeypatch):
+    """Polygons of unlike length leave matplotlib cells that were never filled: their garbage must not be asked for."""
+    empty = np.empty
+    monkeypatch.setattr(np, "empty", lambda *a, **k: full(empty(*a, **k)))
+
+    def full(array):
+        if array.dtype == float:
+            array.ravel()[::2], array.ravel()[1::2] = 1.7e308, -1.7e308
+        return array
+
+    shapes = (box(0, 0, 10, 10), Polygon([(50, 0), (80, 0), (90, 20), (70, 40), (50, 30)]))
+    forests = tuple(Forest(f"f{n}", shape) for n, shape in enumerate(shapes))
+    with figures.style():
+        figures.save(site_view.solid(dataclasses.replace(report_data.site, forests=forests)))

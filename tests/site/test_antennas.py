@@ -255,3 +255,64 @@ def test_measured_patterns_of_the_field(file: str, grid: str, peak_dbi: float) -
     # the same measurement, listed by others over true azimuth
     gain = read_gain_grid(folder / "rad_pat.mat", grid).gain_dbi(theta, azimuth)
     np.testing.assert_allclose(gain, rows[:, 2], atol=0.05)
+
+
+SMALL = [
+    f"{phi:.6f}\t{theta:.6f}\t-3.0103\t-6.0206\t-6.0206\t0.100\t{0.2 * phi:.3f}"
+    for phi in np.arange(4) * np.pi / 4
+    for theta in np.linspace(-np.pi, np.pi, 9)
+]
+
+
+@pytest.mark.parametrize(
+    ("rows", "line", "words"),
+    [
+        ([*SMALL[:-1], SMALL[-1][:-1]], 40, "'0.47', has fewer digits than those above it. Likely cause: the line was cut off"),
+        ([*SMALL[:-1], SMALL[-1][:-20]], 40, "expected 7 numbers. Likely cause: the line was cut off"),
+        ([*SMALL, SMALL[0]], 41, "given twice.*a line was copied"),
+        ([*SMALL[:10], *SMALL[11:]], None, "phi 45.0 deg, theta -135.0 deg .missing.*a line is lost"),
+        ([*SMALL[:9], *SMALL[18:]], None, "phi runs from 0.0 to 135.0 deg in 3 values.*angles are missing"),
+        ([row.replace(".", ",") for row in SMALL], 5, "decimal commas"),
+        ([row.replace("-3.0103\t-6.0206\t-6.0206", "-43.0103\t-46.0206\t-46.0206") for row in SMALL], None,
+         "mean gain over the sphere is -43.0 dB"),
+    ],
+)  # fmt: skip
+def test_damaged_patterns_name_the_line(tmp_path: Path, rows: list[str], line: int | None, words: str) -> None:
+    path = tmp_path / "p.txt"
+    path.write_text(HEADER + "\n".join(SMALL))
+    assert read_pattern_text(path).efficiency == pytest.approx(0.5, rel=1e-3)
+    path.write_text(HEADER + "\n".join(rows))
+    with pytest.raises(InputError, match=words) as error:
+        read_pattern_text(path)
+    assert error.value.line == line
+    path.write_text((HEADER + "\n".join(SMALL)).replace("\t", ";"))
+    with pytest.raises(InputError, match=r"not separated by tabs|no pattern found"):
+        read_pattern_text(path)
+
+
+ELEVATION, AZIMUTH = np.linspace(90, -90, 7), np.arange(12) * 30.0
+
+
+@pytest.mark.parametrize(
+    ("elevation", "azimuth", "change", "words"),
+    [
+        (ELEVATION, AZIMUTH, "nan", r"1 values that are no numbers, the first at elevation 30 deg, azimuth 90 deg"),
+        (ELEVATION, AZIMUTH, "transpose", "'g' has 12 x 7 values.*rows and columns are swapped"),
+        (np.where(ELEVATION == 0, np.nan, ELEVATION), AZIMUTH, "", "elevation .* runs from nan"),
+        (90 - ELEVATION, AZIMUTH, "", "zenith angles in place of elevation"),
+        (ELEVATION, np.linspace(0, 360, 13), "", "a direction stands twice, such as 0 and 360"),
+        (ELEVATION[:4], AZIMUTH, "", "angles are missing"),
+        (np.radians(ELEVATION), AZIMUTH, "", "radians instead of degrees"),
+    ],
+)
+def test_damaged_gain_grids(
+    tmp_path: Path, elevation: np.ndarray, azimuth: np.ndarray, change: str, words: str
+) -> None:
+    from scipy.io import savemat
+
+    grid = np.full((len(elevation), len(azimuth)), -1.0)
+    if change == "nan":
+        grid[2, 3] = np.nan
+    savemat(tmp_path / "g.mat", {"theta2": elevation, "phi2": azimuth, "g": grid.T if change == "transpose" else grid})
+    with pytest.raises(AerpawCmpError, match=words):
+        read_gain_grid(tmp_path / "g.mat", "g")

@@ -185,3 +185,57 @@ def test_imported_site_keeps_its_elevation_model(tmp_path: Path) -> None:
     write_site_yaml(model, tmp_path / "new.yaml")
     site = load_site(tmp_path / "new.yaml")
     assert site.trees.ground_m[0] == pytest.approx(0.03 * site.trees.east_m[0] - 0.02 * site.trees.north_m[0], abs=1e-6)
+
+
+HEAD = "ncols 3\nnrows 3\nxllcorner -150\nyllcorner -150\ncellsize 100\nNODATA_value -9999\n"
+CELLS = "1 2 3\n4 5 6\n7 8 9\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "line", "words"),
+    [
+        (HEAD.replace("-9999", "-32768") + CELLS.replace("9", "-9999"), 9, "a gap that the file's NODATA value does not declare"),
+        (HEAD + CELLS.replace("9", "33000"), 9, "feet or centimetres"),
+        (HEAD + CELLS.replace("5", "-9999"), None, "its cells there are gaps"),
+        (HEAD + CELLS + "1\n", 10, "nrows or ncols is wrong"),
+        (HEAD + CELLS[:-3], 9, "the file was cut off"),
+        (HEAD + CELLS.replace("5", "5,5"), 8, "decimal commas"),
+        (HEAD.replace("ncols 3", "ncols nan") + CELLS, None, "ncols is nan; expected a whole number"),
+        (HEAD.replace("ncols 3", "ncols 2.5") + CELLS, None, "ncols is 2.5; expected a whole number"),
+        (HEAD.replace("cellsize 100", "cellsize 0") + CELLS, None, "cellsize is 0"),
+    ],
+)  # fmt: skip
+def test_damaged_grids_name_the_line(tmp_path: Path, text: str, line: int | None, words: str) -> None:
+    path, frame = tmp_path / "d.asc", SiteFrame(35.7275, -78.696)
+    path.write_bytes(b"\xef\xbb\xbf" + (HEAD + CELLS).encode())
+    assert float(read_dem(path, frame, crs="local").absolute_m(0, 0)) == 5, "with a byte-order mark"
+    path.write_text(text)
+    with pytest.raises(InputError, match=words) as error:
+        read_dem(path, frame, crs="local")
+    assert error.value.line == line
+
+
+def test_pictures_and_feet_are_no_elevation_model(tmp_path: Path) -> None:
+    rasterio = pytest.importorskip("rasterio")
+    frame = SiteFrame(35.7275, -78.696)
+    transform = rasterio.Affine(0.002, 0, -78.699, 0, -0.002, 35.7305)
+    heights = np.arange(9, dtype=np.float32).reshape(3, 3)
+
+    def write(name: str, bands: int, unit: str = "") -> Path:
+        options = {"driver": "GTiff", "width": 3, "height": 3, "dtype": "float32", "crs": "EPSG:4326"}
+        with rasterio.open(tmp_path / name, "w", count=bands, transform=transform, **options) as image:
+            for band in range(bands):
+                image.write(heights, band + 1)
+            if unit:
+                image.set_band_unit(1, unit)
+        return tmp_path / name
+
+    assert float(read_dem(write("m.tif", 1, "metre"), frame).absolute_m(0, 0)) == pytest.approx(4)
+    with pytest.raises(InputError, match="3 bands; expected one band of heights"):
+        read_dem(write("rgb.tif", 3), frame)
+    with pytest.raises(InputError, match="heights in 'us survey foot'; expected metres"):
+        read_dem(write("ft.tif", 1, "US survey foot"), frame)
+    cut = tmp_path / "cut.tif"
+    cut.write_bytes((tmp_path / "m.tif").read_bytes()[:300])
+    with pytest.raises(InputError, match=r"cut\.tif"):
+        read_dem(cut, frame)

@@ -313,8 +313,9 @@ def test_single_trees_of_osm(tmp_path: Path) -> None:
     )
     model, _ = import_site([path])
     assert len(build_site(model).trees) == 1
-    [(east, north)] = import_footprints([path], FRAME).trees_m
-    assert math.hypot(east - 50, north - 60) < 0.01
+    [tree] = import_footprints([path], FRAME).trees
+    assert math.hypot(tree.east_m - 50, tree.north_m - 60) < 0.01
+    assert (tree.height_m, tree.crown_diameter_m) == (None, None)
 
 
 @pytest.mark.parametrize(

@@ -227,3 +227,58 @@ def test_the_documented_differences_are_the_computed_ones() -> None:
         tower, metres = note[:3], note.split(" lies ")[1].split(" from")[0]
         row = next(line for line in text.splitlines() if line.startswith(f"| {tower} "))
         assert f"| {metres} |" in row
+
+
+BASE = """name: test
+origin: {latitude_deg: 35.7275, longitude_deg: -78.696, ground: {height_m: 79, reference: ellipsoidal}}
+towers:
+  T: {latitude_deg: 35.7275, longitude_deg: -78.696}
+"""
+SQUARE = "[[0, 0], [10, 0], [10, 10], [0, 10]]"
+
+
+@pytest.mark.parametrize(
+    ("more", "line", "words"),
+    [
+        ("forests:\n  - name: w\n    polygon_deg: [[-78.697, 35.728], [-78.697, 35.7281], [-78.6969, 35.7281]]", 7, "swapped"),
+        ("buildings:\n  - name: b\n    height_m: 4\n    polygon_deg: [[35.728, -78.697], [35.7281, -78.6969],"
+         " [35.7281, -78.697], [35.728, -78.6969]]", 8, "not a simple outline"),
+        ("buildings:\n  - {name: b, height_m: 4, polygon_deg: [[35.728, -78.697], [35.728, -78.697], [35.728, -78.697]]}", 6, "fewer than 3"),
+        ("geofences:\n  - {name: g, polygon_deg: [[35, 179.9], [35, -179.9], [35.1, -179.9]]}", 6, "crosses the antimeridian"),
+        ("forests:\n  - {name: w, polygon_m: [[706000, 2063000], [706100, 2063000], [706100, 2063100]]}", 6, "map coordinates"),
+        (f"buildings:\n  - {{name: b, height_m: 4000, polygon_m: {SQUARE}}}", 6, "feet or centimetres"),
+        (f"buildings:\n  - {{name: b, height_m: .inf, polygon_m: {SQUARE}}}", 6, "a finite number"),
+        ("buildings:\n  - {name: b, height_m: 4, polygon_m: [[0, 0], [.nan, 0], [10, 10]]}", 6, "a finite number"),
+        (f"forests:\n  - {{name: w, trees_per_hectare: 1e9, polygon_m: {SQUARE}}}", 6, "at most 2000000"),
+        ("  U: {latitude_deg: -78.696, longitude_deg: 35.7275}", 5, "latitude and longitude are swapped"),
+        ("  U: {latitude_deg: 35.7275, longitude_deg: 78.696}", 5, "west is negative"),
+        ("  U: {latitude_deg: 35.9, longitude_deg: -78.696}", 5, "a digit is wrong"),
+        ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna_height_m: 3300}", 5, "feet or centimetres"),
+        ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, antenna: {height_m: 90, reference: orthometric}}", 5, "cannot be compared"),
+        ("  U: {latitude_deg: 35.7275, longitude_deg: -78.696, ground: {height_m: 90, reference: orthometric}}", 5, "cannot be compared"),
+        ("area_m: [10, -10, 0, 5]", 5, "east_min, east_max"),
+        ("tower_ground: dem", 5, "the key 'dem'"),
+        ("trees: {height_m: -3}", 5, "trees.height_m.number: found -3; expected greater than 0"),
+        ("trees:\n  points_m: [[1e9, 0]]", 5, "map coordinates"),
+        ("trees:\n  single:\n    - {at_m: [1, 2]}\n    - {at_deg: [-78.696, 35.7275]}", 8, "swapped"),
+        ("trees:\n  single:\n    - {at_m: [1, 2], at_deg: [35, -78]}", 7, "give at_m"),
+    ],
+)  # fmt: skip
+def test_every_message_names_its_line(tmp_path: Path, more: str, line: int, words: str) -> None:
+    path = tmp_path / "site.yaml"
+    path.write_text(f"{BASE}{more}\n")
+    with pytest.raises(UsageError, match=words) as error:
+        load_site(path)
+    assert (error.value.path, error.value.line) == (str(path), line), str(error.value)
+
+
+def test_the_origins_ground_is_no_height_of_the_site_itself(tmp_path: Path) -> None:
+    (tmp_path / "s.yaml").write_text(BASE.replace("ellipsoidal", "above_takeoff"))
+    with pytest.raises(UsageError, match="expected 'orthometric' or 'ellipsoidal'"):
+        load_site(tmp_path / "s.yaml")
+
+
+def test_overlapping_buildings_are_told(tmp_path: Path) -> None:
+    one, two = (f"  - {{name: {n}, height_m: 4, polygon_m: {SQUARE}}}\n" for n in "ab")
+    (tmp_path / "s.yaml").write_text(BASE + "buildings:\n" + one + two)
+    assert any("the buildings 'a' and 'b' overlap" in note for note in load_site(tmp_path / "s.yaml").notes)

@@ -1,0 +1,94 @@
+"""What map files hold, before it is cleaned: outlines, single trees, tree rows; and how their positions are checked."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+from ..errors import InputError
+
+Position = tuple[float, float]
+"""Latitude, longitude [deg]."""
+
+BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError)
+"""What reading one element may raise: the element is left out and listed, the others stay."""
+
+
+@dataclass(slots=True)
+class Outline:
+    """One area of a map file.
+
+    Parameters
+    ----------
+    name : str
+        Its name, or file and id.
+    source : str
+        File name and id.
+    tags : mapping of str to str
+        As in the file.
+    parts : list of (outer ring, hole rings)
+        Positions in degrees, as written.
+    broken : list of str
+        What was wrong while reading it.
+    """
+
+    name: str
+    source: str
+    tags: Mapping[str, str]
+    parts: list[tuple[list[Position], list[list[Position]]]] = field(default_factory=list)
+    broken: list[str] = field(default_factory=list)
+
+
+@dataclass(frozen=True, slots=True)
+class TreeLine:
+    """A single tree (one position) or a tree row (the corners of its line), with its tags."""
+
+    source: str
+    tags: Mapping[str, str]
+    positions: tuple[Position, ...]
+
+
+@dataclass(slots=True)
+class MapFile:
+    """All outlines and trees of a file, and sentences about what is neither."""
+
+    kind: str
+    outlines: list[Outline] = field(default_factory=list)
+    trees: list[TreeLine] = field(default_factory=list)
+    notes: list[str] = field(default_factory=list)
+
+    def take(self, other: MapFile) -> None:
+        """Everything of a part of the file."""
+        self.outlines += other.outlines
+        self.trees += other.trees
+        self.notes += other.notes
+
+
+def lonlat(point: Any, where: str, path: Path) -> Position:
+    """A position written longitude first; InputError when it is none."""
+    try:
+        longitude, latitude = float(point[0]), float(point[1])
+    except (TypeError, ValueError, IndexError, KeyError):
+        raise InputError(f"{where}: the position {str(point)[:40]} is not longitude, latitude", path=path) from None
+    if not (math.isfinite(latitude) and math.isfinite(longitude)):
+        raise InputError(f"{where}: a coordinate is not a number", path=path)
+    return latitude, longitude
+
+
+def reason(error: Exception) -> str:
+    """Why an element cannot be used, in words."""
+    if isinstance(error, InputError):
+        return error.found
+    if isinstance(error, KeyError):
+        return f"it is not as it should be: no {error}"
+    return "it is not as it should be"
+
+
+def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
+    """The line of the list about an element that cannot be used."""
+    place = path.name if line is None else f"{path.name}, line {line}"
+    why = reason(error).removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
+    return f"warning: {place}: {what} was left out: {why}"

@@ -1,0 +1,406 @@
+"""Damaged and unusual map data: what can be used is used, and nothing goes without a line that says so."""
+
+import gzip
+import io
+import json
+import zipfile
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import shapely
+
+from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
+from aerpaw_cmp.site.siteyaml import load_site
+
+FRAME = SiteFrame(35.7275, -78.696)
+Ring = list[tuple[float, float]]
+BARN = {"building": "barn", "height": "7.5"}
+
+
+def square(east: float, north: float, size: float = 20.0) -> Ring:
+    corners = [(east, north), (east + size, north), (east + size, north + size), (east, north + size), (east, north)]
+    latitude, longitude = FRAME.to_geographic(*np.array(corners).T)
+    return [(float(x), float(y)) for x, y in zip(longitude, latitude, strict=True)]
+
+
+def feature(geometry: Any, **tags: Any) -> dict[str, Any]:
+    return {"type": "Feature", "properties": tags, "geometry": geometry}
+
+
+def polygon(*rings: Any) -> dict[str, Any]:
+    return {"type": "Polygon", "coordinates": list(rings)}
+
+
+def read(tmp_path: Path, content: Any, name: str = "m.json", **options: Any) -> Footprints:
+    path = tmp_path / name
+    text = content if isinstance(content, str | bytes) else json.dumps(content, indent=1)
+    path.write_bytes(text if isinstance(text, bytes) else text.encode())
+    return import_footprints([path], FRAME, **options)
+
+
+def collection(*features: Any) -> dict[str, Any]:
+    return {"type": "FeatureCollection", "features": list(features)}
+
+
+def said(found: Footprints, words: str) -> bool:
+    return any(words in action for action in found.actions)
+
+
+# ---------------------------------------------------------------- OSM
+
+
+class Osm:
+    """OSM data written as XML or as Overpass JSON."""
+
+    def __init__(self) -> None:
+        self.nodes: list[tuple[int, float, float, dict[str, str]]] = []
+        self.ways: list[tuple[int, list[int], dict[str, str]]] = []
+        self.relations: list[tuple[list[tuple[int, str]], dict[str, str]]] = []
+
+    def node(self, lon: float, lat: float, **tags: str) -> int:
+        self.nodes.append((len(self.nodes) + 1, lat, lon, tags))
+        return len(self.nodes)
+
+    def way(self, ring: Ring, **tags: str) -> int:
+        ids = [self.node(*point) for point in ring[:-1]]
+        self.ways.append((100 + len(self.ways), [*ids, ids[0]], tags))
+        return self.ways[-1][0]
+
+    def relation(self, members: list[tuple[int, str]], **tags: str) -> None:
+        self.relations.append((members, tags))
+
+    def xml(self, *, drop: tuple[int, ...] = (), root: str = '<osm version="0.6">') -> str:
+        def words(tags: dict[str, str]) -> str:
+            return "".join(f'<tag k="{k}" v="{v}"/>' for k, v in tags.items())
+
+        lines = ['<?xml version="1.0"?>', root]
+        for i, lat, lon, tags in self.nodes:
+            if i not in drop:
+                lines.append(f'<node id="{i}" lat="{lat!r}" lon="{lon!r}">{words(tags)}</node>')
+        for i, refs, tags in self.ways:
+            lines.append(f'<way id="{i}">' + "".join(f'<nd ref="{r}"/>' for r in refs) + words(tags) + "</way>")
+        for n, (members, tags) in enumerate(self.relations):
+            listed = "".join(f'<member type="way" ref="{r}" role="{role}"/>' for r, role in members)
+            lines.append(f'<relation id="{n}">{listed}{words(tags)}</relation>')
+        return "\n".join([*lines, "</osm>"])
+
+
+@pytest.mark.parametrize("style", ["multipolygon", "tags on the outer way", "tags on both", "no roles"])
+def test_clearings_stay_empty_of_trees(tmp_path: Path, style: str) -> None:
+    osm = Osm()
+    wood = {"natural": "wood"}
+    outer = osm.way(square(100, 100, 300), **(wood if "tags" in style else {}))
+    inner = [osm.way(square(150, 150, 80)), osm.way(square(280, 280, 60))]
+    island = osm.way(square(170, 170, 30))
+    roles = ("", "") if style == "no roles" else ("outer", "inner")
+    members = [(outer, roles[0]), *((way, roles[1]) for way in inner), (island, roles[0])]
+    osm.relation(members, type="multipolygon", **({} if style == "tags on the outer way" else wood))
+    (tmp_path / "w.osm").write_text(osm.xml())
+    model, _ = import_site([tmp_path / "w.osm"])
+    write_site_yaml(model, tmp_path / "site.yaml")
+    site = load_site(tmp_path / "site.yaml")
+    # the site's origin is LW1, a metre or so from FRAME's
+    shift = np.array(site.frame.to_local(FRAME.latitude_deg, FRAME.longitude_deg))
+    east, north = site.trees.east_m - shift[0], site.trees.north_m - shift[1]
+    clearings = shapely.box(151, 151, 229, 229).difference(shapely.box(169, 169, 201, 201))
+    assert not shapely.contains_xy(clearings, east, north).any()
+    assert not shapely.contains_xy(shapely.box(281, 281, 339, 339), east, north).any()
+    assert shapely.contains_xy(shapely.box(170, 170, 200, 200), east, north).sum() > 3, "the island in the clearing"
+    assert len(site.trees) == pytest.approx((300**2 - 80**2 - 60**2 + 30**2) / 100, rel=0.01)
+
+
+def test_trees_have_their_tagged_sizes(tmp_path: Path) -> None:
+    osm = Osm()
+    for place, tags in enumerate(
+        [
+            {"height": "12", "diameter_crown": "6 m", "circumference": "1.57"},
+            {"est_height": "40 ft"},
+            {},
+            {"height": "tall"},
+            {"height": "400"},
+        ]
+    ):
+        osm.node(*square(40.0 * place + 30, 50)[0], natural="tree", **tags)
+    (tmp_path / "t.osm").write_text(osm.xml())
+    model, actions = import_site([tmp_path / "t.osm"])
+    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    trees = load_site(tmp_path / "site.yaml").trees
+    np.testing.assert_allclose(trees.height_m, [12, 12.19, 20, 20, 20])
+    np.testing.assert_allclose(trees.crown_diameter_m, [6, 10, 10, 10, 10])
+    np.testing.assert_allclose(trees.crown_base_m, trees.height_m / 4)
+    np.testing.assert_allclose(trees.trunk_diameter_m, [0.5, 0.4, 0.4, 0.4, 0.4])
+    assert "t.osm: node 4: the height 'tall' is not a length" in actions
+    assert any("node 5: a tree 400 m high" in action for action in actions)
+
+
+def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:
+    corners = [[*square(0, 0)[0]], [*square(60, 0)[0]], [*square(60, 40)[0]]]
+    row = feature({"type": "LineString", "coordinates": corners}, natural="tree_row", height="9", diameter_crown="5")
+    found = read(tmp_path, collection(row))
+    east, north = (np.array([getattr(t, name) for t in found.trees]) for name in ("east_m", "north_m"))
+    assert len(east) == 21
+    assert shapely.LineString([(0, 0), (60, 0), (60, 40)]).distance(shapely.points(east, north)).max() < 0.02
+    np.testing.assert_allclose(np.diff(east).sum() + np.diff(north).sum(), 100, atol=0.05)
+    assert {(t.height_m, t.crown_diameter_m) for t in found.trees} == {(9.0, 5.0)}
+    assert said(found, "21 trees were placed along the row, 5 m apart")
+
+
+def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Path) -> None:
+    osm = Osm()
+    osm.way(square(0, 0), **BARN)
+    osm.way(square(100, 0), **BARN)
+    osm.ways[1] = (osm.ways[1][0], osm.ways[1][1][:-1], osm.ways[1][2])
+    found = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
+    assert sorted(round(b.footprint.area) for b in found.buildings) == [200, 400]
+    assert said(found, "way 100: 2 of 5 nodes are not in the file")
+    assert said(found, "way 101: its line is not closed")
+
+
+def test_osm_with_a_namespace_and_deleted_elements(tmp_path: Path) -> None:
+    osm = Osm()
+    osm.way(square(0, 0), **BARN)
+    text = osm.xml(root='<osm xmlns="http://openstreetmap.org/osm/0.6" version="0.6">')
+    text = text.replace("</osm>", '<node id="77" visible="false"/><way id="78" visible="false"/></osm>')
+    found = read(tmp_path, text, "a.osm")
+    assert (len(found.buildings), found.actions) == (1, [])
+
+
+def test_broken_relations(tmp_path: Path) -> None:
+    osm = Osm()
+    way = osm.way(square(0, 0, 200))
+    osm.ways[0] = (way, osm.ways[0][1][:-1], {})
+    osm.relation([(way, "outer"), (999, "inner")], type="multipolygon", landuse="forest")
+    osm.relation([(998, "outer")], type="multipolygon", landuse="forest")
+    osm.relation([], type="route", landuse="forest")
+    found = read(tmp_path, osm.xml(), "a.osm")
+    assert [round(f.area.area, -2) for f in found.forests] == [40_000]
+    for words in ("relation 0: way 999 is not in the file", "relation 0: a ring is not closed",
+                  "relation 1: left out, it has no area", "1 relations of type 'route'"):  # fmt: skip
+        assert said(found, words), words
+
+
+def overpass(*elements: Any, **more: Any) -> dict[str, Any]:
+    return {"elements": list(elements), **more}
+
+
+def test_overpass_center_body_and_remark(tmp_path: Path) -> None:
+    points = [{"lat": lat, "lon": lon} for lon, lat in square(0, 0)]
+    whole = {"type": "way", "id": 2, "tags": BARN, "geometry": points}
+    centre = {"type": "way", "id": 1, "tags": BARN, "center": points[0]}
+    with pytest.raises(InputError, match=r"no building.*way 1: it has no outline in the file.*'out geom;'"):
+        read(tmp_path, overpass(centre))
+    cut = {**whole, "id": 3, "geometry": [*points[:3], None]}
+    broken = {"type": "way", "id": 4, "tags": BARN, "geometry": [{"lat": 1}]}
+    found = read(tmp_path, overpass(centre, whole, cut, broken, "?", remark="runtime error: Query timed out"))
+    assert len(found.buildings) == 1
+    for words in ("way 1: left out", "way 3: 1 of 4 points are unknown", "Query timed out"):
+        assert said(found, words), words
+    text = (tmp_path / "m.json").read_text().splitlines()
+    line = text.index('   "id": 4,')  # the brace stands two lines above, and the index counts from 0
+    assert said(found, f"m.json, line {line - 1}: way 4 was left out"), found.actions
+    assert any(action.endswith("element 5 was left out: it is not as it should be") for action in found.actions)
+    # 'out body; >; out skel;' lists nodes without tags, and ways twice
+    nodes = [{"type": "node", "id": n, **point} for n, point in enumerate(points[:-1])]
+    body = {"type": "way", "id": 5, "tags": BARN, "nodes": [0, 1, 2, 3, 0]}
+    found = read(tmp_path, overpass(body, *nodes, {"type": "way", "id": 5, "nodes": [0, 1, 2, 3, 0]}))
+    assert (len(found.buildings), found.actions) == (1, [])
+
+
+# ---------------------------------------------------------------- GeoJSON
+
+
+def test_one_bad_feature_does_not_lose_the_others(tmp_path: Path) -> None:
+    good = feature(polygon(square(0, 0)), **BARN)
+    bad = [
+        None,
+        3,
+        feature(polygon([["a", 1], [2, 3], [4, 5]]), **BARN),
+        feature({"type": "GeometryCollection"}, **BARN),
+        feature({"type": "Circle", "coordinates": [1, 2]}, **BARN),
+        feature(polygon(None), **BARN),
+    ]
+    found = read(tmp_path, collection(*bad, good))
+    assert len(found.buildings) == 1
+    lines = (tmp_path / "m.json").read_text().splitlines()
+    assert said(found, f"m.json, line {lines.index('  null,') + 1}: feature 1 was left out")
+    assert said(found, f"m.json, line {lines.index('  3,') + 1}: feature 2 was left out")
+    assert said(found, "feature 3 was left out: the position ['a', 1] is not longitude, latitude")
+    assert said(found, "feature 4 was left out: it is not as it should be: no 'geometries'")
+    assert said(found, "feature 5 was left out: it is not as it should be: a geometry of type 'Circle'")
+    assert said(found, "feature 6 was left out: it is not as it should be")
+
+
+def test_what_is_no_area_is_counted(tmp_path: Path) -> None:
+    line = feature({"type": "LineString", "coordinates": square(0, 0)}, building="yes")
+    found = read(tmp_path, collection(feature(polygon(square(0, 0)), **BARN), feature(None, **BARN), line, line))
+    assert len(found.buildings) == 1
+    assert said(found, "left out, not areas: 2 LineString, 1 without geometry")
+
+
+@pytest.mark.parametrize(
+    ("rings", "words", "area"),
+    [
+        ([square(0, 0)[:-1]], "a ring is not closed", 400),
+        ([square(0, 0), square(100, 100)], "a hole outside its outline was left out", 400),
+        ([square(0, 0), square(-5, -5, 40)], "its holes cover all of it", 0),
+        ([[[*p, 112.3] for p in square(0, 0)]], "", 400),
+        ([[[2063000.1, 706000.2], [2063100, 706000], [2063100, 706100]]], "metres or feet in place of degrees", 0),
+        ([[[lat, lon] for lon, lat in square(0, 0)]], "km from the site; latitude and longitude are swapped", 0),
+        ([[[179.9, 35], [-179.9, 35], [-179.9, 35.1], [179.9, 35]]], "crosses the antimeridian", 0),
+    ],
+)
+def test_each_repair_is_said(tmp_path: Path, rings: list[Any], words: str, area: float) -> None:
+    found = read(tmp_path, collection(feature(polygon(*rings), **BARN), feature(polygon(square(300, 0)), **BARN)))
+    assert sum(b.footprint.area for b in found.buildings) == pytest.approx(area + 400, rel=1e-3)
+    assert bool(found.actions) == bool(words)
+    assert said(found, words) or not words
+
+
+def test_parts_of_a_building_have_their_own_heights(tmp_path: Path) -> None:
+    outline = feature(polygon(square(0, 0, 40)), building="yes", height="20")
+    low = feature(polygon(square(0, 0, 20)), **{"building:part": "yes", "height": "6"})
+    roof = feature(polygon(square(20, 20, 20)), **{"building:part": "roof", "height": "20", "min_height": "15"})
+    found = read(tmp_path, collection(outline, low, roof))
+    assert sorted((round(b.footprint.area), b.height_m) for b in found.buildings) == [
+        (400, 6),
+        (400, 20),
+        (400, 20),
+        (400, 20),
+    ]
+    assert said(found, "feature 1: gives way to its mapped parts")
+    assert said(found, "feature 3: it begins above the ground")
+
+
+@pytest.mark.parametrize(
+    ("tags", "metres", "words"),
+    [
+        ({"height": "-1"}, 6, "not above 0"),
+        ({"height": 0, "building:levels": 3}, 9, "not above 0"),
+        ({"height": None}, 6, ""),
+        ({"height": "2;3"}, 3, "taken as 3 m"),
+        ({"height": "~12"}, 12, "taken as 12 m"),
+        ({"height": "1,200"}, 6, "is not a length"),
+        ({"height": "12-15"}, 6, "is not a length"),
+        ({"height": "12\u20196\u201d"}, 3.81, ""),
+        ({"height": "350 cm"}, 3.5, ""),
+        ({"building:levels": "2;3"}, 9, "the largest holds"),
+        ({"building:levels": "-1"}, 6, "no positive number"),
+        ({"building:levels": "three"}, 6, "no positive number"),
+    ],
+)
+def test_unusual_heights_are_used_or_said(tmp_path: Path, tags: dict[str, Any], metres: float, words: str) -> None:
+    found = read(tmp_path, collection(feature(polygon(square(0, 0)), building="yes", **tags)))
+    assert found.buildings[0].height_m == pytest.approx(metres, abs=0.01)
+    assert said(found, words) if words else not found.actions
+
+
+def test_false_is_no_building_and_the_way_out_is_named(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="1 untagged; '--untagged building'"):
+        read(tmp_path, collection(feature(polygon(square(0, 0)), building=False)))
+    with pytest.raises(UsageError, match="untagged areas as 'house'; expected one of building, forest, geofence"):
+        read(tmp_path, polygon(square(0, 0)), untagged="house")
+    assert len(read(tmp_path, polygon(square(0, 0)), untagged="building").buildings) == 1
+
+
+def test_forests_far_outside_the_site_are_cut_off(tmp_path: Path) -> None:
+    wood = feature(polygon(square(200, 200, 9000)), natural="wood")
+    found = read(tmp_path, collection(wood), area_m=(-500.0, 500.0, -500.0, 500.0))
+    east, north = found.forests[0].area.bounds[2:]
+    assert (east, north) == pytest.approx((1500, 1500), abs=1)
+    assert said(found, "ha more than 1000 m outside the site's area were cut away")
+
+
+# ---------------------------------------------------------------- files
+
+
+def kml(*placemarks: str, root: str = '<kml xmlns="http://www.opengis.net/kml/2.2">') -> str:
+    return f'<?xml version="1.0"?>{root}<Document>' + "\n".join(placemarks) + "</Document></kml>"
+
+
+def placemark(ring: Ring, name: str = "fence", blank: str = "") -> str:
+    text = " ".join(f"{lon!r},{blank}{lat!r},30" for lon, lat in ring)
+    return (
+        f"<Placemark><name>{name}</name><MultiGeometry><Polygon><altitudeMode>absolute</altitudeMode><outerBoundaryIs>"
+        f"<LinearRing><coordinates>{text}</coordinates></LinearRing></outerBoundaryIs></Polygon></MultiGeometry>"
+        "</Placemark>"
+    )
+
+
+def test_kmz_and_kml_of_many_hands(tmp_path: Path) -> None:
+    good = kml(placemark(square(0, 0, 100)))
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w") as archive:
+        archive.writestr("images/x.png", b"")
+        archive.writestr("doc.kml", good)
+    for name, content in (
+        ("a.kml", good),
+        ("a.kmz", packed.getvalue()),
+        ("blanks.kml", kml(placemark(square(0, 0, 100), blank=" "))),
+        ("old.kml", kml(placemark(square(0, 0, 100)), root="<kml>")),
+    ):
+        found = read(tmp_path, content, name)
+        assert [round(g.area.area) for g in found.geofences] == [10_000], name
+        assert not found.actions
+    path = "<Placemark><LineString><coordinates>1,2 3,4</coordinates></LineString></Placemark>"
+    odd = placemark(square(0, 0), "odd", blank="north")
+    found = read(tmp_path, kml(placemark(square(0, 0, 100)), path, odd), "b.kml")
+    assert len(found.geofences) == 1
+    assert said(found, "not areas: 1 LineString")
+    assert said(found, "b.kml, line 3: placemark 'odd' was left out: ")
+
+
+@pytest.mark.parametrize(
+    ("content", "words"),
+    [
+        (gzip.compress(b"<osm/>"), "gzip-compressed data.*gunzip"),
+        (b"BZh91AY", "bzip2-compressed"),
+        ('{"type": "Polygon"}'.encode("utf-16"), "UTF-16 text.*save it as UTF-8"),
+        (b'{"a":\n "\xfc"}', "line 2: not JSON text: a byte that is not UTF-8"),
+        (b"\x00\x00\x00\x0d\n\tOSMHeader\x18", "OSM data in PBF"),
+        (b"\x00\x00\x27\x0a\x00", "a shapefile.*ogr2ogr"),
+        (b"<!DOCTYPE html><html><body>429 Too Many Requests</body></html>", "a web page"),
+        (b'{"type": "Topology"}', "JSON of type 'Topology'"),
+        (b'{"type": "FeatureCollection", "features": null}', "without a list of features"),
+        (b'{"type": "FeatureCollection", "features": []}', "the map is empty"),
+        (b'{"elements": [], "remark": "runtime error: out of memory"}', "out of memory"),
+        (b'{"type":"Point","crs":"urn:ogc:def:crs:EPSG::3857","coordinates":[0,0]}', "EPSG::3857.*ogr2ogr"),
+        (b"PK\x03\x04xxxx", "not a KMZ archive"),
+        (b"[" * 100_000, "nested too deep"),
+    ],
+)
+def test_other_files_are_named_for_what_they_are(tmp_path: Path, content: bytes, words: str) -> None:
+    with pytest.raises(InputError, match=f"(?s){words}"):
+        read(tmp_path, content, "x")
+
+
+@pytest.mark.parametrize(
+    "name", ["1e1", "0x1F", "12", "~", "true", "no", "a: b # c", ".nan", "</script>", "- x", "\u2028"]
+)
+def test_any_name_survives_site_yaml(tmp_path: Path, name: str) -> None:
+    content = collection(feature(polygon(square(50, 0)), name=name, **BARN))
+    (tmp_path / "v.json").write_text(json.dumps(content))
+    model, actions = import_site([tmp_path / "v.json"])
+    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    assert [b.name for b in load_site(tmp_path / "site.yaml").buildings] == [name]
+
+
+def test_control_characters_do_not_spoil_the_file(tmp_path: Path) -> None:
+    odd = feature(polygon(square(50, 0)), building="yes", height="\u0007\u001b[31m", name="bell\u0007")
+    (tmp_path / "v.json").write_text(json.dumps(collection({**odd, "id": "x\u0000\u2028\ny"})))
+    model, actions = import_site([tmp_path / "v.json"])
+    assert any("is not a length" in action for action in actions)
+    write_site_yaml(model, tmp_path / "site.yaml", header=actions)
+    assert load_site(tmp_path / "site.yaml").buildings[0].name == "bell\u0007"
+
+
+def test_openstreetmap_is_named_in_the_notes(tmp_path: Path) -> None:
+    osm = Osm()
+    osm.way(square(50, 0), **BARN)
+    (tmp_path / "a.osm").write_text(osm.xml())
+    (tmp_path / "b.json").write_text(json.dumps(collection(feature(polygon(square(100, 0)), **BARN))))
+    model, _ = import_site([tmp_path / "a.osm", tmp_path / "b.json"])
+    assert [note for note in model.notes if "OpenStreetMap" in note] == ["a.osm: (c) OpenStreetMap contributors, ODbL"]

@@ -88,6 +88,10 @@ def find_paths(
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
     hiding = Occlusion(faces, tolerance_m)
+    known = targets_m[np.isfinite(targets_m).all(axis=1)]
+    box = corners(faces, 10.0 * float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
+    # without a second reflection nobody asks
+    facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
     found: list[PathSet] = []
     for tower, source in enumerate(sources_m):
         usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
@@ -97,7 +101,9 @@ def find_paths(
             alive &= ~excluded[tower]
         poses = np.flatnonzero(alive)
         if len(poses):
-            tree = Sequences.of(faces, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m)
+            tree = Sequences.of(
+                faces, box, facing, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m
+            )
             for level in select(tower, tree) if select else tree:
                 found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
@@ -129,6 +135,8 @@ class Sequences:
     def of(
         cls,
         faces: Faces,
+        box: FloatArray,
+        facing: BoolArray,
         source: FloatArray,
         targets: FloatArray,
         usable: BoolArray,
@@ -136,12 +144,13 @@ class Sequences:
         budget: int,
         tolerance_m: float,
     ) -> list[Sequences]:
-        """Sequences of depth 0 .. max_depth that geometry does not rule out for any target."""
+        """Sequences of depth 0 .. max_depth that geometry does not rule out for any target.
+
+        ``box`` are the corners of the faces, ``facing`` which of them can follow which.
+        """
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]
-        reach = 10.0 * float(max(np.abs(targets).max(), np.abs(source).max(), 1.0))
-        box = corners(faces, reach)
-        facing = _facing(faces, box, tolerance_m) & usable[None, :]
+        facing = facing & usable[None, :]
         lit = (faces.normal @ targets.T - faces.offset_m[:, None] > tolerance_m).any(axis=1)
         low, high = targets.min(axis=0), targets.max(axis=0)
         hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)

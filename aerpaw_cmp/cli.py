@@ -346,7 +346,7 @@ def bench(
         return
     rows = []
     for r in result["replay"]["rows"]:
-        what = "" if r["thinning"] == 1 else f", every {r['thinning']}th pose"
+        what = "" if r["thinning"] == 1 else f", 1 in {r['thinning']} poses"
         rows.append(
             [
                 f"{r['engine']}{what}",

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import InputError, UsageError
+from .errors import InputError, UsageError, one_line
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
 from .store import IngestedFile
 
@@ -265,7 +265,7 @@ def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
     rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [
-        os.path.relpath(file["path"], folder) if folder else str(file["path"]),
+        one_line(os.path.relpath(file["path"], folder) if folder else str(file["path"])),
         file["reader"],
         "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
         *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
@@ -291,10 +291,12 @@ def account_notes(account: Mapping[str, Any]) -> list[str]:
     """What a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
     notes = []
     for file in account["files"]:
-        notes += [f"{file['path']}: {text}" for text in file["warnings"]]
+        path = one_line(file["path"])
+        notes += [f"{path}: {text}" for text in file["warnings"]]
         for line in file["first_rejected"]:
-            notes.append(f"{file['path']}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
+            notes.append(f"{path}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
         more = file["rejected"] - len(file["first_rejected"])
         if more:
-            notes.append(f"{file['path']}: and {more} more rejected lines, all in the flight file (-o)")
-    return notes + [f"{left['path']}: skipped: {left['reason']}" for left in account["skipped"]]
+            lines = "line" if more == 1 else "lines"
+            notes.append(f"{path}: and {more} more rejected {lines}, all in the flight file (-o)")
+    return notes + [f"{one_line(left['path'])}: skipped: {left['reason']}" for left in account["skipped"]]

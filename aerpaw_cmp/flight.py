@@ -162,10 +162,10 @@ def gather(
             else:
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
         if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
-            names = ", ".join(ratios)
+            shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
             warnings.append(
-                f"{log.path}: {names}: a ratio to the noise, not a level: compared as RSS as if the noise were "
-                f"constant ('skip: [{names}]' beside the path leaves it out)"
+                f"{log.path}: {shown} to the noise, not a level: compared as RSS as if the noise were constant "
+                f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
             )
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")

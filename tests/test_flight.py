@@ -63,5 +63,5 @@ def test_a_ratio_is_known_by_its_channel_too(tmp_path: Path) -> None:
         "time,snr_lw1,snr_lw2\n" + "".join(f"2025-06-01T10:01:{s:02d},{20 + s % 3},{10 + s % 2}\n" for s in range(40))
     )
     (warning,) = _flight(tmp_path, "path: snr.csv, reader: aadm_snr").warnings
-    assert "a ratio to the noise" in warning
+    assert "'LW1', 'LW2' are ratios to the noise" in warning
     assert "skip: [LW1, LW2]" in warning

@@ -76,16 +76,14 @@ def _table(columns: list[str], rows: list[list[str]], title: str | None = None, 
     from rich.table import Table
 
     console = Console(width=width if width or sys.stdout.isatty() else 160)
-    needs = [
-        max(max(map(cell_len, name.split())), *(cell_len(row[i]) for row in rows)) if rows else cell_len(name)
-        for i, name in enumerate(columns)
-    ]
+    needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
+    roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
     if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
         _paragraphs(columns, rows, title, console.width)
         return
     table = Table(title=title, title_justify="left")
     for column, need in zip(columns, needs, strict=True):
-        table.add_column(column, overflow="fold", width=need if need <= _FIXED else None)
+        table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
     for row in rows:
         table.add_row(*[cell.replace("[", r"\[") for cell in row])
     console.print(table)

@@ -272,11 +272,12 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     need = [s for s in file.result.streams if s.kind != "telemetry" and not s.attributes.get("node")]
     if not need:
         return entry, ""
-    towers = _TOWER.findall(path) or _TOWER.findall(file.path)
+    near = _TOWER.findall("/".join(Path(file.path).resolve().parts[-2:]))  # of the file or its folder
+    towers = near or _TOWER.findall(path)
     entry["node"] = f"LW{towers[-1]}" if towers else "LW1"
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
-    return entry, "" if towers else "  # which tower?"
+    return entry, "" if near else "  # which tower?"
 
 
 def _flow(value: dict[str, Any]) -> str:

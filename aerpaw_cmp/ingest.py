@@ -28,6 +28,7 @@ FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
 
 _GZIP = b"\x1f\x8b"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 __all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
 
@@ -144,8 +145,11 @@ def ingest(
         files += found
         skipped += left
         if not found:
+            known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
+            looked = "1 file" if len(left) == 1 else f"{len(left)} files"
+            first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
             raise InputError(
-                f"the folder holds no log that a reader knows ({len(left)} files looked at)",
+                f"the folder holds no log that {known} ({looked} looked at){first}",
                 expected="one of the formats of 'aerpaw-cmp formats'",
                 path=place,
             )
@@ -163,6 +167,13 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     """Read one file; see :func:`ingest`."""
     place = Path(path)
     head = _raw(place, HEAD_BYTES)
+    if head.startswith(_HDF5):
+        raise InputError(
+            "an HDF5 file, such as 'ingest -o' writes",
+            expected="the logs themselves (aerpaw_cmp.store.read_flight gives back what a flight file holds)",
+            cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
+            path=path,
+        )
     if reader is None and not head.startswith(_GZIP):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     data, digest = read_bytes(place)

@@ -146,6 +146,15 @@ def test_levels_without_telemetry_are_asked_about(logs: Path) -> None:
     assert [r for r in remarks if "no telemetry here" in r]
 
 
+def test_the_tower_is_told_by_the_folder_of_the_log(logs: Path) -> None:
+    far = logs / "LW4_campaign" / "first" / "run"
+    far.mkdir(parents=True)
+    shutil.move(logs / "LW2/USRP1_power_log.txt", far / "power_log.txt")
+    text, _ = draft(ingest([logs / "LW3", far], options=OPTIONS), logs / "LW3", timezone=ZONE)
+    assert "{path: USRP1_power_log.txt, reader: sounder_log, node: LW3, channel: USRP1}\n" in text
+    assert "node: LW4}  # which tower?" in text  # a guess
+
+
 def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
     shutil.move(logs / "LW1/USRP1_power_log.txt", logs / "LW1/x_quality_log.txt")
     files = ingest([logs / "LW1/x_quality_log.txt", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)

@@ -12,12 +12,13 @@ from typing import Any
 import numpy as np
 import yaml
 
-from .config import FlightFile
+from .config import FlightFile, LogSettings
 from .errors import UsageError, one_line
 from .files import whole
 from .flight import is_ratio
 from .ingest import IngestedFile
 from .records import Stream
+from .yamlfile import parse_yaml
 
 _TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
 _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
@@ -103,7 +104,7 @@ def draft(
     parts += [LINK] if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
     text = "".join(parts)
-    FlightFile.model_validate(yaml.safe_load(text))  # a draft that its own reader refuses is a fault of ours
+    parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
     asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     return text, asked + [f"left out: {remark}" for remark in entries.out]
 
@@ -280,12 +281,22 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     return entry, "" if near else "  # which tower?"
 
 
-def _flow(value: dict[str, Any]) -> str:
-    """A YAML mapping on one line."""
-    text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=True)
-    if len(text.splitlines()) > 1:  # a name with a line break: as escapes
-        text = yaml.safe_dump(value, default_flow_style=True, sort_keys=False, width=10_000, default_style='"')
-    return str(text).strip()
+def _flow(entry: dict[str, Any]) -> str:
+    """A log's YAML mapping on one line, as a flight.yaml is read: a file may be called 1e6."""
+
+    def dumped(style: str | None) -> str:
+        text = yaml.safe_dump(
+            entry, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=style is None,
+            default_style=style,
+        )  # fmt: skip
+        return str(text).strip()
+
+    text = dumped(None)
+    try:
+        as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
+    except UsageError:
+        as_read = False
+    return text if as_read else dumped('"')
 
 
 def _is_text(path: str) -> bool:

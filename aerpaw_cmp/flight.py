@@ -161,12 +161,19 @@ def gather(
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
             else:
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
+        names = [s.name for s in file.result.streams]
+        if unknown := [name for name in log.skip if name not in names]:
+            warnings.append(
+                f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
+            )
         if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
             shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
             warnings.append(
                 f"{log.path}: {shown} to the noise, not a level: compared as RSS as if the noise were constant "
                 f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
             )
+    if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
+        warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (

@@ -9,13 +9,14 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.config import load_flight
+from aerpaw_cmp.config import FlightFile, load_flight
 from aerpaw_cmp.draft import draft, write_draft
 from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.flight import gather, read_logs
 from aerpaw_cmp.ingest import ingest
 from aerpaw_cmp.logwriters import format_nemo_csv
 from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.yamlfile import parse_yaml
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs"
 ZONE = "America/New_York"
@@ -82,6 +83,14 @@ def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
     settings = load_flight(target)
     data = gather(settings, target.parent, read_logs(settings, target.parent))
     assert {s.channel for s in data.rss} >= {f"USRP{10 + i}" for i in range(len(names))}
+
+
+@pytest.mark.parametrize("name", ["1e6", "0o17", "0x1F", "no", "11:48:16", "~", "12", "=", "<<"])
+def test_a_log_may_be_called_like_a_number(logs: Path, name: str) -> None:
+    shutil.move(logs / "LW1/USRP1_power_log.txt", logs / name)
+    files = ingest([logs / name, *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
+    text, _ = draft(files, logs, timezone=ZONE)
+    assert parse_yaml(text, FlightFile).logs[1].path == name
 
 
 def test_a_name_that_is_no_text_is_left_out(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -65,3 +65,14 @@ def test_a_ratio_is_known_by_its_channel_too(tmp_path: Path) -> None:
     (warning,) = _flight(tmp_path, "path: snr.csv, reader: aadm_snr").warnings
     assert "'LW1', 'LW2' are ratios to the noise" in warning
     assert "skip: [LW1, LW2]" in warning
+
+
+def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> None:
+    log = f"path: {SAMPLE / 'LW1/USRP1_power_log.txt'}, node: LW1"
+    (warning,) = _flight(tmp_path, f"{log}, skip: [qualty]").warnings
+    assert "nothing is skipped by qualty: its streams are power" in warning
+    text = (tmp_path / "flight.yaml").read_text().replace(", skip: [qualty]", "")
+    (tmp_path / "flight.yaml").write_text(text + "link: {channels: {USRP1: {carrier_hz: 3.3e9}}}\n")
+    settings = load_flight(tmp_path / "flight.yaml")
+    (warning,) = gather(settings, tmp_path, read_logs(settings, tmp_path)).warnings
+    assert "link.channels names USRP1: no log is of such a channel" in warning

@@ -211,10 +211,14 @@ def _folder(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
-        places = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+        places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
+        if not place.is_file():  # links to folders are not followed: they may go round in circles
+            what = "a link to a folder; name that folder, too" if place.is_dir() else "a link to nothing"
+            skipped.append(Skipped(str(place), what))
+            continue
         try:
             files.append(read_file(place, options=options, reader=chosen))
         except InputError as error:

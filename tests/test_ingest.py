@@ -244,3 +244,19 @@ def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_p
         ingest(tmp_path)
     with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):
         ingest(tmp_path, reader="vehicle_out")
+
+
+def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
+    logs, far = tmp_path / "logs", tmp_path / "far"
+    for folder in (logs, far):
+        folder.mkdir()
+        (folder / "a.txt").write_bytes(VEHICLE)
+    (logs / "b.txt").symlink_to(far / "a.txt")
+    (logs / "gone.txt").symlink_to(far / "nowhere")
+    (logs / "far").symlink_to(far)
+    (logs / "round").symlink_to(logs)
+    found = ingest(logs, options=OPTIONS)
+    assert [Path(f.path).name for f in found] == ["a.txt", "b.txt"]
+    told = {Path(s.path).name: s.reason for s in found.skipped}
+    assert told.keys() == {"far", "gone.txt", "round"}
+    assert "link to a folder" in told["far"]

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from .commands import COMMANDS
-from .errors import UsageError
+from .errors import UsageError, one_line
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -186,6 +186,10 @@ def report(
     return 1 if strict and failed else 0
 
 
+_WARNINGS = 10
+"""Warnings of a report that are also said here."""
+
+
 def _print_report_summary(outcome: Any) -> None:
     rows = []
     for tower, channels in outcome.metrics["rss"].items():
@@ -219,6 +223,11 @@ def _print_report_summary(outcome: Any) -> None:
             )
     if rows:
         _table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    warnings = [one_line(text) for text in outcome.metrics["warnings"]]
+    for text in warnings[:_WARNINGS]:
+        _say(f"warning: {text}")
+    if len(warnings) > _WARNINGS:
+        _say(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
 
 

@@ -169,7 +169,7 @@ def gather(
         if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
             shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
             warnings.append(
-                f"{log.path}: {shown} to the noise, not a level: compared as RSS as if the noise were constant "
+                f"{log.path}: {shown} to the noise, no level: compared as RSS as if the noise were constant "
                 f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
             )
     if idle := set(settings.link.channels) - {series.channel for _, series in rss}:

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.config import load_flight
 from aerpaw_cmp.errors import UsageError
 from aerpaw_cmp.flight import FlightData, gather, read_logs
@@ -58,13 +59,17 @@ def test_two_records_of_one_channel_are_refused(tmp_path: Path) -> None:
         _flight(tmp_path, *[f"path: {SAMPLE / 'UAV/modem_ri.csv'}"] * 2)
 
 
-def test_a_ratio_is_known_by_its_channel_too(tmp_path: Path) -> None:
+def test_a_ratio_is_known_by_its_channel_and_the_report_warns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "snr.csv").write_text(
         "time,snr_lw1,snr_lw2\n" + "".join(f"2025-06-01T10:01:{s:02d},{20 + s % 3},{10 + s % 2}\n" for s in range(40))
     )
     (warning,) = _flight(tmp_path, "path: snr.csv, reader: aadm_snr").warnings
     assert "'LW1', 'LW2' are ratios to the noise" in warning
     assert "skip: [LW1, LW2]" in warning
+    assert main(["report", str(tmp_path / "flight.yaml"), "--audit", "none", "-o", str(tmp_path / "out")]) == 0
+    assert f"warning: {warning}" in capsys.readouterr().err
 
 
 def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> None:

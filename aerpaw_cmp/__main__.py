@@ -122,6 +122,8 @@ def main(arguments: list[str] | None = None) -> int:
         The exit code; exceptions end here.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
+    if callable(reconfigure := getattr(sys.stdout, "reconfigure", None)):
+        reconfigure(errors="backslashreplace")  # a file name that the terminal cannot show is no reason to fail
     before_dashes = arguments[: arguments.index("--")] if "--" in arguments else arguments
     debug = "--debug" in before_dashes or os.environ.get("AERPAW_CMP_DEBUG", "0") not in ("", "0")
     if "--debug" in before_dashes:

@@ -10,7 +10,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from .commands import COMMANDS
-from .errors import UsageError
+from .errors import UsageError, one_line
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -65,16 +65,46 @@ def _print_json(value: dict[str, Any]) -> None:
     print(json.dumps(value, indent=1, allow_nan=False))
 
 
-def _table(columns: list[str], rows: list[list[str]], title: str | None = None) -> None:
+_FIXED = 20
+"""Columns up to this width (numbers, times) are never broken."""
+
+
+def _table(columns: list[str], rows: list[list[str]], title: str | None = None, width: int | None = None) -> None:
+    """A table; where the terminal is too narrow for it, a paragraph per row."""
+    from rich.cells import cell_len
     from rich.console import Console
     from rich.table import Table
 
+    console = Console(width=width if width or sys.stdout.isatty() else 160)
+    needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
+    roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
+    if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
+        _paragraphs(columns, rows, title, console.width)
+        return
     table = Table(title=title, title_justify="left")
-    for column in columns:
-        table.add_column(column, overflow="fold")
+    for column, need in zip(columns, needs, strict=True):
+        table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
     for row in rows:
         table.add_row(*[cell.replace("[", r"\[") for cell in row])
-    Console(width=None if sys.stdout.isatty() else 160).print(table)
+    console.print(table)
+
+
+def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, width: int) -> None:
+    """Rows as text: the first cell, then names and values."""
+    import textwrap
+
+    if title:
+        print(title)
+    for row in rows:
+        lines = [""]
+        for name, cell in zip(columns[1:], row[1:], strict=True):
+            item = f"{name} {cell}"
+            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7: indent and separator
+                lines.append("")
+            lines[-1] += f" | {item}" if lines[-1] else item
+        print(row[0])
+        for line in lines:
+            print(textwrap.fill(line, width, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False))
 
 
 @app.command(help=COMMANDS["ingest"])
@@ -156,6 +186,10 @@ def report(
     return 1 if strict and failed else 0
 
 
+_WARNINGS = 10
+"""Warnings of a report that are also said here."""
+
+
 def _print_report_summary(outcome: Any) -> None:
     rows = []
     for tower, channels in outcome.metrics["rss"].items():
@@ -189,6 +223,11 @@ def _print_report_summary(outcome: Any) -> None:
             )
     if rows:
         _table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    warnings = [one_line(text) for text in outcome.metrics["warnings"]]
+    for text in warnings[:_WARNINGS]:
+        _say(f"warning: {text}")
+    if len(warnings) > _WARNINGS:
+        _say(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
 
 

@@ -17,6 +17,17 @@ from __future__ import annotations
 from pathlib import Path
 
 
+def one_line(text: str) -> str:
+    r"""Text for one line of a message: line breaks, control characters and bytes that are no UTF-8 as escapes.
+
+    Examples
+    --------
+    >>> print(one_line("two\nlines"))
+    two\nlines
+    """
+    return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
+
+
 class AerpawCmpError(Exception):
     """A message for the user; never shown with a traceback.
 
@@ -60,7 +71,7 @@ class AerpawCmpError(Exception):
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        place = self.path or ""
+        place = one_line(self.path or "")
         if self.line is not None:
             place += f", line {self.line}" if place else f"line {self.line}"
         text = f"{place}: {self.found}" if place else self.found

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+import itertools
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any, TypeVar
 
 import numpy as np
 import pandas as pd
@@ -130,7 +132,13 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
 
 
 RATIOS = ("quality", "snr")
-"""Streams of kind rss that the sounder writes beside its level."""
+"""Streams or channels of kind rss that are no levels, as sounder and controller name them."""
+
+
+def is_ratio(stream: Stream) -> bool:
+    """Whether a stream of kind rss is a ratio to the noise."""
+    names = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
+    return stream.kind == "rss" and any(name is not None and name.lower() in RATIOS for name in names)
 
 
 def gather(
@@ -140,8 +148,8 @@ def gather(
     site = choose_site(settings.site, folder)
     warnings: list[str] = []
     telemetry: list[tuple[str, Stream]] = []
-    rss: list[RssSeries] = []
-    rank: list[RankSeries] = []
+    rss: list[tuple[str, RssSeries]] = []
+    rank: list[tuple[str, RankSeries]] = []
     for log, file in zip(settings.logs, files, strict=True):
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         for stream in file.result.streams:
@@ -150,14 +158,22 @@ def gather(
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss":
-                if stream.name.lower() in RATIOS:
-                    warnings.append(
-                        f"{log.path}: {stream.name!r} is a ratio to the noise, not a level: compared as RSS as if the "
-                        f"noise were constant ('skip: [{stream.name}]' beside the path leaves it out)"
-                    )
-                rss.append(_rss_series(settings, log, stream, site))
+                rss.append((log.path, _rss_series(settings, log, stream, site)))
             else:
-                rank.append(_rank_series(settings, log, stream, site))
+                rank.append((log.path, _rank_series(settings, log, stream, site)))
+        names = [s.name for s in file.result.streams]
+        if unknown := [name for name in log.skip if name not in names]:
+            warnings.append(
+                f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
+            )
+        if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
+            shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
+            warnings.append(
+                f"{log.path}: {shown} to the noise, no level: compared as RSS as if the noise were constant "
+                f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
+            )
+    if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
+        warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
     track = (
@@ -171,7 +187,14 @@ def gather(
         else None
     )
     data = FlightData(
-        settings, logs_root or folder, site, tuple(files), track, tuple(rss), tuple(rank), tuple(warnings)
+        settings=settings,
+        folder=logs_root or folder,
+        site=site,
+        files=tuple(files),
+        track=track,
+        rss=_records(rss, lambda s: f"RSS of {s.tower} {s.channel}"),
+        rank=_records(rank, lambda s: f"rank of {s.tower}"),
+        warnings=tuple(warnings),
     )
     _check_overlap(data)
     return data
@@ -218,6 +241,49 @@ def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: S
     return RankSeries(
         tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position
     )
+
+
+Series = TypeVar("Series", "RssSeries", "RankSeries")
+
+
+def _records(found: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
+    """One series per name: logs that follow each other (a radio started anew) are one record.
+
+    Raises
+    ------
+    UsageError
+        If two logs hold the same at the same time: only one of them could be compared.
+    """
+    groups: dict[str, list[tuple[str, Series]]] = {}
+    for path, series in found:
+        groups.setdefault(name(series), []).append((path, series))
+    return tuple(_record(what, group) for what, group in groups.items())
+
+
+def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
+    if len(group) == 1:
+        return group[0][1]
+    parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
+    for (path, before), (other, after) in itertools.pairwise(parts):
+        if after.time.min() < before.time.max() or _form(before) != _form(after):
+            where = "two logs" if path != other else "two streams of a log"
+            raise UsageError(
+                f"{where} hold {what} at the same time or in another form: {path!r} and {other!r}",
+                expected="one record of each channel and of each tower's rank",
+                cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
+            )
+    first = parts[0][1]
+    arrays: dict[str, Any] = {
+        field.name: np.concatenate([getattr(series, field.name) for _, series in parts])
+        for field in dataclasses.fields(first)
+        if isinstance(getattr(first, field.name), np.ndarray)
+    }
+    return dataclasses.replace(first, **arrays)
+
+
+def _form(series: RssSeries | RankSeries) -> object:
+    """What two parts of one record must share."""
+    return series.unit if isinstance(series, RssSeries) else series.position_m is None
 
 
 def _text(stream: Stream, key: str) -> str | None:

@@ -14,7 +14,7 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from .errors import InputError, UsageError
+from .errors import InputError, UsageError, one_line
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
 from .store import IngestedFile
 
@@ -28,6 +28,7 @@ FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
 
 _GZIP = b"\x1f\x8b"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
 
 __all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
 
@@ -144,8 +145,11 @@ def ingest(
         files += found
         skipped += left
         if not found:
+            known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
+            looked = "1 file" if len(left) == 1 else f"{len(left)} files"
+            first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
             raise InputError(
-                f"the folder holds no log that a reader knows ({len(left)} files looked at)",
+                f"the folder holds no log that {known} ({looked} looked at){first}",
                 expected="one of the formats of 'aerpaw-cmp formats'",
                 path=place,
             )
@@ -163,6 +167,13 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     """Read one file; see :func:`ingest`."""
     place = Path(path)
     head = _raw(place, HEAD_BYTES)
+    if head.startswith(_HDF5):
+        raise InputError(
+            "an HDF5 file, such as 'ingest -o' writes",
+            expected="the logs themselves (aerpaw_cmp.store.read_flight gives back what a flight file holds)",
+            cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
+            path=path,
+        )
     if reader is None and not head.startswith(_GZIP):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     data, digest = read_bytes(place)
@@ -200,10 +211,14 @@ def _folder(
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
     try:
-        places = sorted(p for p in folder.rglob("*") if p.is_file() and not p.name.startswith("."))
+        places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
     except OSError as error:
         raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
     for place in places:
+        if not place.is_file():  # links to folders are not followed: they may go round in circles
+            what = "a link to a folder; name that folder, too" if place.is_dir() else "a link to nothing"
+            skipped.append(Skipped(str(place), what))
+            continue
         try:
             files.append(read_file(place, options=options, reader=chosen))
         except InputError as error:
@@ -265,7 +280,7 @@ def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
     rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [
-        os.path.relpath(file["path"], folder) if folder else str(file["path"]),
+        one_line(os.path.relpath(file["path"], folder) if folder else str(file["path"])),
         file["reader"],
         "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
         *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
@@ -291,10 +306,12 @@ def account_notes(account: Mapping[str, Any]) -> list[str]:
     """What a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
     notes = []
     for file in account["files"]:
-        notes += [f"{file['path']}: {text}" for text in file["warnings"]]
+        path = one_line(file["path"])
+        notes += [f"{path}: {text}" for text in file["warnings"]]
         for line in file["first_rejected"]:
-            notes.append(f"{file['path']}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
+            notes.append(f"{path}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
         more = file["rejected"] - len(file["first_rejected"])
         if more:
-            notes.append(f"{file['path']}: and {more} more rejected lines, all in the flight file (-o)")
-    return notes + [f"{left['path']}: skipped: {left['reason']}" for left in account["skipped"]]
+            lines = "line" if more == 1 else "lines"
+            notes.append(f"{path}: and {more} more rejected {lines}, all in the flight file (-o)")
+    return notes + [f"{one_line(left['path'])}: skipped: {left['reason']}" for left in account["skipped"]]

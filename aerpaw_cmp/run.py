@@ -52,14 +52,17 @@ def run_ingest(
     from .readers import ReadOptions
     from .store import write_flight
 
+    if draft is not None:
+        from .draft import check_target, write_draft
+
+        check_target(draft)
     files = ingest(paths, options=ReadOptions(**options), reader=reader)
     if out is not None:
         write_flight(out, files)
     account = summary(files)
     if draft is not None:
-        from .draft import write_draft
-
-        account["draft"] = write_draft(files, draft, timezone=options.get("timezone"))
+        told = {key: options.get(key) for key in ("timezone", "time_origin")}
+        account["draft"] = write_draft(files, draft, **told)
     return account
 
 

@@ -370,17 +370,38 @@ def _explain(
     return UsageError(f"{len(findings)} problems\n  " + "\n  ".join(shown), path=path)
 
 
+_MEMBER = re.compile(r"literal\[.*\]|float|int|str|bool")
+"""Parts of a location that say which member of a union was tried; no key of ours has such a name."""
+
+_KINDS = {
+    "float_(type|parsing)": "a number",
+    "int_(type|parsing|from_float)": "a whole number",
+    "bool_(type|parsing)": "true or false",
+    "string_type": "text (a number or yes/no in quotes)",
+    "(list|tuple)_type": "a list, [a, b]",
+    "dict_type|model_type|model_attributes_type|mapping_type": "keys with values",
+    "too_short": "at least {min_length} in the list",
+    "too_long": "at most {max_length} in the list",
+    "string_pattern_mismatch": "text of the form {pattern}",
+}
+"""What is expected, by pydantic's name of the error."""
+
+
 def _finding(item: Any, model: type[pydantic.BaseModel]) -> tuple[str, str | None]:
     location: Location = item["loc"]
-    where = ".".join(str(part) for part in location)
+    where = ".".join(str(part) for part in location if not _MEMBER.fullmatch(str(part)))
     if item["type"] == "extra_forbidden":
         names = _field_names(*_models_at(model, location[:-1]))
         near = nearest(location[-1], names)
         cause = f"did you mean '{near}'?" if near else f"valid keys are {_listed(names)}"
         return f"unknown key '{where}'", cause
+    if item["type"] == "missing" and isinstance(location[-1], int):
+        return f"{'.'.join(map(str, location[:-1]))}: entry {location[-1] + 1} of the list is missing", None
     if item["type"] == "missing":
         return f"the key '{where}' is missing", None
     message = str(item["msg"]).removeprefix("Value error, ").removeprefix("Input should be ")
+    for kind, words in _KINDS.items():
+        message = words.format(**item.get("ctx", {})) if re.fullmatch(kind, item["type"]) else message
     if item["type"] in ("value_error", "assertion_error"):
         return (f"{where}: {message}" if where else message), None
     message = re.sub(r"<\w+\.\w+: ('[^']*')>", r"\1", message)  # members of an Enum, as they are written

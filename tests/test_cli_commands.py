@@ -136,3 +136,28 @@ def test_bench_json(capsys: pytest.CaptureFixture[str]) -> None:
     reference = next(row for row in rows if row["engine"] == "image" and row["depth"] == 2 and row["thinning"] == 1)
     assert reference["rss_max_error_db"] == 0.0
     assert any(row["engine"] == "sionna" and row["rss_max_error_db"] < 1.0 for row in rows)
+
+
+def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys: pytest.CaptureFixture[str]) -> None:
+    from aerpaw_cmp.cli import _table
+    from aerpaw_cmp.ingest import ACCOUNT
+
+    file = "a_rather_long_name_of_a_power_log.txt"
+    row = [
+        file,
+        "sounder_log",
+        "rss: power 123456",
+        "123456",
+        "123450",
+        "6",
+        "0",
+        "30.5",
+        "2025-06-01 14:00:00",
+        "711.5",
+    ]
+    for width in (40, 80, 100, 160):
+        _table(list(ACCOUNT), [row, row], "files below x", width=width)
+        shown = capsys.readouterr().out
+        assert max(map(len, shown.splitlines())) <= width
+        assert all(shown.count(cell) == 2 for cell in (file, "sounder_log", "123450"))
+        assert shown.count("2025-06-01 14:00:00") == 2

@@ -15,6 +15,7 @@ from aerpaw_cmp import ingest as room
 from aerpaw_cmp.errors import InputError, UsageError
 from aerpaw_cmp.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, summary
 from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.store import write_flight
 from tests.parsers.samples import OPTIONS, SAMPLES
 
 VEHICLE = SAMPLES["vehicle_out"]["ten_fields"][0]
@@ -233,3 +234,29 @@ def test_symlink_loops_end(tmp_path: Path) -> None:
     (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
     (tmp_path / "loop").symlink_to(tmp_path)
     assert len(ingest(tmp_path, options=OPTIONS)) == 1
+
+
+def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
+    write_flight(tmp_path / "flight.h5", [])
+    with pytest.raises(InputError, match="read_flight"):
+        ingest(tmp_path / "flight.h5")
+    with pytest.raises(InputError, match=r"no log that a reader knows \(1 file looked at\); flight.h5: an HDF5 file"):
+        ingest(tmp_path)
+    with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):
+        ingest(tmp_path, reader="vehicle_out")
+
+
+def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
+    logs, far = tmp_path / "logs", tmp_path / "far"
+    for folder in (logs, far):
+        folder.mkdir()
+        (folder / "a.txt").write_bytes(VEHICLE)
+    (logs / "b.txt").symlink_to(far / "a.txt")
+    (logs / "gone.txt").symlink_to(far / "nowhere")
+    (logs / "far").symlink_to(far)
+    (logs / "round").symlink_to(logs)
+    found = ingest(logs, options=OPTIONS)
+    assert [Path(f.path).name for f in found] == ["a.txt", "b.txt"]
+    told = {Path(s.path).name: s.reason for s in found.skipped}
+    assert told.keys() == {"far", "gone.txt", "round"}
+    assert "link to a folder" in told["far"]

@@ -1,4 +1,5 @@
 from pathlib import Path
+from typing import Literal
 
 import pytest
 from hypothesis import given
@@ -21,6 +22,9 @@ class Settings(StrictModel):
     masts: dict[str, Mast] = Field(default_factory=dict)
     lists: list[Mast] = Field(default_factory=list)
     anything: object = None
+    pair: tuple[float, float] = (0.0, 1.0)
+    lag: Literal["off", "on"] | float = "off"
+    code: str = Field("a", pattern="^[a-z]+$")
 
 
 def failure(text: str) -> UsageError:
@@ -48,7 +52,16 @@ def test_duplicate_key_names_both_lines() -> None:
         ("name: a\nmasts:\n  LW1:\n    heigth_m: 3", 4, "did you mean 'height_m'"),
         ("lists:\n- {}\n- {labl: x}", 3, "did you mean 'label'"),
         ("qqqq: 1", 1, "valid keys are 'name', 'start'"),
-        ("name: a\npower: loud", 2, "power: found 'loud'; expected a valid number"),
+        ("name: a\npower: loud", 2, "power: found 'loud'; expected a number"),
+        ("pair: [1]", 1, "pair: entry 2 of the list is missing"),
+        (
+            "lag: maybe",
+            None,
+            "lag: found 'maybe'; expected 'off' or 'on'\n  line 1: lag: found 'maybe'; expected a number",
+        ),
+        ("code: ../x", 1, "expected text of the form ^[a-z]+$"),
+        ("lists: 5", 1, "lists: found 5; expected a list"),
+        ("masts: {a: 5}", 1, "masts.a: found 5; expected keys with values"),
         ("name: a\n\tpower: 1", 2, "tabs"),
         ("name: [a", 2, "not YAML"),
         ("name: a\n---\nname: b", 2, "second document"),

@@ -11,7 +11,8 @@ from pathlib import Path
 from typing import Any
 
 from ..errors import InputError
-from .log import BadLine, Record, read_log
+from ..files import whole
+from .log import BadLine, Record, read_log, segments
 
 COLUMNS = (
     *("time_utc", "uncertainty_s", "n", "query", "status"),
@@ -96,7 +97,7 @@ def _rows(source: Path, bad: list[BadLine]) -> Iterator[dict[str, Any]]:
 
 
 def export_csv(source: Path, out: Path) -> ExportSummary:
-    """Write one CSV row per exchange, prediction and gap of a tap log.
+    """Write one CSV row per exchange, prediction and gap of a tap log: the whole file or none.
 
     Parameters
     ----------
@@ -112,8 +113,9 @@ def export_csv(source: Path, out: Path) -> ExportSummary:
     """
     bad: list[BadLine] = []
     rows = 0
+    segments(source)  # raises before anything is written
     try:
-        with out.open("w", newline="", encoding="ascii") as file:
+        with whole(out) as part, part.open("w", newline="", encoding="ascii") as file:
             writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
             writer.writeheader()
             for row in _rows(source, bad):

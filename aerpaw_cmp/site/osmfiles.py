@@ -98,6 +98,7 @@ def _way_outline(identity: str, way: Element, data: _Data, result: MapFile, line
     ring = _points(way, data, outline)
     if outline.tags.get("natural") == "tree_row":
         result.trees.append(TreeLine(outline.source, outline.tags, tuple(ring)))
+        result.notes += [f"{outline.source}: {fault}" for fault in outline.broken]
         return
     references = way.get("nodes") or ring
     if not references or references[0] != references[-1]:

@@ -222,6 +222,7 @@ def test_export_of_nothing(tmp_path):
         export_csv(tmp_path, tmp_path / "out.csv")
     with pytest.raises(InputError, match="no such file"):
         export_csv(tmp_path / "x", tmp_path / "out.csv")
+    assert not (tmp_path / "out.csv").exists()
     (tmp_path / "tap_x.jsonl").write_bytes(encode_record({"kind": "exchange", "n": 0}))
     with pytest.raises(InputError, match="lacks what its kind"):
         export_csv(tmp_path, tmp_path / "out.csv")

@@ -149,6 +149,14 @@ def test_tree_rows_become_trees_along_the_line(tmp_path: Path) -> None:
     assert said(found, "21 trees were placed along the row, 5 m apart")
 
 
+def test_a_tree_row_with_lost_nodes_says_so(tmp_path: Path) -> None:
+    osm = Osm()
+    osm.way(square(0, 0), natural="tree_row")
+    found = read(tmp_path, osm.xml(drop=(1,)), "a.osm")
+    assert found.trees
+    assert said(found, "way 100: 2 of 5 nodes are not in the file")
+
+
 def test_a_building_with_a_lost_first_node_or_an_open_line_is_kept(tmp_path: Path) -> None:
     osm = Osm()
     osm.way(square(0, 0), **BARN)

@@ -19,7 +19,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 RSS_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the sample, ISO 8601, UTC",
+    "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
+    "time_s": "seconds after the first sample of this tower and channel",
     "tower": "name of the tower",
     "channel": "name of the channel",
     "unit": "unit of measured_db",
@@ -36,7 +37,8 @@ RSS_COLUMNS: dict[str, str] = {
 """Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline."""
 
 RANK_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the report, ISO 8601, UTC",
+    "time_utc": "instant of the report, ISO 8601, UTC; empty: the log has relative times and no origin was given",
+    "time_s": "seconds after the first report of this tower",
     "tower": "name of the tower",
     "east_m": "UAV position, metres east of the site origin",
     "north_m": "metres north",
@@ -240,7 +242,7 @@ def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
         n = len(panel.time)
         nowhere = np.full(n, np.nan)
         columns: dict[str, Any] = {
-            "time_utc": iso_time(panel.time),
+            **_times(panel.time),
             "tower": panel.tower,
             "channel": panel.channel,
             "unit": panel.unit,
@@ -274,7 +276,7 @@ def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
     frames = []
     for panel in panels:
         columns: dict[str, Any] = {
-            "time_utc": iso_time(panel.time),
+            **_times(panel.time),
             "tower": panel.tower,
             "east_m": panel.east_m,
             "north_m": panel.north_m,
@@ -305,6 +307,22 @@ def iso_time(time: Any) -> Any:
     # half a unit added: numpy truncates, and a stored 0.9999999 s must not lose a millisecond
     text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
     return np.where(np.isnat(instants), "", text)
+
+
+def has_wall_clock(start: np.datetime64) -> bool:
+    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
+    return bool(start >= np.datetime64("1980-01-01"))
+
+
+def _times(time: Any) -> dict[str, Any]:
+    """Columns ``time_utc`` and ``time_s``."""
+    instants = np.asarray(time, dtype="datetime64[ns]")
+    known = instants[~np.isnat(instants)]
+    if not len(known):
+        return {"time_utc": "", "time_s": np.full(len(instants), np.nan)}
+    first = known.min()
+    seconds = (instants - first) / np.timedelta64(1, "s")
+    return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
 
 
 def safe_name(text: str) -> str:

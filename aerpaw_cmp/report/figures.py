@@ -18,7 +18,7 @@ import numpy as np
 from ..site.site import Site, Trees
 from ..units import AnyArray, BoolArray, FloatArray
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
-from .export import k_key, safe_name
+from .export import has_wall_clock, k_key, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -157,11 +157,6 @@ def start_of(data: ReportData) -> np.datetime64:
     if not times:
         return np.datetime64(0, "ns")
     return times[0] if data.track is not None and len(data.track.time) else min(times)
-
-
-def has_wall_clock(start: np.datetime64) -> bool:
-    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
-    return bool(start >= np.datetime64("1980-01-01"))
 
 
 def time_label(start: np.datetime64) -> str:

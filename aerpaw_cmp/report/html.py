@@ -16,8 +16,8 @@ import numpy as np
 
 from . import words
 from .data import RANKS, ReportData
-from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
-from .figures import Picture, has_wall_clock, start_of
+from .export import RANK_COLUMNS, RSS_COLUMNS, has_wall_clock, iso_time, k_key
+from .figures import Picture, start_of
 
 REJECTED_SHOWN = 20
 """Rejected lines shown per file; the flight file holds all."""

@@ -86,6 +86,19 @@ def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
     np.testing.assert_allclose(back.calibrated_db - back.simulated_dbm, back.residual_db, atol=2e-4)
 
 
+def test_relative_times_are_no_times_of_day(report_data):
+    panel = report_data.rss[0]
+    start = panel.time[0] - np.datetime64("1969-12-31T23:57:00", "ns")
+    table = export.rss_frame([dataclasses.replace(panel, time=panel.time - start), panel])
+    relative, absolute = table[: len(panel.time)], table[len(panel.time) :]
+    assert (relative.time_utc == "").all()
+    assert absolute.time_utc.str.startswith("20").all()
+    np.testing.assert_allclose(relative.time_s.to_numpy(), absolute.time_s.to_numpy())
+    np.testing.assert_allclose(
+        absolute.time_s.to_numpy(), (panel.time - panel.time.min()) / np.timedelta64(1, "s"), atol=1e-4
+    )
+
+
 def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
     path = tmp_path / "rank.csv"
     export.rank_frame(report_data.rank).to_csv(path, index=False)

@@ -14,16 +14,14 @@ import yaml
 
 from .config import FlightFile, LogSettings
 from .errors import UsageError, one_line
-from .files import whole
+from .files import write_whole
 from .flight import is_ratio
 from .ingest import IngestedFile
-from .records import Stream
+from .records import Stream, has_wall_clock
 from .yamlfile import parse_yaml
 
 _TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
 _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
-_FIRST_YEAR = np.datetime64("1971")
-"""Relative times without an origin count from 1970."""
 
 HEAD = """\
 # A first draft for these logs, made by 'aerpaw-cmp ingest --draft'. Check every line with a question mark.
@@ -73,11 +71,7 @@ def write_draft(
     """
     check_target(target)
     text, remarks = draft(files, target.resolve().parent, timezone=timezone, time_origin=time_origin)
-    try:
-        with whole(target) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot be written ({error.strerror or error})", path=target) from error
+    write_whole(target, text)
     return remarks
 
 
@@ -191,7 +185,7 @@ class _Entries:
         return refused
 
     def _reason(self, stream: Stream, span: Span) -> str | None:
-        relative = span[0] < _FIRST_YEAR
+        relative = not has_wall_clock(span[0])
         if stream.kind == "telemetry":
             if self.flown is None or stream is self.flown[0]:
                 return None
@@ -245,7 +239,7 @@ def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     others: list[Span] = []
     for file in files:
         for stream in file.result.streams:
-            if (span := _span(stream)) and span[0] >= _FIRST_YEAR:
+            if (span := _span(stream)) and has_wall_clock(span[0]):
                 if stream.kind == "telemetry":
                     telemetry.append((stream, span))
                 else:

@@ -8,6 +8,8 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
+from .errors import UsageError
+
 
 @contextlib.contextmanager
 def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
@@ -44,6 +46,15 @@ def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
                 _sync(target.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+def write_whole(path: Path, content: str | bytes) -> None:
+    """Write a file whole or not at all; UsageError where it cannot be written."""
+    try:
+        with whole(path) as part:
+            part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+    except OSError as error:
+        raise UsageError(f"cannot be written ({error.strerror or error})", path=path) from None
 
 
 def _umask() -> int:

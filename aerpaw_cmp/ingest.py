@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from .errors import InputError, UsageError, one_line
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
+from .records import has_wall_clock
 from .store import IngestedFile
 
 if TYPE_CHECKING:
@@ -298,8 +299,7 @@ def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
     first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
     last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
     whole = str(first.astype("datetime64[s]")).replace("T", " ")
-    # without --time-origin, relative times count from 1970
-    return "relative" if first < np.datetime64("1971") else whole, f"{(last - first) / np.timedelta64(1, 's'):.1f}"
+    return whole if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
 
 
 def account_notes(account: Mapping[str, Any]) -> list[str]:

@@ -27,6 +27,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
 if TYPE_CHECKING:
+    import numpy as np
     import pandas as pd
 
 Kind = Literal["telemetry", "rss", "rank"]
@@ -130,3 +131,10 @@ class ReadResult:
                 f"accounting law broken by reader {self.reader!r}: {self.lines} lines are not "
                 f"{self.accepted} accepted + {len(self.rejected)} rejected + {self.blank} blank"
             )
+
+
+def has_wall_clock(start: np.datetime64) -> bool:
+    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
+    import numpy as np
+
+    return bool(start >= np.datetime64("1980-01-01"))

@@ -14,9 +14,9 @@ import pandas as pd
 
 from . import campaign_figures, figures
 from .campaign_data import CampaignData, RankRow, RssRow
-from .export import json_safe, k_key, write_atomic
+from .export import json_safe, k_key, remove_stale, write_atomic
 from .figures import Picture
-from .html import CONTENT_POLICY, environment
+from .html import CONTENT_POLICY, by_section, environment
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
@@ -242,13 +242,10 @@ def warnings(data: CampaignData) -> list[str]:
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
-    sections: dict[str, list[Picture]] = {}
-    for picture in pictures:
-        sections.setdefault(picture.section, []).append(picture)
     template = environment().get_template("campaign.html.jinja")
     text: str = template.render(
         data=data,
-        sections=sections,
+        sections=by_section(pictures),
         mean_rmse=mean_rmse(data),
         beside=repeatability_beside(data),
         halves=halves(data),
@@ -269,14 +266,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
     written = [write_atomic(folder / "campaign.json", numbers), write_atomic(folder / "campaign.csv", table)]
-    drawn = []
-    for plate in campaign_figures.plates(data):
-        picture = figures.render(plate)
-        drawn.append(picture)
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
-    for path in (folder / "figures").glob("*"):
-        if path not in written and OWN_FIGURES.fullmatch(path.name):
-            path.unlink()
+    drawn, pictures = figures.write_plates(campaign_figures.plates(data), folder / "figures")
+    written += pictures
+    remove_stale(folder / "figures", {path.name for path in written}, OWN_FIGURES)
     page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
     return [page, *written]

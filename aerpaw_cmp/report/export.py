@@ -12,7 +12,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..errors import UsageError
-from ..files import whole
+from ..files import write_whole
+from ..records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 
 if TYPE_CHECKING:
@@ -309,11 +310,6 @@ def iso_time(time: Any) -> Any:
     return np.where(np.isnat(instants), "", text)
 
 
-def has_wall_clock(start: np.datetime64) -> bool:
-    """Whether instants are times of day; those of a log with relative times and no origin count from 1970."""
-    return bool(start >= np.datetime64("1980-01-01"))
-
-
 def _times(time: Any) -> dict[str, Any]:
     """Columns ``time_utc`` and ``time_s``."""
     instants = np.asarray(time, dtype="datetime64[ns]")
@@ -349,11 +345,7 @@ def make_folder(folder: Path) -> Path:
 def write_atomic(path: Path, content: str | bytes) -> Path:
     """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
     make_folder(path.parent)
-    try:
-        with whole(path) as part:
-            part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
-    except OSError as error:
-        raise UsageError(f"cannot be written ({error.strerror or error})", path=path) from None
+    write_whole(path, content)
     return path
 
 
@@ -363,10 +355,10 @@ _OWN_FIGURES = re.compile(
 )
 
 
-def remove_stale(folder: Path, kept: set[str]) -> None:
+def remove_stale(folder: Path, kept: set[str], own: re.Pattern[str] = _OWN_FIGURES) -> None:
     """Remove figures of an earlier report that this one no longer has; other files are left alone."""
     for path in folder.glob("*"):
-        if path.name not in kept and _OWN_FIGURES.fullmatch(path.name):
+        if path.name not in kept and own.fullmatch(path.name):
             path.unlink()
 
 
@@ -398,12 +390,8 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
         # written even without rows, so that the table of an earlier report never stands beside this one
         written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))
-    drawn = []
-    for plate in figures.plates(data):
-        picture = figures.render(plate)
-        drawn.append(picture)
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    drawn, pictures = figures.write_plates(figures.plates(data), folder / "figures")
+    written += pictures
     remove_stale(folder / "figures", {path.name for path in written})
     files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
     page = write_atomic(folder / "report.html", html.page(data, drawn, files))

@@ -11,14 +11,16 @@ import io
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..records import has_wall_clock
 from ..site.site import Site, Trees
 from ..units import AnyArray, BoolArray, FloatArray
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
-from .export import has_wall_clock, k_key, safe_name
+from .export import k_key, safe_name, write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -139,6 +141,17 @@ def render(plate: Plate) -> Picture:
         svg=svg,
         png=png,
     )
+
+
+def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], list[Path]]:
+    """Draw plates one after the other and write each as SVG and PNG; gives the pictures and the files."""
+    drawn, written = [], []
+    for plate in plates:
+        picture = render(plate)
+        drawn.append(picture)
+        written.append(write_atomic(folder / f"{picture.name}.svg", picture.svg))
+        written.append(write_atomic(folder / f"{picture.name}.png", picture.png))
+    return drawn, written
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
+from ..records import has_wall_clock
 from . import words
 from .data import RANKS, ReportData
-from .export import RANK_COLUMNS, RSS_COLUMNS, has_wall_clock, iso_time, k_key
+from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 from .figures import Picture, start_of
 
 REJECTED_SHOWN = 20
@@ -124,6 +125,14 @@ def environment() -> Any:
     return environment
 
 
+def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
+    """Pictures in their order, by the section that they stand in."""
+    sections: dict[str, list[Picture]] = {}
+    for picture in pictures:
+        sections.setdefault(picture.section, []).append(picture)
+    return sections
+
+
 def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page.
 
@@ -135,13 +144,10 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     files : sequence of str
         Names of the files beside the page.
     """
-    sections: dict[str, list[Picture]] = {}
-    for picture in pictures:
-        sections.setdefault(picture.section, []).append(picture)
     template = environment().get_template("report.html.jinja")
     text: str = template.render(
         data=data,
-        sections=sections,
+        sections=by_section(pictures),
         start=start_of(data),
         clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
         files=files,

@@ -11,7 +11,7 @@ from . import figures, maps_figures
 from .data import RANKS
 from .export import json_safe, k_key, merge, write_atomic
 from .figures import Picture
-from .html import CONTENT_POLICY, environment
+from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData
 
 
@@ -75,12 +75,9 @@ def error_tables(
 
 def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
-    sections: dict[str, list[Picture]] = {}
-    for picture in pictures:
-        sections.setdefault(picture.section, []).append(picture)
     text: str = environment().get_template("map.html.jinja").render(
         data=data,
-        sections=sections,
+        sections=by_section(pictures),
         coverage=coverage_table(data),
         errors=error_tables(data.errors),
         names={picture.name for picture in pictures},
@@ -96,11 +93,7 @@ def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     written = [
         write_atomic(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")
     ]
-    drawn = []
-    for plate in maps_figures.plates(data):
-        picture = figures.render(plate)
-        drawn.append(picture)
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / "figures" / f"{picture.name}.png", picture.png))
+    drawn, pictures = figures.write_plates(maps_figures.plates(data), folder / "figures")
+    written += pictures
     page = write_atomic(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
     return [page, *written]

@@ -20,7 +20,7 @@ from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from ..errors import InputError, UsageError
-from ..files import whole
+from ..files import write_whole
 from ..geodesy import SiteFrame
 from ..units import FloatArray
 from ..yamlfile import dump_yaml
@@ -617,8 +617,4 @@ def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str]
     content = model.model_dump(mode="json", exclude_defaults=True)
     text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
     text += dump_yaml(content)
-    try:
-        with whole(Path(path)) as part:
-            part.write_text(text, encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot be written ({error.strerror})", path=path) from None
+    write_whole(Path(path), text)

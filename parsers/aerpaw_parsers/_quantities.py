@@ -6,8 +6,8 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from aerpaw_cmp.records import Attribute, Kind, Stream
-from aerpaw_cmp.units import BoolArray, FloatArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs.records import Attribute, Kind, Stream
 
 from . import _rows
 

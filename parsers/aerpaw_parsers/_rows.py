@@ -13,9 +13,9 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from aerpaw_cmp.readers import ReadOptions
-from aerpaw_cmp.records import Attribute, Kind, ReadResult, RejectedLine, Stream
-from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _time
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import re
 
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
 
 from . import _lines, _rows, _time
 

@@ -171,7 +171,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     if head.startswith(_HDF5):
         raise InputError(
             "an HDF5 file, such as 'ingest -o' writes",
-            expected="the logs themselves (aerpaw_cmp.logs.flight_file.read_flight gives back what a flight file holds)",
+            expected="the logs themselves (logs.flight_file.read_flight gives back what a flight file holds)",
             cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
             path=path,
         )

@@ -8,7 +8,6 @@ its ``logs`` say which files to write and in which format (by ``reader``). The s
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,6 +23,7 @@ from .logwriters import format_power_log, format_ri_csv, format_vehicle_out
 from .replay.arrays import Poses, rotation_from_aircraft
 from .replay.replay import replay
 from .site.site import Site
+from .stages import Progress, silent
 from .units import FloatArray, IntArray
 
 LOWEST_DBM = -400.0
@@ -170,7 +170,7 @@ class FlightSimulator:
         self.site = site
         self.folder = folder
 
-    def run(self, out: Path, *, progress: Callable[[str], None] = lambda _text: None) -> list[Path]:
+    def run(self, out: Path, *, progress: Progress = silent) -> list[Path]:
         """Write every log of the flight file and truth.json below ``out``; gives the paths written.
 
         Raises

@@ -9,20 +9,20 @@ import dataclasses
 import json
 import os
 import platform
-from collections.abc import Callable
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from . import llvm
-from .comparison import versions
 from .flight import FlightData
 from .replay.arrays import Isotropic, Poses
 from .replay.bench import Row, speed_against_error
 from .replaying import Replayed
 from .report.data import SpeedRow
 from .report.export import write_atomic
+from .stages import Progress, silent
+from .versions import versions
 
 POSES = 40
 """Evenly spread poses of the flight that the table is made on."""
@@ -31,7 +31,7 @@ EXPLICIT_POSES = 10
 SAMPLES = (1_000, 10_000, 100_000)
 
 
-def speed_rows(data: FlightData, replayed: Replayed, progress: Callable[[str], None]) -> tuple[SpeedRow, ...]:
+def speed_rows(data: FlightData, replayed: Replayed, progress: Progress = silent) -> tuple[SpeedRow, ...]:
     """Rows of speed against error for one replayed series.
 
     Sionna's own arrays know isotropic elements only; with other patterns their rows are left out.

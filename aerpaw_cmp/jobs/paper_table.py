@@ -10,11 +10,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.jsonable import number_key as k_key
 from ..common.units import power_from_db
 from ..maps.job import Antennas
 from ..maps.study import Study, rank_fields
 from ..maps.variogram import PAPER_BIEXPONENTIAL
-from ..report.export import k_key, safe_name
+from ..report.export import safe_name
 from ..report.maps_data import PaperRow
 
 if TYPE_CHECKING:

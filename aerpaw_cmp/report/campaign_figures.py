@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.jsonable import number_key as k_key
 from ..common.units import FloatArray
 from ..site.site import Site
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
-from .export import k_key, safe_name
+from .export import safe_name
 from .figures import (
     BASELINE,
     Plate,

@@ -16,11 +16,12 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.jsonable import number_key as k_key
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
-from .export import k_key, safe_name, write_atomic
+from .export import safe_name, write_atomic
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

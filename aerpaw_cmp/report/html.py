@@ -14,10 +14,11 @@ from typing import Any
 
 import numpy as np
 
+from ..common.jsonable import number_key as k_key
 from ..logs.records import has_wall_clock
 from . import words
 from .data import RANKS, ReportData
-from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
+from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time
 from .figures import Picture, start_of
 
 REJECTED_SHOWN = 20
@@ -94,7 +95,9 @@ def clock(instant: Any, start: Any) -> str:
 
 
 def short(value: Any) -> str:
-    """A value as text; numbers to 6 digits, which metrics.json holds in full."""
+    """A value as text; numbers to 6 digits, which metrics.json holds in full; an en dash where there is none."""
+    if value is None:
+        return "–"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

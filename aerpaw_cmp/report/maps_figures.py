@@ -7,10 +7,11 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from ..common.jsonable import number_key as k_key
 from ..common.units import FloatArray
 from ..site.site import Site
 from .data import RANKS
-from .export import k_key, safe_name
+from .export import safe_name
 from .figures import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
 

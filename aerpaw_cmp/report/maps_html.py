@@ -7,9 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..common.jsonable import json_safe
+from ..common.jsonable import number_key as k_key
 from . import figures, maps_figures
 from .data import RANKS
-from .export import json_safe, k_key, merge, write_atomic
+from .export import merge, write_atomic
 from .figures import Picture
 from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData

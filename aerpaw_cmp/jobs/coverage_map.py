@@ -388,7 +388,7 @@ def tower_round(site: Site) -> tuple[FloatArray, str]:
 def maps_record(
     outcome: MapOutcome, *, name: str, generated: str, versions: Mapping[str, str], paper: Iterable[page.PaperRow] = ()
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files; ``paper``: what the paper states."""
+    """The record that :func:`~aerpaw_cmp.report.maps_html.write_maps` turns into files; ``paper``: its table."""
     s, result = outcome.settings, outcome.shown
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))

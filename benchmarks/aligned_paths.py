@@ -1,4 +1,4 @@
-"""Paths of the image engine among integer boxes against rational arithmetic (tests/replay/exact.py).
+"""Paths of the image engine among integer boxes against rational arithmetic (tests/propagation/exact.py).
 
 Walls that touch, ends on faces, segments through edges and corners and along walls: where a tolerance shows.
 
@@ -17,9 +17,9 @@ from types import ModuleType
 import numpy as np
 from shapely.geometry import box
 
-from aerpaw_cmp.geodesy import SiteFrame
-from aerpaw_cmp.replay.faces import inside_solids, site_faces
-from aerpaw_cmp.replay.image import find_paths
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.propagation.faces import inside_solids, site_faces
+from aerpaw_cmp.propagation.image import find_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 ROOT = Path(__file__).parents[1]

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
-from ..readers import Reader, ReadOptions, identify
+from ..common.errors import InputError
+from ..logs.readers import Reader, ReadOptions, identify
 from .predict import Predict
 
 TAIL_BYTES = 65_536

@@ -27,7 +27,7 @@ from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.report import build
-from aerpaw_cmp.report.figures import figure, save, style
+from aerpaw_cmp.report.canvas import figure, save, style
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "tests" / "field"

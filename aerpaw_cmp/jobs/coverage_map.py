@@ -8,7 +8,7 @@ the links that foliage touches.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -51,7 +51,8 @@ from ..propagation.channel import channel_matrices, rss_dbm
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
-from ..propagation.tracer import Engine, Replay, Scene, replay
+from ..propagation.scene import Scene
+from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
 from ..report.export import make_folder
 from ..site.site import Site
@@ -364,11 +365,27 @@ def tower_round(site: Site) -> tuple[FloatArray, str]:
 
 
 def maps_record(
-    outcome: MapOutcome, *, name: str, generated: str, versions: Mapping[str, str], stages_s: Mapping[str, float]
+    outcome: MapOutcome,
+    *,
+    name: str,
+    generated: str,
+    versions: Mapping[str, str],
+    stages_s: Mapping[str, float],
+    paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files."""
-    from .paper_table import paper_rows
+    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files.
 
+    Parameters
+    ----------
+    outcome : MapOutcome
+    name, generated : str
+        Of the maps; UTC, ISO 8601.
+    versions : mapping of str to str
+    stages_s : mapping of str to float
+        Seconds per stage.
+    paper : iterable of PaperRow
+        The table of what the paper states.
+    """
     s, result = outcome.settings, outcome.shown
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
@@ -386,7 +403,7 @@ def maps_record(
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
-        paper=tuple(paper_rows(outcome)),
+        paper=tuple(paper),
         warnings=tuple(_warnings(outcome)),
         notes=_notes(outcome),
         versions=versions,

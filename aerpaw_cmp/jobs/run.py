@@ -98,7 +98,7 @@ def run_report(
     with stages("report"):
         from ..report.build import report_data
         from ..report.export import metrics as metrics_of
-        from ..report.export import write_report
+        from ..report.write import write_report
 
         notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
         record = report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
@@ -330,7 +330,7 @@ def run_map(
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
-    from .paper_table import paper_markdown
+    from .paper_table import paper_markdown, paper_rows
 
     given = {name: value for name, value in options.items() if value is not None}
     settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
@@ -347,7 +347,14 @@ def run_map(
     with stages("export"):
         files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
     progress("page")
-    record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions(), stages_s=stages.seconds)
+    record = mapping.maps_record(
+        outcome,
+        name=name,
+        generated=generated,
+        versions=versions(),
+        stages_s=stages.seconds,
+        paper=paper_rows(outcome),
+    )
     written = write_maps(record, folder)
     written.append(folder / "paper.md")
     written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")

@@ -37,6 +37,8 @@ _CHUNK = 1 << 20
 def singular_values(h: ArrayLike) -> FloatArray:
     """Singular values of every channel matrix, divided by the largest magnitude of an entry.
 
+    Source: arXiv 2502.10324 eq. 2.
+
     Parameters
     ----------
     h : array_like, complex, (..., n_rx, n_tx)
@@ -83,6 +85,8 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
     Singular values that tie with ``sigma_1 / k`` do not count (strict). SVD noise is a few ulp of ``sigma_1``, so a
     tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1, whatever the rounding.
+
+    Source: arXiv 2502.10324 eq. 3.
     """
     if not k >= 1:
         raise ValueError(f"K is a ratio of singular values and must be >= 1, found {k}")
@@ -102,6 +106,8 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
 def channel_rank(h: ArrayLike, k: float) -> IntArray:
     """Number of singular values above ``sigma_1 / k`` (strict) of every channel matrix.
+
+    Source: arXiv 2502.10324 eq. 3.
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ $(READY): pyproject.toml tools/setup_venv
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv
 	@touch $@
 
-$(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/llvm.py
+$(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/machine/llvm.py
 	@$(BIN)/python tools/setup_llvm.py
 	@touch $@
 

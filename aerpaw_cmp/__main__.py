@@ -26,7 +26,7 @@ ISSUES = "the project's issue tracker"
 
 def help_text() -> str:
     """What ``aerpaw-cmp --help`` prints."""
-    from .commands import COMMANDS
+    from .common.commands import COMMANDS
 
     width = max(map(len, COMMANDS))
     lines = [f"  {name:<{width}}  {line}" for name, line in COMMANDS.items()]
@@ -52,7 +52,7 @@ def help_text() -> str:
 def _unknown_command(name: str) -> str:
     from difflib import get_close_matches
 
-    from .commands import COMMANDS
+    from .common.commands import COMMANDS
 
     near = get_close_matches(name, COMMANDS, n=1)
     hint = f"; did you mean '{near[0]}'?" if near else "; 'aerpaw-cmp --help' lists the commands"
@@ -61,7 +61,7 @@ def _unknown_command(name: str) -> str:
 
 def _quick_answer(arguments: list[str]) -> int | None:
     """Answer what needs no library; None when the command line itself has to run."""
-    from .commands import COMMANDS
+    from .common.commands import COMMANDS
 
     first = arguments[0] if arguments else ""
     if first in ("", "-h", "--help"):
@@ -80,7 +80,7 @@ def _quick_answer(arguments: list[str]) -> int | None:
 
 def _message(error: BaseException) -> tuple[str, int]:
     """What the user is told of an exception that reached the top, and the exit code."""
-    from .errors import AerpawCmpError
+    from .common.errors import AerpawCmpError
 
     if isinstance(error, AerpawCmpError):
         return f"aerpaw-cmp: {error}", error.exit_code

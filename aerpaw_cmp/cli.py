@@ -9,8 +9,8 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .commands import COMMANDS
-from .errors import UsageError, one_line
+from .common.commands import COMMANDS
+from .common.errors import UsageError, one_line
 
 app = typer.Typer(add_completion=False, no_args_is_help=True, rich_markup_mode=None, pretty_exceptions_enable=False)
 site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
@@ -119,8 +119,8 @@ def ingest(
     as_json: Json = False,
 ) -> None:
     """Read logs, account for every line, write the flight file."""
-    from . import run
-    from .ingest import ACCOUNT, account_notes, account_rows
+    from .jobs import run
+    from .logs.ingest import ACCOUNT, account_notes, account_rows
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
@@ -144,7 +144,7 @@ def ingest(
 @app.command(help=COMMANDS["formats"])
 def formats(as_json: Json = False) -> None:
     """List the readers with a sample line each."""
-    from .readers import catalogue
+    from .logs.readers import catalogue
 
     readers = sorted(catalogue(), key=lambda r: r.name)
     if as_json:
@@ -173,7 +173,7 @@ def report(
     as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
-    from . import run
+    from .jobs import run
 
     outcome = run.run_report(flight, out=out, logs_root=logs_root, engine=engine, audit=audit, progress=_say)
     if as_json:
@@ -241,7 +241,7 @@ def simulate(
     out: Out = None,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
-    from . import run
+    from .jobs import run
 
     for path in run.run_simulate(flight, out=out, progress=_say):
         print(path)
@@ -250,7 +250,7 @@ def simulate(
 @app.command(help=COMMANDS["doctor"])
 def doctor(as_json: Json = False) -> int:
     """Check this machine."""
-    from . import doctor as doctor_room
+    from .machine import doctor as doctor_room
 
     checks = doctor_room.checks()
     if as_json:
@@ -307,7 +307,7 @@ def tap(
     )
     predict = None
     if flight is not None:
-        from .run import live_prediction
+        from .jobs.run import live_prediction
 
         predict = live_prediction(flight, telemetry)
     terminal = sys.stderr.isatty()
@@ -374,7 +374,7 @@ def bench(
     as_json: Json = False,
 ) -> None:
     """Speed against error on this machine."""
-    from . import run
+    from .jobs import run
 
     if quick:
         result = run.run_bench(poses=min(poses, 40), samples=(1_000, 10_000), ratios=False, progress=_say)
@@ -424,7 +424,7 @@ def site_import(
     untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
 ) -> None:
     """Import footprints."""
-    from . import run
+    from .jobs import run
 
     for line in run.run_site_import(files, out, base=base, untagged=untagged):
         _say(line)
@@ -441,7 +441,7 @@ def site_show(
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
 ) -> None:
     """Look at a site."""
-    from . import run
+    from .jobs import run
 
     for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
         print(path)
@@ -489,7 +489,7 @@ def map_(
     as_json: Json = False,
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
-    from . import run
+    from .jobs import run
 
     if engine not in (None, "image", "sionna"):
         raise UsageError(f"--engine {engine!r}", expected="image or sionna")
@@ -537,7 +537,7 @@ def campaign(
     as_json: Json = False,
 ) -> int:
     """Many flights and settings, with what can be said only of several flights."""
-    from . import run
+    from .jobs import run
 
     outcome = run.run_campaign(
         campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, progress=_say

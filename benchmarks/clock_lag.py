@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from aerpaw_cmp.track import estimate_lag
+from aerpaw_cmp.flight.track import estimate_lag
 
 WAVELENGTH_M = 299_792_458.0 / 3.3e9
 NOISE_DB = 3.0

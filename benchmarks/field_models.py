@@ -29,19 +29,19 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.common.units import BoolArray, FloatArray, wavelength_m
 from aerpaw_cmp.compare.heldout import HeldOutFit, fit_held_out
 from aerpaw_cmp.compare.installed import InstalledFit, LinkAngles, fit_installed
 from aerpaw_cmp.compare.offset import grid_offset
 from aerpaw_cmp.compare.rss import local_mean_db, stretch_means_db, stretches
-from aerpaw_cmp.config import load_flight
-from aerpaw_cmp.flight import FlightData, gather, read_logs
-from aerpaw_cmp.replay.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
-from aerpaw_cmp.replay.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.replay.foliage import CrownIndex, foliage_loss_db, foliage_model
-from aerpaw_cmp.replay.replay import replay
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.propagation.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
+from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import read_gain_grid
 from aerpaw_cmp.site.installed import InstalledPattern
-from aerpaw_cmp.units import BoolArray, FloatArray, wavelength_m
 
 TOWER = "LW1"
 CARRIER_HZ = 3.3e9

@@ -20,10 +20,10 @@ from typing import Any
 import field_models
 import numpy as np
 
-from aerpaw_cmp.comparison import audit_replays, compare_rank_series, compare_rss_series, pairs_of, versions
-from aerpaw_cmp.config import FlightFile, load_flight
-from aerpaw_cmp.flight import FlightData, gather, read_logs
-from aerpaw_cmp.replaying import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
+from aerpaw_cmp.jobs.compare_flight import audit_replays, compare_rank_series, compare_rss_series, pairs_of, versions
+from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
 from aerpaw_cmp.report.export import json_safe
 from aerpaw_cmp.report.figures import figure, save, style
 

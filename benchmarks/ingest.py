@@ -21,9 +21,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.ingest import ingest
-from aerpaw_cmp.logwriters import format_power_log, format_quectel_csv, format_vehicle_out
-from aerpaw_cmp.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.writers import format_power_log, format_quectel_csv, format_vehicle_out
 
 LINES = 20_523
 ZONE = "America/New_York"

@@ -19,14 +19,14 @@ from pathlib import Path
 
 import numpy as np
 
-from aerpaw_cmp.config import load_flight
-from aerpaw_cmp.flight import gather, rank_positions, read_logs
+from aerpaw_cmp.common.units import FloatArray, IntArray
+from aerpaw_cmp.flight.data import gather, rank_positions, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.replay import replay_rss
 from aerpaw_cmp.maps.evaluate import interval_coverage
 from aerpaw_cmp.maps.interpolate import InverseDistance, Nearest
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import field_correlation, fit_biexponential
-from aerpaw_cmp.replaying import replay_rss
-from aerpaw_cmp.units import FloatArray, IntArray
 
 PLACE_M = 5.0
 BIN_M = 10.0

@@ -20,7 +20,7 @@ from pathlib import Path
 
 def whole(quick: bool) -> dict:
     """The command's job; seconds per stage from its own metrics."""
-    from aerpaw_cmp.run import run_map
+    from aerpaw_cmp.jobs.run import run_map
 
     with tempfile.TemporaryDirectory() as folder:
         metrics = run_map("lake_wheeler", out=Path(folder), quick=quick).metrics
@@ -30,7 +30,7 @@ def whole(quick: bool) -> dict:
 
 def maps_only(heights: int, spacing_m: float) -> dict:
     """The maps alone at some number of heights."""
-    from aerpaw_cmp import mapping
+    from aerpaw_cmp.jobs import coverage_map as mapping
     from aerpaw_cmp.site.siteyaml import load_site
 
     levels = tuple(30.0 + 5.0 * i for i in range(heights))

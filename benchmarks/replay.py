@@ -21,15 +21,15 @@ from pathlib import Path
 
 import numpy as np
 
-from aerpaw_cmp.replay.arrays import Link, Poses
-from aerpaw_cmp.replay.bench import path_search, random_scene, speed_against_error
-from aerpaw_cmp.replay.replay import replay
+from aerpaw_cmp.propagation.arrays import Link, Poses
+from aerpaw_cmp.propagation.bench import path_search, random_scene, speed_against_error
+from aerpaw_cmp.propagation.tracer import replay
 
-REFERENCE = Path(__file__).parents[1] / "tests" / "replay" / "reference.py"
+REFERENCE = Path(__file__).parents[1] / "tests" / "propagation" / "reference.py"
 
 
 def brute_force(poses: int) -> dict[str, int]:
-    """Paths of the image engine against one-by-one enumeration (tests/replay/conftest.py), on the same 12 buildings."""
+    """Paths of the image engine against one-by-one enumeration (tests/propagation/conftest.py), on the same 12 buildings."""
     spec = importlib.util.spec_from_file_location("replay_conftest", REFERENCE.with_name("conftest.py"))
     helpers = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = helpers

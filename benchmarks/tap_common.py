@@ -19,7 +19,7 @@ CSI = 'AT+QNWCFG="nr5g_csi"'
 CHILD = """
 import json, sys
 from pathlib import Path
-from aerpaw_cmp.errors import AerpawCmpError
+from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.tap import TapSettings, run_tap
 values = json.loads(sys.argv[1])

@@ -17,11 +17,11 @@ from pathlib import Path
 
 import numpy as np
 
-from aerpaw_cmp.comparison import compare_rank_series, compare_rss_series, metrics_beyond_panels, pairs_of
-from aerpaw_cmp.config import FlightFile
-from aerpaw_cmp.flight import FlightData, RankSeries, RssSeries, choose_site
-from aerpaw_cmp.replaying import estimate_clocks, replay_rank, replay_rss
-from aerpaw_cmp.track import Track
+from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries, choose_site
+from aerpaw_cmp.flight.settings import FlightFile
+from aerpaw_cmp.flight.track import Track
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, metrics_beyond_panels, pairs_of
+from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
 
 ANTENNA = {"model": "tr38901", "installed_db": [1.0, 0.0]}
 

@@ -28,7 +28,7 @@ def test_ingest_takes_the_sample_folder(tmp_path: Path, capsys: pytest.CaptureFi
         assert file["lines"] == file["accepted"] + file["rejected"] + file["blank"]
         assert set(file["streams"][0]) == {"kind", "name", "rows", "start", "end", "rate_hz"}
     assert {Path(s["path"]).name for s in summary["skipped"]} == {"flight.yaml", "truth.json"}
-    from aerpaw_cmp.store import read_flight
+    from aerpaw_cmp.logs.flight_file import read_flight
 
     stored = {Path(f.path).as_posix(): f for f in read_flight(flight)}
     for file in summary["files"]:
@@ -44,7 +44,7 @@ def test_ingest_without_a_zone_names_the_option(capsys: pytest.CaptureFixture[st
 
 
 def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
-    from aerpaw_cmp.readers import catalogue
+    from aerpaw_cmp.logs.readers import catalogue
 
     listed = json.loads(out_of(capsys, "formats", "--json"))["readers"]
     assert {r["name"] for r in listed} == {r.name for r in catalogue()}
@@ -140,7 +140,7 @@ def test_bench_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys: pytest.CaptureFixture[str]) -> None:
     from aerpaw_cmp.cli import _table
-    from aerpaw_cmp.ingest import ACCOUNT
+    from aerpaw_cmp.logs.ingest import ACCOUNT
 
     file = "a_rather_long_name_of_a_power_log.txt"
     row = [

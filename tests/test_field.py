@@ -13,8 +13,8 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.ingest import Ingested, ingest
-from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.logs.ingest import Ingested, ingest
+from aerpaw_cmp.logs.readers import ReadOptions
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 pytestmark = [

@@ -12,8 +12,8 @@ import pytest
 
 import aerpaw_cmp
 from aerpaw_cmp import __main__ as program
-from aerpaw_cmp.commands import COMMANDS
-from aerpaw_cmp.errors import CheckError, InputError, UsageError
+from aerpaw_cmp.common.commands import COMMANDS
+from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = (

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.commands import COMMANDS
+from aerpaw_cmp.common.commands import COMMANDS
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -70,7 +70,7 @@ def test_setup_says_what_to_do_without_python(tmp_path: Path) -> None:
 
 def test_the_keys_of_the_flight_file_page_are_real() -> None:
     """docs/flight_yaml.md lists keys: each example must load, and each settings block must exist."""
-    from aerpaw_cmp import config
+    from aerpaw_cmp.flight import settings as config
 
     text = (ROOT / "docs" / "flight_yaml.md").read_text()
     block = re.search(r"```yaml\n(.*?)```", text, re.DOTALL)
@@ -93,7 +93,7 @@ def test_the_keys_of_the_flight_file_page_are_real() -> None:
 
 def test_no_setting_is_without_effect() -> None:
     """Every key that a flight file may hold is read somewhere: a key that does nothing would be a promise not kept."""
-    from aerpaw_cmp import config
+    from aerpaw_cmp.flight import settings as config
 
     code = "\n".join(path.read_text() for path in (ROOT / "aerpaw_cmp").rglob("*.py"))
     models = [

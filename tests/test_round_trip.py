@@ -9,10 +9,10 @@ import numpy as np
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.comparison import compare_rss_series
-from aerpaw_cmp.config import load_flight
-from aerpaw_cmp.flight import gather, read_logs
-from aerpaw_cmp.replaying import estimate_clocks, replay_rss
+from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.compare_flight import compare_rss_series
+from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rss
 from aerpaw_cmp.report.data import RssPanel
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray
 from .statistics import plain
 
 Objective = Callable[[Mapping[str, float], str], FloatArray]

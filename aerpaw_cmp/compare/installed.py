@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..common.units import FloatArray
 from ..site.installed import harmonics
-from ..units import FloatArray
 
 ORDERS = (0, 1, 2, 3, 4)
 """Harmonics to choose from; 4 resolves 45 degrees."""

@@ -16,8 +16,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError
-from ..units import FloatArray
+from ..common.errors import InputError
+from ..common.units import FloatArray
 
 SPAN_DB = (-50.0, 50.0)
 """Search span of arXiv 2502.10324, section V [dB]."""

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
 from .statistics import (
     NO_INTERVAL,
     REPLICATES,

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import FloatArray, IntArray, db_from_power, power_from_db
+from ..common.units import FloatArray, IntArray, db_from_power, power_from_db
 from .offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
 from .statistics import (
     NO_INTERVAL,

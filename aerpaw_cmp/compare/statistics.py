@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import FloatArray, IntArray, wrap_degrees
+from ..common.units import FloatArray, IntArray, wrap_degrees
 
 REPLICATES = 1000
 """Bootstrap replicates."""

@@ -10,8 +10,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
-from ..files import whole
+from ..common.errors import InputError
+from ..common.files import whole
 from .log import BadLine, Record, read_log, segments
 
 COLUMNS = (

@@ -9,8 +9,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import InputError
-from ..readers import Reader, ReadOptions, identify
+from ..common.errors import InputError
+from ..logs.readers import Reader, ReadOptions, identify
 from .predict import Predict
 
 TAIL_BYTES = 65_536
@@ -76,7 +76,7 @@ class TelemetryFollower:
         InputError
             If the content is no telemetry.
         """
-        from .. import limits  # loads pandas, as any reader does
+        from ..logs import limits  # loads pandas, as any reader does
 
         data = self._new_lines()
         if not data.strip():

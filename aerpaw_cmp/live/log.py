@@ -24,7 +24,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from ..errors import InputError
+from ..common.errors import InputError
 
 SCHEMA = "aerpaw-cmp-tap/1"
 _CRC = b',"crc":"'

@@ -21,7 +21,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..errors import AerpawCmpError, InputError
+from ..common.errors import AerpawCmpError, InputError
 
 QUECTEL_VENDOR = "2c7c"
 AT_INTERFACES = ("02", "03")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ..errors import UsageError
+from ..common.errors import UsageError
 from .log import LogSettings
 from .modem import OTHER_QUERIES, RI_QUERY, query_of
 from .ports import Roots

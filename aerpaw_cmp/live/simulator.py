@@ -23,8 +23,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from ..errors import AerpawCmpError, InputError, UsageError
-from ..readers import ReadOptions, identify
+from ..common.errors import AerpawCmpError, InputError, UsageError
+from ..logs.readers import ReadOptions, identify
 from .framing import Answer, frame_transcript
 from .log import BadLine, read_log
 from .modem import QUERIES

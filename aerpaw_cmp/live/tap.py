@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
-from ..errors import InputError
+from ..common.errors import InputError
 from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode

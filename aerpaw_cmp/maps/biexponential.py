@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import FloatArray
+from ..common.errors import UsageError
+from ..common.units import FloatArray
 
 TINY = 1e-300
 

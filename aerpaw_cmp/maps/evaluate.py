@@ -14,8 +14,8 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import BoolArray, FloatArray, IntArray
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray
 from .grid import Grid
 
 

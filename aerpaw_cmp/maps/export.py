@@ -18,9 +18,9 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
-from ..errors import UsageError
-from ..geodesy import SiteFrame
-from ..units import AnyArray, FloatArray
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame
+from ..common.units import AnyArray, FloatArray
 from .grid import Border, Grid, Layer
 
 CLASS_COLOURS = ("#9e9e9e", "#440154", "#31688e", "#35b779", "#fde725", "#e66101", "#b2182b")

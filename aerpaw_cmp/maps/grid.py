@@ -12,8 +12,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import AnyArray, FloatArray, IntArray
+from ..common.errors import UsageError
+from ..common.units import AnyArray, FloatArray, IntArray
 
 PAPER_SPACING_M = 30.0
 """Horizontal interval d_rx of the UAV positions."""

@@ -23,8 +23,8 @@ from typing import TYPE_CHECKING, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import FloatArray, IntArray
+from ..common.errors import UsageError
+from ..common.units import FloatArray, IntArray
 from . import neighbours as choose
 from .grid import Grid, serving_tower
 from .kriging import coverage_patterns

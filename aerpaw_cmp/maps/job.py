@@ -18,9 +18,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray, db_from_power
 from ..compare.rank import rank_from_singular_values
-from ..errors import UsageError
-from ..units import BoolArray, FloatArray, IntArray, db_from_power
 from .grid import (
     Border,
     Grid,

@@ -36,8 +36,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import BoolArray, FloatArray, IntArray
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray
 from . import neighbours as choose
 
 Correlation = Callable[[FloatArray], FloatArray]

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from ..units import FloatArray, IntArray
+from ..common.units import FloatArray, IntArray
 
 CHUNK = 4096
 """Targets per query; bounds the memory."""

@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import FloatArray
+from ..common.units import FloatArray
 from .evaluate import (
     IntervalCoverage,
     Predictor,

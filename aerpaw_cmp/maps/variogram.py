@@ -26,8 +26,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import UsageError
-from ..units import BoolArray, FloatArray, IntArray
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray
 from .biexponential import PAPER_BIEXPONENTIAL, BiExponential, fit_biexponential
 
 __all__ = [

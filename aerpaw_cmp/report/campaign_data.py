@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from ..common.units import FloatArray
 from ..site.site import Site
-from ..units import FloatArray
 from .data import Interval
 
 

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.units import FloatArray
 from ..site.site import Site
-from ..units import FloatArray
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
 from .export import k_key, safe_name
 from .figures import (

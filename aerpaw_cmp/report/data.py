@@ -13,9 +13,9 @@ from typing import Any
 
 import numpy as np
 
-from ..records import RejectedLine
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..logs.records import RejectedLine
 from ..site.site import Site
-from ..units import AnyArray, BoolArray, FloatArray, IntArray
 
 Interval = tuple[float, float]
 

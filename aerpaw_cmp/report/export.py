@@ -11,9 +11,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import UsageError
-from ..files import write_whole
-from ..records import has_wall_clock
+from ..common.errors import UsageError
+from ..common.files import write_whole
+from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 
 if TYPE_CHECKING:

@@ -16,9 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..records import has_wall_clock
+from ..common.units import AnyArray, BoolArray, FloatArray
+from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
-from ..units import AnyArray, BoolArray, FloatArray
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
 from .export import k_key, safe_name, write_atomic
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from ..records import has_wall_clock
+from ..logs.records import has_wall_clock
 from . import words
 from .data import RANKS, ReportData
 from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key

@@ -10,8 +10,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from ..common.units import FloatArray, IntArray
 from ..site.site import Site
-from ..units import FloatArray, IntArray
 from .data import Interval
 
 JOINT = "joint"

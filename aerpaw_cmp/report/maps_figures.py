@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 
+from ..common.units import FloatArray
 from ..site.site import Site
-from ..units import FloatArray
 from .data import RANKS
 from .export import k_key, safe_name
 from .figures import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out

@@ -16,8 +16,8 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
+from ..common.units import FloatArray
 from ..site.site import Building, Site, Trees
-from ..units import FloatArray
 from . import figures
 from .data import Track
 from .export import safe_name, write_atomic

@@ -21,9 +21,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, UsageError
-from ..matfile import read_arrays
-from ..units import AnyArray, ComplexArray, FloatArray, db_from_power, power_from_db
+from ..common.errors import InputError, UsageError
+from ..common.units import AnyArray, ComplexArray, FloatArray, db_from_power, power_from_db
+from ..logs.matfile import read_arrays
 
 HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
 """Peak directivity of a half-wave dipole (2.15 dBi): 4 / Cin(2 pi)."""

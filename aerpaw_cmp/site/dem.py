@@ -14,9 +14,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..errors import InputError, UsageError
-from ..geodesy import SiteFrame
-from ..units import BoolArray, FloatArray
+from ..common.errors import InputError, UsageError
+from ..common.geodesy import SiteFrame
+from ..common.units import BoolArray, FloatArray
 
 EARTH_RADIUS_M = 6_371_000.0
 LOWEST_M, HIGHEST_M = -500.0, 9000.0

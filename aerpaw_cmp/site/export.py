@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..errors import UsageError
+from ..common.errors import UsageError
 from .materials import (
     CROWN,
     CROWN_ATTENUATION_DB_PER_M,

@@ -19,11 +19,11 @@ import shapely
 from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
-from ..errors import InputError, UsageError
-from ..files import write_whole
-from ..geodesy import SiteFrame
-from ..units import FloatArray
-from ..yamlfile import dump_yaml
+from ..common.errors import InputError, UsageError
+from ..common.files import write_whole
+from ..common.geodesy import SiteFrame
+from ..common.units import FloatArray
+from ..common.yamlfile import dump_yaml
 from .mapfiles import read_map_file
 from .outlines import MapFile, Outline, Position, TreeLine
 from .site import Building, Forest, Geofence

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..units import ComplexArray, FloatArray
+from ..common.units import ComplexArray, FloatArray
 
 
 def harmonics(azimuth_rad: ArrayLike, order: int) -> FloatArray:

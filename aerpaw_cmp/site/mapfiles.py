@@ -16,7 +16,7 @@ from typing import Any
 from xml.etree import ElementTree
 from xml.parsers import expat
 
-from ..errors import InputError
+from ..common.errors import InputError
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 

@@ -11,8 +11,8 @@ import difflib
 import math
 from dataclasses import dataclass
 
-from ..errors import UsageError
-from ..units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
+from ..common.errors import UsageError
+from ..common.units import SPEED_OF_LIGHT_MPS, VACUUM_PERMITTIVITY_F_PER_M
 
 Band = tuple[float, float, float, float, float, float]
 """Lowest and highest frequency [GHz], a, b, c, d."""

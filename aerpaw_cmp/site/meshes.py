@@ -14,7 +14,7 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from ..units import FloatArray, IntArray
+from ..common.units import FloatArray, IntArray
 from .materials import CROWN, material
 from .site import Building, Site, Trees
 

@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from shapely.geometry import Polygon
 
-from ..geodesy import SiteFrame
-from ..units import FloatArray
+from ..common.geodesy import SiteFrame
+from ..common.units import FloatArray
 from .dem import Dem
 from .heights import VerticalDatum
 

@@ -18,10 +18,10 @@ import shapely
 from pydantic import AfterValidator, ConfigDict, Discriminator, Field, Tag, model_validator
 from shapely.geometry import Point, Polygon
 
-from ..errors import UsageError
-from ..geodesy import SiteFrame
-from ..units import FloatArray
-from ..yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame
+from ..common.units import FloatArray
+from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines, nearest
 from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material

@@ -17,8 +17,8 @@ import shapely
 from scipy.spatial import cKDTree
 from shapely.geometry.base import BaseGeometry
 
-from ..errors import UsageError
-from ..units import BoolArray, FloatArray
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray
 from .site import Forest, Trees
 
 MAXIMUM_TREES = 2_000_000

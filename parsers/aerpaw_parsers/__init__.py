@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from aerpaw_cmp.readers import Reader
+from aerpaw_cmp.logs.readers import Reader
 
 from . import (
     aadm_snr,

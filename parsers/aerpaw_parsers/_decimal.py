@@ -10,7 +10,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 
 _ROOM = (2**53 - 9) // 10  # one digit more is still exact in float64
 

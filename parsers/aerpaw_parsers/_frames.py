@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.readers import ReadOptions
-from aerpaw_cmp.records import COLUMNS, Attribute, Kind
-from aerpaw_cmp.units import AnyArray
+from aerpaw_cmp.common.units import AnyArray
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import COLUMNS, Attribute, Kind
 
 _INTEGERS = ("fix", "satellites")
 

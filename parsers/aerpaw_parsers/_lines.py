@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from aerpaw_cmp.records import RejectedLine
-from aerpaw_cmp.units import AnyArray, BoolArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
+from aerpaw_cmp.logs.records import RejectedLine
 
 TEXT_LIMIT = 500
 """Characters of a rejected line that are kept."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from aerpaw_cmp.readers import ReadOptions
-from aerpaw_cmp.records import Stream
-from aerpaw_cmp.units import AnyArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Stream
 
 from . import _frames, _lines, _time
 

@@ -11,7 +11,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from aerpaw_cmp.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 
 from ._lines import Lines
 

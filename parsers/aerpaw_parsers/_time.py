@@ -13,9 +13,9 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.readers import ReadOptions
-from aerpaw_cmp.units import AnyArray, BoolArray, IntArray
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
+from aerpaw_cmp.logs.readers import ReadOptions
 
 from ._lines import add_flag
 

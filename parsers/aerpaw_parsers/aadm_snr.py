@@ -6,9 +6,9 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult, Stream
-from aerpaw_cmp.units import AnyArray
+from aerpaw_cmp.common.units import AnyArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _frames, _lines, _time
 

@@ -10,8 +10,8 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
 
 from . import _lines, _time, aadm_snr
 

@@ -14,12 +14,12 @@ import zlib
 
 import numpy as np
 
-from aerpaw_cmp.errors import InputError
-from aerpaw_cmp.matfile import MAGIC as _MAGIC
-from aerpaw_cmp.matfile import read_arrays
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
+from aerpaw_cmp.logs.matfile import read_arrays
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _time
 

@@ -12,10 +12,10 @@ from difflib import get_close_matches
 
 import numpy as np
 
-from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
-from aerpaw_cmp.units import AnyArray, FloatArray
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _time
 

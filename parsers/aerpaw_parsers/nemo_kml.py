@@ -10,9 +10,9 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult, RejectedLine
-from aerpaw_cmp.units import IntArray
+from aerpaw_cmp.common.units import IntArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
 from . import _lines, _nemo
 

@@ -25,9 +25,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import ReadResult, RejectedLine, Stream
-from aerpaw_cmp.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _table, _time
 

@@ -27,9 +27,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.errors import InputError
-from aerpaw_cmp.readers import Reader, ReadOptions
-from aerpaw_cmp.records import Attribute, ReadResult, RejectedLine, Stream
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 
 SCHEMA = "aerpaw-cmp-tap/1"
 _CRC = b',"crc":"'

@@ -7,7 +7,7 @@ import pytest
 from scipy.ndimage import gaussian_filter1d
 
 from aerpaw_cmp.compare.installed import LinkAngles, fit_installed
-from aerpaw_cmp.config import AntennaSettings, load_pattern
+from aerpaw_cmp.flight.settings import AntennaSettings, load_pattern
 from aerpaw_cmp.site.antennas import HalfWaveDipole
 from aerpaw_cmp.site.installed import InstalledPattern, harmonics
 

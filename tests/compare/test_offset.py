@@ -11,6 +11,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.offset import (
     censored_offset,
     expected_offset_db,
@@ -23,7 +24,6 @@ from aerpaw_cmp.compare.offset import (
     reference_power_dbm,
     trimmed_offset,
 )
-from aerpaw_cmp.errors import InputError
 
 tenths = st.integers(-2000, 2000).map(lambda k: k / 100)
 

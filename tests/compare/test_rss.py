@@ -214,7 +214,7 @@ def test_unknown_positions_belong_to_the_stretch_before():
 
 
 def test_link_geometry_in_the_antenna_frames():
-    from aerpaw_cmp.replay.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
+    from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
 
     tower = np.array([10.0, -5.0, 10.0])
     rng = np.random.default_rng(9)
@@ -343,7 +343,7 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
         pytest.skip("AERPAW_CMP_FIELD_DATA is not set")
     from scipy.io import loadmat
 
-    from aerpaw_cmp.geodesy import SiteFrame
+    from aerpaw_cmp.common.geodesy import SiteFrame
 
     data = {
         k: np.ravel(v)

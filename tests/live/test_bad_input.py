@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
 from aerpaw_cmp.live.session import TapSettings
@@ -80,7 +80,7 @@ def test_no_permission_names_the_group(modem, tmp_path):
     os.chown(sim.node, 0, grp.getgrnam("dialout").gr_gid)
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
-        "from aerpaw_cmp.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
+        "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
         "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
@@ -212,7 +212,7 @@ def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem, tmp_p
     sim.node.chmod(0o666)
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
-        "from aerpaw_cmp.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
+        "from aerpaw_cmp.common.errors import InputError\nos.setgroups([])\nos.setuid(65534)\n"
         "try:\n SerialPort.open(Path(sys.argv[1]))\nexcept InputError as error:\n print(error); sys.exit(error.exit_code)"
     )
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}

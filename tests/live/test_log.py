@@ -16,7 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import InputError
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.live import log as log_module
 from aerpaw_cmp.live.log import (
     Clock,
@@ -27,7 +27,7 @@ from aerpaw_cmp.live.log import (
     read_log,
 )
 from aerpaw_cmp.live.writer import LogWriter
-from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers.tap_jsonl import READER, SCHEMA, decode_line
 
 

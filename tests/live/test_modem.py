@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.framing import Answer, frame_transcript
 from aerpaw_cmp.live.modem import QUERIES, Redactor, csi_write, decode, encode, query_of
 

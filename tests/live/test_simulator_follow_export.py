@@ -10,16 +10,16 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live import simulator
 from aerpaw_cmp.live.export import COLUMNS, export_csv
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.log import encode_record
 from aerpaw_cmp.live.modem import decode
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
-from aerpaw_cmp.readers import Reader
-from aerpaw_cmp.records import COLUMNS as RECORD_COLUMNS
-from aerpaw_cmp.records import ReadResult, Stream
+from aerpaw_cmp.logs.readers import Reader
+from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
 TRANSCRIPT = b"""AT+QNWCFG="nr5g_csi"
 +QNWCFG: "nr5g_csi",21,3,9,11

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps import evaluate
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.interpolate import IndexInterpolation, InverseDistance, Nearest, ServingTowerMean

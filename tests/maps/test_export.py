@@ -11,8 +11,8 @@ import pandas as pd
 import pytest
 from shapely.geometry import shape
 
-from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import export
 from aerpaw_cmp.maps.grid import Grid, Layer, class_names, voronoi_borders
 

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import evaluate
 from aerpaw_cmp.maps.kriging import OrdinaryKriging
 from aerpaw_cmp.maps.variogram import field_correlation, fit_biexponential

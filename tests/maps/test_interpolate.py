@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.interpolate import Akima1DInterpolator, CubicSpline
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.interpolate import (
     IndexInterpolation,

@@ -6,8 +6,8 @@ import tracemalloc
 import numpy as np
 import pytest
 
-from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.maps import export
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import (

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.maps import biexponential, variogram
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.variogram import (

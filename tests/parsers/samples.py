@@ -11,7 +11,7 @@ import zlib
 import numpy as np
 import scipy.io
 
-from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.logs.readers import ReadOptions
 
 OPTIONS = ReadOptions(
     timezone="America/New_York",

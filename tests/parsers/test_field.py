@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 import scipy.io
 
-from aerpaw_cmp.ingest import Ingested, ingest
-from aerpaw_cmp.limits import LIMITS, UNSCORED
-from aerpaw_cmp.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.ingest import Ingested, ingest
+from aerpaw_cmp.logs.limits import LIMITS, UNSCORED
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 pytestmark = [

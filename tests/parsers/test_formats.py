@@ -9,9 +9,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.readers import ReadOptions, by_name
-from aerpaw_cmp.records import ReadResult, Stream
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.parsers import samples
 from tests.parsers.samples import CASES, OPTIONS, SAMPLES
 
@@ -402,7 +402,7 @@ def test_a_clock_with_offset_needs_no_zone() -> None:
 
 
 def test_gzip_is_transparent(tmp_path) -> None:
-    from aerpaw_cmp.ingest import ingest
+    from aerpaw_cmp.logs.ingest import ingest
 
     (tmp_path / "a.kml.gz").write_bytes(gzip.compress(samples.NEMO_KML))
     assert ingest(tmp_path / "a.kml.gz", options=OPTIONS)[0].result.accepted == 2

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import AerpawCmpError
-from aerpaw_cmp.readers import by_name, catalogue, identify
-from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.logs.readers import by_name, catalogue, identify
+from aerpaw_cmp.logs.records import ReadResult
 from tests.parsers.samples import CASES, OPTIONS, SAMPLES
 
 SNIFFED = [case for case in CASES if case[0] != "generic_csv"]

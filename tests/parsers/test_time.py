@@ -11,8 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import UsageError
-from aerpaw_cmp.readers import ReadOptions
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_parsers import _time
 
 NEW_YORK = "America/New_York"

@@ -8,8 +8,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.readers import by_name
-from aerpaw_cmp.records import ReadResult
+from aerpaw_cmp.logs.readers import by_name
+from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _table, vehicle_out
 from tests.parsers.samples import OPTIONS, SAMPLES
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.geodesy import SiteFrame
-from aerpaw_cmp.records import RejectedLine
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report.data import (
     Audit,
     Baseline,

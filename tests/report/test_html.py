@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.records import RejectedLine
+from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import html, words
 from aerpaw_cmp.report.data import InputFile, ReportData
 from aerpaw_cmp.report.figures import Picture

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.report import figures, site_view
 from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees

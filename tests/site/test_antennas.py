@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import AerpawCmpError, InputError, UsageError
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
 from aerpaw_cmp.site.antennas import (
     TR38901,
     HalfWaveDipole,

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.dem import EARTH_RADIUS_M, Dem, read_dem
 from aerpaw_cmp.site.siteyaml import load_site
 

@@ -10,8 +10,8 @@ import pytest
 import shapely
 from shapely.geometry import box
 
-from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import shapely
 
-from aerpaw_cmp.errors import InputError, UsageError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
 from aerpaw_cmp.site.siteyaml import load_site
 

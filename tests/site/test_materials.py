@@ -2,7 +2,7 @@ import math
 
 import pytest
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.materials import MATERIALS, material
 
 

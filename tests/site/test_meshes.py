@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.materials import CROWN_PERMITTIVITY, lossy_conductivity_s_per_m
 from aerpaw_cmp.site.meshes import WALL_DEPTH_M, _bodies, building_mesh, site_meshes

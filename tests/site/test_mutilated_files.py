@@ -8,8 +8,8 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.errors import AerpawCmpError
-from aerpaw_cmp.geodesy import SiteFrame
+from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.antennas import read_gain_grid, read_pattern_text
 from aerpaw_cmp.site.dem import read_dem
 from aerpaw_cmp.site.footprints import import_footprints

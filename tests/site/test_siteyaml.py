@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
 from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SiteModel, build_site, load_site
-from aerpaw_cmp.yamlfile import parse_yaml
 
 MINIMAL = """\
 name: test

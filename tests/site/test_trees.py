@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial import cKDTree
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.errors import UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.site.site import Forest
 from aerpaw_cmp.site.trees import Distribution, TreeSizes, _first_come, place_trees, wanted_trees
 

@@ -1,0 +1,1 @@
+"""A checked flight.yaml, its logs as series, pose and clock."""

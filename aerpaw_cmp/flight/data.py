@@ -1,0 +1,462 @@
+"""From a checked flight file to the data of one flight: site, logs, track, RSS and rank series."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, TypeVar
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+
+from ..common.errors import InputError, UsageError
+from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ..logs.ingest import IngestedFile, ingest, read_bytes
+from ..logs.limits import UNSCORED, flagged
+from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
+from ..logs.records import Stream
+from ..site.site import Site
+from ..site.siteyaml import load_site
+from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
+from .track import Track, clock_trap
+
+Times = NDArray[np.datetime64]
+
+
+@dataclass(frozen=True, slots=True)
+class RssSeries:
+    """Measured RSS of one tower and channel: ``time`` (n,) UTC, ``measured_db`` (n,), NaN = out of coverage."""
+
+    tower: str
+    channel: str
+    unit: str
+    time: Times
+    measured_db: FloatArray
+    link: LinkSettings
+    settings_key: str
+    """Equal for series whose link settings are equal: they share a replay."""
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """Rows of the log that are not here, because a flag voids them: how many per flag."""
+
+
+@dataclass(frozen=True, slots=True)
+class RankSeries:
+    """Reported rank at a tower: ``rank`` (n,) with NaN for no CSI, ``position_m`` (n, 3) of the log itself or None."""
+
+    tower: str
+    time: Times
+    rank: FloatArray
+    sinr_db: FloatArray
+    position_m: FloatArray | None
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """As in :class:`RssSeries`."""
+
+
+@dataclass(frozen=True, slots=True)
+class FlightData:
+    """Everything the comparison needs, nothing replayed yet."""
+
+    settings: FlightFile
+    folder: Path
+    """Where logs and antenna files resolve: ``--logs-root``, else the folder of the flight file."""
+    site: Site
+    files: tuple[IngestedFile, ...]
+    track: Track | None
+    rss: tuple[RssSeries, ...]
+    rank: tuple[RankSeries, ...]
+    warnings: tuple[str, ...]
+
+
+def choose_site(choice: SiteChoice, folder: Path) -> Site:
+    """The site of a flight, with the flight's own changes."""
+    name = choice.file
+    path = folder / name
+    site = load_site(path if path.is_file() else name, coordinates=choice.coordinates)
+    if choice.antenna_height_m is not None:
+        towers = {
+            key: dataclasses.replace(tower, antenna_height_m=choice.antenna_height_m)
+            for key, tower in site.towers.items()
+        }
+        site = dataclasses.replace(site, towers=towers)
+    if choice.without_buildings:
+        note = "this flight is replayed without the buildings of the site (site.without_buildings)"
+        site = dataclasses.replace(site, buildings=(), notes=(*site.notes, note))
+    return site
+
+
+def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
+    """Every log of the flight file, in its order.
+
+    Raises
+    ------
+    InputError
+        A missing file, a log of another kind than the flight file says, a log without any record.
+    """
+    files = []
+    for log in settings.logs:
+        path = (logs_root or folder) / log.path
+        if not path.exists():
+            root = logs_root or folder
+            raise InputError(
+                "there is no such log",
+                expected=f"the file below {root}",
+                cause="a wrong path, or --logs-root",
+                path=path,
+            )
+        reader = None if log.reader is None else by_name(log.reader)
+        if reader is not None:
+            _refuse_other_kind(path, reader)
+        (file,) = ingest([path], options=log.options(settings.timezone), reader=log.reader)
+        if not file.result.streams:
+            raise InputError(
+                "no record could be read",
+                expected=f"records of reader {file.result.reader!r}",
+                cause=file.result.rejected[0].reason if file.result.rejected else "an aborted run",
+                path=path,
+            )
+        files.append(file)
+    return tuple(files)
+
+
+def _refuse_other_kind(path: Path, reader: Reader) -> None:
+    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    head = read_bytes(path)[0][:HEAD_BYTES]
+    others = [r.name for r in catalogue() if r.sniff(head)]
+    if not others or reader.name in others:
+        return
+    raise InputError(
+        f"the content is that of {' or '.join(others)}",
+        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
+        cause="the wrong file, or the wrong 'reader:'",
+        path=path,
+    )
+
+
+RATIOS = ("quality", "snr")
+"""Streams or channels of kind rss that are no levels, as sounder and controller name them."""
+
+
+def is_ratio(stream: Stream) -> bool:
+    """Whether a stream of kind rss is a ratio to the noise."""
+    names = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
+    return stream.kind == "rss" and any(name is not None and name.lower() in RATIOS for name in names)
+
+
+def gather(
+    settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
+) -> FlightData:
+    """Sort the streams into track, RSS and rank, and check that they belong together."""
+    site = choose_site(settings.site, folder)
+    warnings: list[str] = []
+    telemetry: list[tuple[str, Stream]] = []
+    rss: list[tuple[str, RssSeries]] = []
+    rank: list[tuple[str, RankSeries]] = []
+    for log, file in zip(settings.logs, files, strict=True):
+        warnings += [f"{log.path}: {text}" for text in file.result.warnings]
+        for stream in file.result.streams:
+            if stream.name in log.skip:
+                continue
+            if stream.kind == "telemetry":
+                telemetry.append((log.path, stream))
+            elif stream.kind == "rss":
+                rss.append((log.path, _rss_series(settings, log, stream, site)))
+            else:
+                rank.append((log.path, _rank_series(settings, log, stream, site)))
+        names = [s.name for s in file.result.streams]
+        if unknown := [name for name in log.skip if name not in names]:
+            warnings.append(
+                f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
+            )
+        if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
+            shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
+            warnings.append(
+                f"{log.path}: {shown} to the noise, no level: compared as RSS as if the noise were constant "
+                f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
+            )
+    if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
+        warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
+    if len(telemetry) > 1:
+        warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
+    track = _track(settings, site, *telemetry[0], warnings) if telemetry else None
+    data = FlightData(
+        settings=settings,
+        folder=logs_root or folder,
+        site=site,
+        files=tuple(files),
+        track=track,
+        rss=_records(rss, lambda s: f"RSS of {s.tower} {s.channel}"),
+        rank=_records(rank, lambda s: f"rank of {s.tower}"),
+        warnings=tuple(warnings),
+    )
+    _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
+    _check_overlap(data)
+    return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings: list[str]) -> Track:
+    frame, _ = _scored(stream, path)
+    track = Track(
+        frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m
+    )  # fmt: skip
+    if not len(track):
+        raise InputError(
+            f"none of the {len(stream.frame)} telemetry rows holds a position that can be",
+            expected="latitude and longitude in degrees, altitude in metres",
+            cause="a receiver without a fix, or columns exchanged",
+            path=path,
+        )
+    warnings += [f"{path}: {text}" for text in track.account.warnings]
+    return track
+
+
+def _scored(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
+    """The rows that may be compared, and how many the others are per flag.
+
+    Raises
+    ------
+    InputError
+        If no row is left.
+    """
+    frame = stream.frame
+    void = flagged(frame)
+    if not void.any():
+        return frame, {}
+    words = Counter(w for text in frame["flag"][void] for w in str(text).split(";") if w in UNSCORED)
+    if void.all():
+        raise InputError(
+            f"every row of {stream.kind} {stream.name!r} is flagged {', '.join(words)}",
+            expected="values that can be, see docs/formats.md",
+            cause="another unit, or exchanged columns",
+            path=path,
+        )
+    return frame[~void], dict(words)
+
+
+FAR_M = 30_000.0
+"""A flight further than this from every tower [m] was not flown at this site."""
+
+DISTANT_M = 5_000.0
+"""And from here on [m] the reader is told first."""
+
+
+def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> None:
+    """A flight far from every tower is no flight of this site: exchanged or mirrored angles are named.
+
+    Raises
+    ------
+    InputError
+        If no position comes within :data:`FAR_M` of any tower.
+    """
+    flown = [(path, stream) for path, stream in telemetry] + [
+        (log.path, stream)
+        for log, file in zip(data.settings.logs, data.files, strict=True)
+        for stream in file.result.streams
+        if stream.kind == "rank" and stream.name not in log.skip and "latitude_deg" in stream.frame
+    ]
+    for path, stream in flown:
+        latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
+        near = _nearest_m(data.site, latitude, longitude)
+        if not near > FAR_M:
+            continue
+        turned = {
+            "latitude and longitude are exchanged": (longitude, latitude),
+            "the longitude lacks its sign (west is negative)": (latitude, -longitude),
+            "the latitude lacks its sign (south is negative)": (-latitude, longitude),
+            "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
+        }
+        causes = [why for why, angles in turned.items() if _nearest_m(data.site, *angles) <= FAR_M]
+        raise InputError(
+            f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {data.site.name!r}",
+            expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
+            cause=causes[0] if causes else "another site, or a log of another flight",
+            path=path,
+        )
+
+
+def _nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
+    """Least horizontal distance of positions to any tower [m]; NaN without a position."""
+    can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
+    if not can.any():
+        return float("nan")
+    east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
+    gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
+    return float(np.min(gaps, initial=np.inf))
+
+
+def _idle_attitude(data: FlightData) -> tuple[str, ...]:
+    """What is to be told where ``rt.attitude`` cannot act, or only in part."""
+    mode = data.settings.rt.attitude
+    if mode == "ignored":
+        return ()
+    told = []
+    for kind, tower, time in [("RSS", s.tower, s.time) for s in data.rss] + [
+        ("rank", s.tower, s.time) for s in data.rank
+    ]:
+        pose = None if data.track is None else data.track.pose_at(time)
+        known = 0 if pose is None else int((pose.attitude_known if mode == "logged" else pose.valid).sum())
+        if known == 0:
+            why = (
+                "no log holds telemetry"
+                if pose is None
+                else "the telemetry holds no attitude: level flight along the course stands in"
+                if pose.valid.any()
+                else "the telemetry covers none of its instants (relative times want 'time_origin')"
+            )
+            told.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
+        elif pose is not None and kind == "rank" and not pose.valid.all():
+            told.append(
+                f"rt.attitude: {mode} acts on {known} of {len(time)} samples of {kind} of {tower}: "
+                "the telemetry covers no more."
+            )
+    return tuple(dict.fromkeys(told))
+
+
+def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
+    if name is None:
+        raise UsageError(
+            f"log {log.path!r} does not say which tower it belongs to",
+            expected="'node: LW1', say, beside its path in flight.yaml",
+        )
+    if name not in site.towers:
+        raise UsageError(
+            f"log {log.path!r} names tower {name!r}, which site {site.name!r} does not have",
+            expected="one of " + ", ".join(site.towers),
+        )
+    return name
+
+
+def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RssSeries:
+    tower = _known_tower(log.node or _text(stream, "node"), log, site)
+    channel = log.channel or _text(stream, "channel") or stream.name
+    link = settings.link.channels.get(channel, settings.link.rss)
+    frame, left_out = _scored(stream, log.path)
+    return RssSeries(
+        tower=tower,
+        channel=channel,
+        unit=str(stream.attributes.get("unit", "dB re full scale")),
+        time=frame["time"].to_numpy("datetime64[ns]"),
+        measured_db=frame["rss_db"].to_numpy(np.float64),
+        link=link,
+        settings_key=link.model_dump_json(),
+        flagged=left_out,
+    )
+
+
+def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RankSeries:
+    tower = _known_tower(log.node or settings.rank.tower, log, site)
+    frame, left_out = _scored(stream, log.path)
+    position = None
+    if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
+        east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
+        up = np.fmax(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)
+        position = np.stack([east, north, up], axis=-1)
+    sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
+    return RankSeries(
+        tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position, left_out
+    )
+
+
+Series = TypeVar("Series", "RssSeries", "RankSeries")
+
+
+def _records(found: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
+    """One series per name: logs that follow each other (a radio started anew) are one record.
+
+    Raises
+    ------
+    UsageError
+        If two logs hold the same at the same time: only one of them could be compared.
+    """
+    groups: dict[str, list[tuple[str, Series]]] = {}
+    for path, series in found:
+        groups.setdefault(name(series), []).append((path, series))
+    return tuple(_record(what, group) for what, group in groups.items())
+
+
+def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
+    if len(group) == 1:
+        return group[0][1]
+    parts = sorted((p for p in group if len(p[1].time)), key=lambda p: p[1].time.min()) or [group[0]]
+    for (path, before), (other, after) in itertools.pairwise(parts):
+        if after.time.min() < before.time.max() or _form(before) != _form(after):
+            where = "two logs" if path != other else "two streams of a log"
+            raise UsageError(
+                f"{where} hold {what} at the same time or in another form: {path!r} and {other!r}",
+                expected="one record of each channel and of each tower's rank",
+                cause="a copy: leave one out, by its path or by 'skip'; another radio: give it its own 'channel'",
+            )
+    first = parts[0][1]
+    arrays: dict[str, Any] = {
+        field.name: np.concatenate([getattr(series, field.name) for _, series in parts])
+        for field in dataclasses.fields(first)
+        if isinstance(getattr(first, field.name), np.ndarray)
+    }
+    voided = sum((Counter(series.flagged) for _, series in parts), Counter())
+    return dataclasses.replace(first, flagged=dict(voided), **arrays)
+
+
+def _form(series: RssSeries | RankSeries) -> object:
+    """What two parts of one record must share."""
+    return series.unit if isinstance(series, RssSeries) else series.position_m is None
+
+
+def _text(stream: Stream, key: str) -> str | None:
+    value = stream.attributes.get(key)
+    return None if value is None else str(value)
+
+
+def _check_overlap(data: FlightData) -> None:
+    if not data.rss and not data.rank:
+        raise UsageError(
+            "none of the logs holds RSS or rank",
+            expected="at least one radio log under 'logs'",
+            cause="'skip', or a log left out",
+        )
+    needs_track = [("RSS", s.tower, s.time) for s in data.rss] + [
+        ("rank", s.tower, s.time) for s in data.rank if s.position_m is None
+    ]
+    if needs_track and data.track is None:
+        raise UsageError(
+            f"{needs_track[0][0]} of {needs_track[0][1]} has no positions of its own and there is no telemetry log",
+            expected="a telemetry log (vehicle_out, say) under 'logs'",
+        )
+    for kind, tower, time in needs_track:
+        assert data.track is not None
+        start, end = np.datetime64(data.track.start_ns, "ns"), np.datetime64(data.track.end_ns, "ns")
+        if len(time) == 0 or time.min() > end or time.max() < start:
+            shown = f"{pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}" if len(time) else "no samples"
+            flown = f"{pd.Timestamp(start)} .. {pd.Timestamp(end)}"
+            raise InputError(
+                f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
+                expected="logs of the same flight",
+                cause=_clock_cause(data, time, start, end),
+            )
+
+
+def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+    trap = None
+    if len(time):
+        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+    if trap is None:
+        return "logs of different flights, or a wrong 'timezone' or 'clock'"
+    return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"
+
+
+def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
+    """Positions (n, 3) [m] and which of them are known: the log's own, and the track's where it has none."""
+    if series.position_m is None:
+        assert track is not None
+        pose = track.pose_at(series.time)
+        return pose.position_m, pose.valid
+    position = series.position_m
+    known = np.isfinite(position).all(axis=1)
+    if track is not None and not known.all():
+        pose = track.pose_at(series.time)
+        use = ~known & pose.valid
+        position, known = np.where(use[:, None], pose.position_m, position), known | use
+    return position, np.asarray(known)

@@ -1,0 +1,310 @@
+"""A first flight.yaml for logs that were just read: what can be told from them is filled in, the rest is asked for."""
+
+from __future__ import annotations
+
+import os
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import yaml
+
+from ..common.errors import UsageError, one_line
+from ..common.files import write_whole
+from ..common.yamlfile import parse_yaml
+from ..logs.ingest import IngestedFile
+from ..logs.records import Stream, has_wall_clock
+from .data import is_ratio
+from .settings import FlightFile, LogSettings
+
+_TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
+_RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
+
+HEAD = """\
+# A first draft for these logs, made by 'aerpaw-cmp ingest --draft'. Check every line with a question mark.
+"""
+LINK = """\
+link:
+  rss: {carrier_hz: 3.3e9, transmit_power_dbm: 40, uav_transmits: true}  # as in your experiment?
+"""
+NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
+RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
+
+
+Span = tuple[np.datetime64, np.datetime64]
+
+
+def check_target(target: Path) -> None:
+    """UsageError unless a new file can stand there; asked before logs are read."""
+    if target.exists() or target.is_symlink():
+        raise UsageError("the file exists", expected="the name of a new flight.yaml", path=target)
+    if not target.absolute().parent.is_dir():
+        raise UsageError("there is no such folder", expected="--draft in a folder that exists", path=target.parent)
+
+
+def write_draft(
+    files: Sequence[IngestedFile], target: Path, *, timezone: str | None = None, time_origin: str | None = None
+) -> list[str]:
+    """Write a flight.yaml that names the logs.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+        As ``ingest`` read them.
+    target : Path
+        The flight.yaml; the paths in it are relative to its folder.
+    timezone, time_origin : str, optional
+        What zone-less clocks and relative times were read with.
+
+    Returns
+    -------
+    list of str
+        What is left to check or was left out.
+
+    Raises
+    ------
+    UsageError
+        If the file exists, cannot be written, or no log has what a flight needs.
+    """
+    check_target(target)
+    text, remarks = draft(files, target.resolve().parent, timezone=timezone, time_origin=time_origin)
+    write_whole(target, text)
+    return remarks
+
+
+def draft(
+    files: Sequence[IngestedFile], folder: Path, *, timezone: str | None = None, time_origin: str | None = None
+) -> tuple[str, list[str]]:
+    """The text of the flight.yaml in ``folder``, and the remarks; see :func:`write_draft`."""
+    flown = _flown(files)
+    entries = _Entries(folder, flown, _has_level(files, flown), time_origin)
+    for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
+        entries.enter(file)
+    entries.sort(files)
+    if not entries.kinds & {"rss", "rank"}:
+        raise UsageError(
+            "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
+            expected="telemetry and levels or ranks of one flight",
+        )
+    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", "site: lake_wheeler  # or your own site.yaml?\n"]
+    if timezone:
+        parts.append(f"timezone: {timezone}\n")
+    parts += ["logs:\n", *entries.lines.values()]
+    parts += [NO_TRACK] if entries.without_track else []
+    parts += [f"  # left out: {remark}\n" for remark in entries.out]
+    parts += [LINK] if "rss" in entries.kinds else []
+    parts += [RANK] if "rank" in entries.kinds else []
+    text = "".join(parts)
+    parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
+    return text, asked + [f"left out: {remark}" for remark in entries.out]
+
+
+@dataclass
+class _Entries:
+    """Lines of ``logs:``, and remarks on what stays out."""
+
+    folder: Path
+    flown: tuple[Stream, Span] | None
+    """The telemetry that gives the track, and its span."""
+    has_level: bool
+    time_origin: str | None
+    lines: dict[str, str] = field(default_factory=dict)
+    """By the path as it was given."""
+    kinds: set[str] = field(default_factory=set)
+    out: list[str] = field(default_factory=list)
+    without_track: bool = False
+    """A record was entered that needs a track, and there is none."""
+    taken: dict[tuple[str, ...], list[tuple[Span, str]]] = field(default_factory=dict)
+    """By tower, kind and channel: when, and from which log."""
+    contents: dict[str, str] = field(default_factory=dict)
+    """Path by SHA-256."""
+
+    def leads(self, file: IngestedFile) -> bool:
+        """Whether the track is in this file."""
+        return self.flown is not None and any(s is self.flown[0] for s in file.result.streams)
+
+    def sort(self, files: Sequence[IngestedFile]) -> None:
+        """Lines in the order of the files, telemetry first."""
+        order = [f.path for f in sorted(files, key=lambda f: not self.leads(f))]
+        self.lines = {path: self.lines[path] for path in order if path in self.lines}
+        self.out.sort()
+
+    def enter(self, file: IngestedFile) -> None:
+        """One log: a line of ``logs:``, or the reason why not."""
+        path = os.path.relpath(Path(file.path).resolve(), self.folder)
+        shown = one_line(path)
+        if (first := self.contents.setdefault(file.sha256, shown)) != shown:
+            self.out.append(f"{shown}: the same bytes as {first}")
+        elif not _is_text(path):
+            self.out.append(f"{shown}: flight.yaml cannot hold a name that is not UTF-8; rename it")
+        else:
+            self._enter(file, path, shown)
+
+    def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
+        entry, asked = _entry(file, path)
+        refused = self._refused(file, entry, shown)
+        kept = [s for s in file.result.streams if s.name not in refused]
+        reasons = list(dict.fromkeys(refused.values()))
+        if not kept:
+            self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
+            return
+        self.out += [f"{shown}: {name}: {reason}" for name, reason in refused.items() if reason != RATIO]
+        if all(s.kind == "telemetry" for s in kept):
+            entry, asked = {"path": path, "reader": file.result.reader}, ""
+        if self.time_origin and any("clock" in s.attributes for s in kept):
+            entry["time_origin"] = self.time_origin
+        if refused:
+            entry["skip"] = sorted(refused)
+        if any(is_ratio(s) for s in kept):
+            asked += " a ratio to the noise as a level?" if asked else "  # a ratio to the noise as a level?"
+        self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
+        self.kinds |= {s.kind for s in kept}
+        self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
+
+    def _refused(self, file: IngestedFile, entry: Mapping[str, Any], shown: str) -> dict[str, str]:
+        """Streams that stay out, by name, and why; the others are taken."""
+        refused = {}
+        for stream in sorted(file.result.streams, key=_missing):
+            span = _span(stream)
+            if span is None:
+                refused[stream.name] = "no samples"
+            elif reason := self._reason(stream, span):
+                refused[stream.name] = reason
+            elif stream.kind != "telemetry":
+                key = _key(stream, entry)
+                same = [other for when, other in self.taken.get(key, []) if _meet(span, when)]
+                if same:
+                    where = "another stream of the log" if same[0] == shown else same[0]
+                    refused[stream.name] = f"{where} has {key[1]} of that tower and time already"
+                else:
+                    self.taken.setdefault(key, []).append((span, shown))
+        return refused
+
+    def _reason(self, stream: Stream, span: Span) -> str | None:
+        relative = not has_wall_clock(span[0])
+        if stream.kind == "telemetry":
+            if self.flown is None or stream is self.flown[0]:
+                return None
+            return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
+        if relative and not _has_positions(stream):
+            return "its times are relative; read it again with --time-origin"
+        if self.flown is not None and not relative and not _meet(span, self.flown[1]):
+            return _late(span, self.flown[1])
+        return RATIO if self.has_level and is_ratio(stream) else None
+
+
+RATIO = "a ratio to the noise, no level"
+
+
+def _late(span: Span, flown: Span) -> str:
+    shown = [" .. ".join(str(t.astype("datetime64[s]")).replace("T", " ") for t in s) for s in (span, flown)]
+    return f"{shown[0]} is not at the time of the telemetry, {shown[1]} (UTC)"
+
+
+def _missing(stream: Stream) -> int:
+    """Of two ranks of one modem, the one that was reported more often is taken: NR or LTE."""
+    return int(stream.frame["rank"].isna().sum()) if stream.kind == "rank" else 0
+
+
+def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
+    """What a report tells series apart by."""
+    tower = str(entry.get("node") or stream.attributes.get("node"))
+    if stream.kind == "rank":
+        return tower, "rank"
+    return tower, str(entry.get("channel") or stream.attributes.get("channel") or stream.name)
+
+
+def _has_positions(stream: Stream) -> bool:
+    return stream.kind == "rank" and "latitude_deg" in stream.frame and bool(stream.frame["latitude_deg"].notna().any())
+
+
+def _has_level(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> bool:
+    """Whether some stream of the flight is RSS in the proper sense."""
+    levels = [s for file in files for s in file.result.streams if s.kind == "rss" and not is_ratio(s)]
+    spans = [span for s in levels if (span := _span(s))]
+    return any(flown is None or _meet(span, flown[1]) for span in spans)
+
+
+def _samples(file: IngestedFile) -> int:
+    return sum(len(s.frame) for s in file.result.streams if s.kind != "telemetry")
+
+
+def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
+    """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
+    telemetry: list[tuple[Stream, Span]] = []
+    others: list[Span] = []
+    for file in files:
+        for stream in file.result.streams:
+            if (span := _span(stream)) and has_wall_clock(span[0]):
+                if stream.kind == "telemetry":
+                    telemetry.append((stream, span))
+                else:
+                    others.append(span)
+
+    def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
+        return sum(_meet(flight[1], other) for other in others), flight[1][1] - flight[1][0]
+
+    return max(telemetry, key=worth, default=None)
+
+
+def _meet(one: Span, other: Span) -> bool:
+    return bool(one[0] <= other[1] and other[0] <= one[1])
+
+
+def _span(stream: Stream) -> Span | None:
+    time = stream.frame["time"].to_numpy("datetime64[ns]")
+    time = time[~np.isnat(time)]
+    return (time.min(), time.max()) if len(time) else None
+
+
+def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
+    """Keys of a log and a question about what had to be guessed."""
+    entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
+    need = [s for s in file.result.streams if s.kind != "telemetry" and not s.attributes.get("node")]
+    if not need:
+        return entry, ""
+    near = _TOWER.findall("/".join(Path(file.path).resolve().parts[-2:]))  # of the file or its folder
+    towers = near or _TOWER.findall(path)
+    entry["node"] = f"LW{towers[-1]}" if towers else "LW1"
+    if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
+        entry["channel"] = f"USRP{radio[-1]}"
+    return entry, "" if near else "  # which tower?"
+
+
+def _flow(entry: dict[str, Any]) -> str:
+    """A log's YAML mapping on one line, as a flight.yaml is read: a file may be called 1e6."""
+
+    def dumped(style: str | None) -> str:
+        text = yaml.safe_dump(
+            entry, default_flow_style=True, sort_keys=False, width=10_000, allow_unicode=style is None,
+            default_style=style,
+        )  # fmt: skip
+        return str(text).strip()
+
+    text = dumped(None)
+    try:
+        as_read = len(text.splitlines()) == 1 and parse_yaml(text, LogSettings).path == entry["path"]
+    except UsageError:
+        as_read = False
+    return text if as_read else dumped('"')
+
+
+def _is_text(path: str) -> bool:
+    """Whether a path can be written as UTF-8: names that cannot are held as surrogates."""
+    try:
+        path.encode("utf-8")
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def _name(flown: tuple[Stream, Span] | None, files: Sequence[IngestedFile]) -> str:
+    """The time of take-off, or the folder."""
+    if flown is None:
+        folder = Path(files[0].path).resolve().parent.name
+        return re.sub(r"[^A-Za-z0-9_.-]", "_", folder).lstrip("_.-") or "flight"
+    return "flight_" + str(flown[1][0].astype("datetime64[m]")).replace("T", "_").replace(":", "")

@@ -1,0 +1,86 @@
+"""Checked flight settings with single keys changed, in dotted form: ``rt.max_depth``, ``link.rss.tower.yaw_deg``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from copy import deepcopy
+from typing import Any
+
+from pydantic import ValidationError
+
+from ..common.errors import UsageError
+from ..common.yamlfile import nearest
+from .settings import FlightFile
+
+Overrides = Mapping[str, Any]
+
+
+def overridden(settings: FlightFile, overrides: Overrides) -> FlightFile:
+    """Checked flight settings with dotted keys changed.
+
+    A channel that ``link.channels`` does not name starts as a copy of ``link.rss``; a tower that ``towers`` does not
+    name as a copy of ``tower``.
+
+    Raises
+    ------
+    UsageError
+        A key that flight files do not have (the nearest one is named), a value of the wrong kind.
+    """
+    if not overrides:
+        return settings
+    plain = settings.model_dump(mode="python")
+    # what copies are made of comes first, so that they have it, too
+    for key in sorted(overrides, key=lambda key: (key.startswith("link.channels."), ".towers." in key)):
+        _set(plain, key, overrides[key])
+    try:
+        return FlightFile.model_validate(plain)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        where = ".".join(str(part) for part in first["loc"])
+        key = next((k for k in overrides if k.startswith(where) or where.startswith(k)), where)
+        message = str(first["msg"]).removeprefix("Value error, ")
+        raise UsageError(f"the override {key!r}: found {first['input']!r} at {where}", expected=message) from None
+
+
+def _set(plain: dict[str, Any], key: str, value: Any) -> None:
+    here: Any = plain
+    parts = key.split(".")
+    for depth, part in enumerate(parts):
+        last = depth == len(parts) - 1
+        if isinstance(here, list):
+            if not part.isdigit() or int(part) >= len(here):
+                raise UsageError(f"the override {key!r} has no element {part!r}", expected=f"0 to {len(here) - 1}")
+            if last:
+                here[int(part)] = value
+            else:
+                here = here[int(part)]
+            continue
+        if not isinstance(here, dict):
+            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[:depth])!r}, which is a value")
+        if part not in here:
+            _add(plain, here, parts[:depth], part, key)
+        if last:
+            here[part] = value
+        elif isinstance(here[part], (dict, list)):
+            here = here[part]
+        else:
+            raise UsageError(f"the override {key!r} goes below {'.'.join(parts[: depth + 1])!r}, which is a value")
+
+
+def _add(plain: dict[str, Any], here: dict[str, Any], above: list[str], part: str, key: str) -> None:
+    """Make an entry of a mapping with free names; every other unknown key is a mistake."""
+    if above == ["link", "channels"]:
+        here[part] = deepcopy(plain["link"]["rss"])
+        return
+    if above[-1:] == ["towers"] and above[0] == "link":
+        parent: Any = plain
+        for name in above[:-1]:
+            parent = parent[name]
+        here[part] = deepcopy(parent["tower"])
+        return
+    near = nearest(part, here)
+    raise UsageError(
+        f"the override {key!r}: there is no key {part!r}" + (f" below {'.'.join(above)!r}" if above else ""),
+        expected="a key of flight.yaml in dotted form",
+        cause=f"did you mean {near!r}?" if near else None,
+    )

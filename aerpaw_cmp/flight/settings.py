@@ -1,0 +1,447 @@
+"""flight.yaml -> checked settings.
+
+Top-level keys of flight.yaml: ``flight site timezone logs link rt rss rank report``. Unknown and duplicate keys
+are errors that name the nearest valid key. Relative paths resolve against the file's folder, or ``--logs-root``.
+"""
+
+from __future__ import annotations
+
+from datetime import datetime
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+
+from ..common.errors import UsageError
+from ..common.units import FloatArray, wavelength_m
+from ..common.yamlfile import load_yaml
+from ..logs.readers import ReadOptions
+from ..logs.records import Kind
+from ..propagation.arrays import (
+    Array,
+    Link,
+    Pattern,
+    linear_array,
+    rotation_from_yaw_pitch_roll,
+    tower_comparison_array,
+    uav_comparison_array,
+)
+from ..site.antennas import Isotropic
+
+Positive = Annotated[float, Field(gt=0)]
+
+
+class Settings(BaseModel):
+    """Base of all settings: frozen, nothing unknown."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+
+class AntennaSettings(Settings):
+    """An element pattern: a named model, or a measured file."""
+
+    model: Literal["iso", "dipole", "tr38901", "file", "gain_grid"] = "iso"
+    file: str | None = None
+    variable: str | None = None
+    """Name of the grid inside a .mat file."""
+    polarised: bool = True
+    """Use both field components of a text pattern; false: its total gain on the element's slant."""
+    installed_db: list[float] = []
+    """Gain that mast or airframe adds: cosine and sine of 1, 2, ... times the azimuth [dB], fitted on other flights."""
+
+    @field_validator("installed_db")
+    @classmethod
+    def _pairs(cls, value: list[float]) -> list[float]:
+        if len(value) % 2:
+            raise ValueError("installed_db must hold pairs: cosine and sine of 1, 2, ... times the azimuth")
+        return value
+
+    @model_validator(mode="after")
+    def _file_where_needed(self) -> AntennaSettings:
+        if (self.file is None) != (self.model not in ("file", "gain_grid")):
+            raise ValueError("'file' belongs to model 'file' or 'gain_grid', and only there")
+        return self
+
+
+class ArraySettings(Settings):
+    """Elements of one device.
+
+    ``layout``: ``single``; ``linear`` (``elements`` at half a wavelength, along the device's left axis);
+    ``tower_comparison`` (60 mm / 1.68 m / 60 mm) and ``uav_comparison`` (2 x 2 at half a wavelength) of
+    arXiv 2502.10324; ``custom`` (``positions_m``). ``yaw_deg`` is counter-clockwise from east (tower) or from the
+    aircraft's nose (UAV with logged attitude); positive ``pitch_deg`` turns the boresight down.
+    """
+
+    layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
+    elements: Annotated[int, Field(ge=1, le=64)] = 4
+    positions_m: list[tuple[float, float, float]] | None = None
+    antenna: AntennaSettings = AntennaSettings()
+    antennas: list[AntennaSettings] | None = None
+    """One per element, in place of ``antenna``."""
+    slant_deg: float | list[float] = 0.0
+    yaw_deg: float = 0.0
+    pitch_deg: float = 0.0
+    roll_deg: float = 0.0
+
+    def positions(self, wavelength: float) -> FloatArray:
+        """Element positions (elements, 3) in the device frame [m]."""
+        if self.layout == "custom":
+            if not self.positions_m:
+                raise UsageError("layout 'custom' without 'positions_m'", expected="a list of [x, y, z] in metres")
+            return np.asarray(self.positions_m, dtype=np.float64)
+        if self.layout == "uav_comparison":
+            return uav_comparison_array(wavelength).positions_m
+        if self.layout == "tower_comparison":
+            return tower_comparison_array().positions_m
+        return linear_array(1 if self.layout == "single" else self.elements, wavelength / 2).positions_m
+
+    def build(self, wavelength: float, folder: Path) -> Array:
+        """The array, with patterns loaded from files relative to ``folder``."""
+        positions = self.positions(wavelength)
+        slant = np.atleast_1d(np.asarray(self.slant_deg, dtype=np.float64))
+        if len(slant) not in (1, len(positions)):
+            raise UsageError(
+                f"{len(slant)} slants for {len(positions)} elements", expected="one slant, or one per element"
+            )
+        antennas = self.antennas or [self.antenna]
+        if len(antennas) not in (1, len(positions)):
+            raise UsageError(
+                f"{len(antennas)} antennas for {len(positions)} elements", expected="one antenna, or one per element"
+            )
+        mount = rotation_from_yaw_pitch_roll(
+            np.radians(self.yaw_deg), np.radians(self.pitch_deg), np.radians(self.roll_deg)
+        )
+        return Array(
+            positions,
+            np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
+            tuple(load_pattern(a, folder) for a in antennas),
+            mount,
+        )
+
+
+def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
+    """The element pattern of the settings; files resolve against ``folder``."""
+    from ..site.installed import InstalledPattern
+
+    alone = _pattern_alone(settings, folder)
+    return InstalledPattern(alone, tuple(settings.installed_db)) if settings.installed_db else alone
+
+
+def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
+    from ..site import antennas
+
+    if settings.model == "dipole":
+        return antennas.HalfWaveDipole()
+    if settings.model == "tr38901":
+        return antennas.TR38901()
+    if settings.model == "file":
+        return antennas.read_pattern_text(folder / str(settings.file), polarised=settings.polarised)
+    if settings.model == "gain_grid":
+        if settings.variable is None:
+            raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
+        return antennas.read_gain_grid(folder / str(settings.file), settings.variable)
+    return Isotropic()
+
+
+class LinkSettings(Settings):
+    """One radio link: carrier, power, and the arrays at both ends."""
+
+    carrier_hz: Positive
+    transmit_power_dbm: float = 40.0
+    uav_transmits: bool = True
+    tower: ArraySettings = ArraySettings()
+    towers: dict[str, ArraySettings] = {}
+    uav: ArraySettings = ArraySettings()
+
+    def build(self, tower_names: list[str], folder: Path) -> Link:
+        """The link to the named towers."""
+        wavelength = wavelength_m(self.carrier_hz)
+        arrays = {name: self.towers.get(name, self.tower).build(wavelength, folder) for name in tower_names}
+        return Link(
+            carrier_hz=self.carrier_hz,
+            tower_arrays=arrays,
+            uav_array=self.uav.build(wavelength, folder),
+            transmit_power_dbm=self.transmit_power_dbm,
+            uav_transmits=self.uav_transmits,
+        )
+
+
+def _rss_link() -> LinkSettings:
+    return LinkSettings(carrier_hz=3.3e9)
+
+
+def _rank_link() -> LinkSettings:
+    return LinkSettings(
+        carrier_hz=3.4e9,
+        uav_transmits=False,
+        tower=ArraySettings(layout="tower_comparison", slant_deg=[45.0, -45.0, 45.0, -45.0], yaw_deg=45.0),
+        uav=ArraySettings(layout="uav_comparison", slant_deg=[45.0, -45.0, -45.0, 45.0], yaw_deg=315.0, roll_deg=90.0),
+    )
+
+
+class LinksSettings(Settings):
+    """The RSS link (single elements, 3.3 GHz) and the rank link (4 x 4, 3.4 GHz) of the paper as defaults."""
+
+    rss: LinkSettings = Field(default_factory=_rss_link)
+    channels: dict[str, LinkSettings] = {}
+    """RSS link of single channels that differ, by channel name (two antennas point differently)."""
+    rank: LinkSettings = Field(default_factory=_rank_link)
+
+
+class LogSettings(Settings):
+    """One log file and what it cannot say about itself."""
+
+    path: str
+    reader: str | None = None
+    node: str | None = None
+    channel: str | None = None
+    frequency_hz: Positive | None = None
+    timezone: str | None = None
+    clock: Literal["local", "utc", "local_as_utc"] | None = None
+    time_origin: str | None = None
+    ri_base: Literal["zero", "one"] | None = None
+    columns: dict[str, str] = {}
+    kind: Kind | None = None
+    unit: str | None = None
+    floor_db: float = -200.0
+    skip: list[str] = []
+    """Streams of the file to leave out, by name."""
+
+    def options(self, timezone: str | None) -> ReadOptions:
+        """The reader options, with the flight's zone as default."""
+        return ReadOptions(
+            timezone=self.timezone or timezone,
+            clock=self.clock,
+            time_origin=self.time_origin,
+            ri_base=self.ri_base,
+            columns=self.columns,
+            kind=self.kind,
+            node=self.node,
+            channel=self.channel,
+            frequency_hz=self.frequency_hz,
+            unit=self.unit,
+            floor_db=self.floor_db,
+        )
+
+
+class Waypoint(Settings):
+    """A planned point: ``height_m`` above the ground at the origin; the UAV waits there ``hold_s`` seconds."""
+
+    label: str = ""
+    east_m: float
+    north_m: float
+    height_m: float
+    hold_s: Annotated[float, Field(ge=0)] = 0.0
+
+
+class PlanSettings(Settings):
+    """What ``aerpaw-cmp simulate`` plants into the logs it writes; all of it goes into truth.json."""
+
+    start: datetime
+    """Local time in the flight's zone."""
+    waypoints: Annotated[list[Waypoint], Field(min_length=2)]
+    speed_mps: Positive = 8.0
+    climb_mps: Positive = 3.0
+    seed: int = 1
+    telemetry_interval_s: Positive = 1.0
+    rss_interval_s: Positive = 0.1
+    rank_interval_s: Positive = 0.5
+    offsets_db: dict[str, dict[str, float]] = {}
+    """By tower and channel: the offset that the comparison should recover (added to the measurement)."""
+    fading_db: Annotated[float, Field(ge=0)] = 0.0
+    """Standard deviation of log-normal fading."""
+    fading_correlation_s: Positive = 2.0
+    noise_floor_db: float | None = None
+    """Logged RSS does not fall below this (before the offset)."""
+    clock_shift_s: dict[str, float] = {}
+    """By tower: the radio clock shows this much more than the telemetry clock."""
+    clock_drift_s_per_s: dict[str, float] = {}
+    bad_lines: Annotated[int, Field(ge=0)] = 0
+    """Deliberately broken lines per log file."""
+    rank_k: Positive = 100.0
+    """Singular-value ratio of the simulated modem."""
+    rank_error_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of reports that are one layer off."""
+    no_csi_share: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Share of reports with RI 0 (no CSI)."""
+
+
+class FlightSettings(Settings):
+    """Name and kind of the flight."""
+
+    name: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+    title: str | None = None
+    synthetic: bool = False
+    notes: list[str] = []
+    plan: PlanSettings | None = None
+
+
+class SiteChoice(Settings):
+    """A site and what this flight changes of it."""
+
+    file: str = "lake_wheeler"
+    coordinates: str | None = None
+    """Which published coordinate set of the packaged site."""
+    antenna_height_m: Positive | None = None
+    """Antenna height of every tower, in place of the site's."""
+    without_buildings: bool = False
+
+
+class RtSettings(Settings):
+    """How the flight is replayed."""
+
+    engine: Literal["image", "sionna"] = "image"
+    max_depth: Annotated[int, Field(ge=0, le=3)] = 2
+    samples: Annotated[int, Field(ge=1, le=100_000_000)] = 1_000_000
+    batch: Annotated[int, Field(ge=1, le=100)] = 50
+    attitude: Literal["logged", "level", "ignored"] = "ignored"
+    """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
+    foliage: Literal["none", "attenuating", "opaque"] = "none"
+    crown_reflections: bool = True
+    """Opaque crowns reflect besides blocking."""
+    foliage_model: Literal["p833", "weissberger"] = "p833"
+    gamma_db_per_m: Positive | None = None
+    maximum_loss_db: Positive | None = None
+    """Replace P.833's specific attenuation and largest loss at the carrier."""
+    leaves: Literal["in", "out"] = "in"
+    reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
+    """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
+    paired_foliage: bool = False
+    """Also replay without trees and out of leaf, and report the differences."""
+    relevance_db: Positive | None = None
+    audit_links: Annotated[int, Field(ge=0)] = 200
+    maximum_gap_s: Positive = 3.0
+    """Telemetry gaps longer than this are not bridged."""
+    cache: bool = True
+
+
+class PortSettings(Settings):
+    """One USRP port of the table of reference powers, and what lies between it and the antenna."""
+
+    node: str
+    channel: str = "ch0"
+    gain_db: float
+    amplifier: bool = False
+    extra_gain_db: float = 0.0
+    """Amplifiers, minus cables, that the table does not contain."""
+
+
+class ReferencePowers(Settings):
+    """A link budget: the offset it predicts is shown beside the fitted one."""
+
+    file: str
+    """CSV ``Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz,...``."""
+    receivers: dict[str, PortSettings]
+    """By channel of the RSS logs."""
+    transmitter: PortSettings | None = None
+    """Without one, the link's transmit power is taken as true."""
+    transmit_amplitude_dbfs: float = 0.0
+    receiver_gain_removed: bool = True
+    """The sounder logs dB re full scale minus its gain setting."""
+
+
+class RssSettings(Settings):
+    """How RSS is compared."""
+
+    step_db: Positive = 0.1
+    span_db: tuple[float, float] = (-50.0, 50.0)
+    lag: Literal["off", "estimate", "apply"] | float = "estimate"
+    """Clock offset: estimated and shown, estimated and applied, or applied as given [s]."""
+    lag_window_s: Positive = 15.0
+    field: Literal["coherent", "power", "local_mean"] = "coherent"
+    """Which simulated RSS is compared."""
+    window_s: Annotated[float, Field(ge=0)] = 0.0
+    """Measurement averaged (in power) over this window; 0 leaves samples as they are."""
+    minimum_height_m: float | None = None
+    """Samples below this height are left out of the comparison, and counted."""
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    reference_powers: ReferencePowers | None = None
+
+    @model_validator(mode="after")
+    def _window_of_local_mean(self) -> RssSettings:
+        if self.field == "local_mean" and self.window_s <= 0:
+            raise ValueError("field: local_mean averages over window_s, which must be above 0")
+        return self
+
+    @field_validator("span_db")
+    @classmethod
+    def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
+        if not value[0] < value[1]:
+            raise ValueError("span_db must be [lowest, highest]")
+        return value
+
+
+class RankSettings(Settings):
+    """How rank is compared."""
+
+    tower: str = "LW1"
+    k: Annotated[list[Positive], Field(min_length=1)] = [10.0, 100.0, 1000.0]
+    minimum_height_m: float | None = None
+    """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
+    bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+
+    @field_validator("k")
+    @classmethod
+    def _above_one(cls, value: list[float]) -> list[float]:
+        if min(value) <= 1:
+            raise ValueError("K is a ratio sigma_1/sigma_i and must be greater than 1")
+        return value
+
+
+class ReportSettings(Settings):
+    """What the report shows."""
+
+    title: str | None = None
+    waypoints: list[Waypoint] = []
+    speed_table: bool = True
+
+
+class FlightFile(Settings):
+    """The whole flight.yaml."""
+
+    flight: FlightSettings
+    site: SiteChoice = SiteChoice()
+    timezone: str | None = None
+    logs: Annotated[list[LogSettings], Field(min_length=1)]
+    link: LinksSettings = LinksSettings()
+    rt: RtSettings = RtSettings()
+    rss: RssSettings = RssSettings()
+    rank: RankSettings = RankSettings()
+    report: ReportSettings = ReportSettings()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _short_forms(cls, data: Any) -> Any:
+        if isinstance(data, dict):
+            data = dict(data)
+            if isinstance(data.get("flight"), str):
+                data["flight"] = {"name": data["flight"]}
+            if isinstance(data.get("site"), str):
+                data["site"] = {"file": data["site"]}
+        return data
+
+    @field_validator("timezone")
+    @classmethod
+    def _known_zone(cls, value: str | None) -> str | None:
+        if value is not None:
+            from zoneinfo import ZoneInfo
+
+            try:
+                ZoneInfo(value)
+            except (KeyError, ValueError, OSError) as error:
+                raise ValueError(
+                    f"unknown time zone {value!r}; expected an IANA name such as America/New_York"
+                ) from error
+        return value
+
+
+def load_flight(path: str | Path) -> FlightFile:
+    """Read and check a flight.yaml.
+
+    Raises
+    ------
+    UsageError
+        Unknown or duplicate keys, wrong types, wrong ranges: with the line and the nearest valid key.
+    """
+    return load_yaml(Path(path), FlightFile)

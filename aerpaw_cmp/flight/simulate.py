@@ -1,0 +1,318 @@
+"""Forward-simulate a planned flight into logs of the real formats, with the truth beside them.
+
+``flight.plan`` of a flight.yaml says what flies and what is planted (offsets, fading, clock shifts, bad lines);
+its ``logs`` say which files to write and in which format (by ``reader``). The same file then drives
+``aerpaw-cmp report``, which must recover what was planted.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import UsageError
+from ..common.geodesy import SiteFrame
+from ..common.units import FloatArray, IntArray
+from ..compare.rank import channel_rank
+from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
+from ..propagation.arrays import Poses, rotation_from_aircraft
+from ..propagation.tracer import replay
+from ..site.site import Site
+from .settings import FlightFile, LogSettings, PlanSettings
+
+LOWEST_DBM = -400.0
+"""Below this the simulated level is no signal."""
+
+
+@dataclass(frozen=True, slots=True)
+class Trajectory:
+    """A planned trajectory as corner points in time.
+
+    ``time_s`` (corners,) from the start; ``position_m`` (corners, 3) east, north, height above the origin's
+    ground. Between corners the UAV moves in a straight line at constant speed.
+    """
+
+    time_s: FloatArray
+    position_m: FloatArray
+
+    @property
+    def duration_s(self) -> float:
+        """From the first to the last corner."""
+        return float(self.time_s[-1])
+
+    def position_at(self, time_s: FloatArray) -> FloatArray:
+        """Positions (n, 3) [m] at times [s]."""
+        return np.stack([np.interp(time_s, self.time_s, self.position_m[:, i]) for i in range(3)], axis=-1)
+
+    def velocity_at(self, time_s: FloatArray) -> FloatArray:
+        """Velocities (n, 3) [m/s] east, north, up; zero while waiting."""
+        leg = np.clip(np.searchsorted(self.time_s, time_s, side="right") - 1, 0, len(self.time_s) - 2)
+        return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
+
+
+def plan_trajectory(plan: PlanSettings) -> Trajectory:
+    """Corner times from speeds, climb rates and waiting times.
+
+    Examples
+    --------
+    >>> from datetime import datetime
+    >>> ends = [{"east_m": 0, "north_m": 0, "height_m": 10}, {"east_m": 80, "north_m": 0, "height_m": 10}]
+    >>> plan_trajectory(PlanSettings(start=datetime(2025, 6, 1), waypoints=ends, speed_mps=8)).duration_s
+    10.0
+    """
+    times, positions = [0.0], []
+    points = plan.waypoints
+    positions.append((points[0].east_m, points[0].north_m, points[0].height_m))
+    for index, point in enumerate(points):
+        here = (point.east_m, point.north_m, point.height_m)
+        if index:
+            last = positions[-1]
+            horizontal = np.hypot(here[0] - last[0], here[1] - last[1])
+            duration = max(horizontal / plan.speed_mps, abs(here[2] - last[2]) / plan.climb_mps)
+            if duration > 0:
+                times.append(times[-1] + float(duration))
+                positions.append(here)
+        if point.hold_s > 0:
+            times.append(times[-1] + point.hold_s)
+            positions.append(here)
+    if len(times) < 2:
+        raise UsageError("the plan does not move and does not wait", expected="waypoints that differ, or hold_s")
+    return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
+
+
+def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Roll, pitch, yaw [deg] of a multirotor on the trajectory: nose along the course, leaning into the motion.
+
+    The lean is 0.6 degrees per m/s of ground speed; while the UAV waits it keeps its last heading.
+    """
+    velocity = trajectory.velocity_at(time_s)
+    speed = np.hypot(velocity[:, 0], velocity[:, 1])
+    yaw = pd.Series(np.where(speed > 0.1, np.degrees(np.arctan2(velocity[:, 0], velocity[:, 1])), np.nan))
+    return np.zeros(len(time_s)), -0.6 * speed, yaw.ffill().bfill().fillna(0.0).to_numpy()
+
+
+def telemetry_frame(
+    trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
+) -> pd.DataFrame:
+    """Telemetry records of the trajectory; altitude counts from the first position."""
+    time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
+    position = trajectory.position_at(time_s)
+    velocity = trajectory.velocity_at(time_s)
+    roll, pitch, yaw = plan_attitude(trajectory, time_s)
+    latitude, longitude = frame.to_geographic(position[:, 0], position[:, 1])
+    records: pd.DataFrame = pd.DataFrame(
+        {
+            "time": times_after(start_utc, time_s),
+            "latitude_deg": latitude,
+            "longitude_deg": longitude,
+            "altitude_m": position[:, 2],
+            "roll_deg": roll,
+            "pitch_deg": pitch,
+            "yaw_deg": yaw,
+            "velocity_north_mps": velocity[:, 1],
+            "velocity_east_mps": velocity[:, 0],
+            "velocity_down_mps": -velocity[:, 2],
+            "fix": 4,
+            "satellites": 18,
+        }
+    )
+    return records
+
+
+def times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
+    """UTC times, naive, rounded to the microsecond that the log formats hold."""
+    stamps: pd.Series = pd.Series(
+        start_utc + pd.to_timedelta(np.round(np.asarray(seconds) * 1e6).astype(np.int64), unit="us")
+    )
+    return stamps
+
+
+def correlated_noise(
+    generator: np.random.Generator, count: int, standard_deviation: float, step_s: float, correlation_s: float
+) -> FloatArray:
+    """First-order autoregressive Gaussian noise with the stated standard deviation and correlation time."""
+    from scipy.signal import lfilter
+
+    if count == 0 or standard_deviation == 0:
+        return np.zeros(count)
+    keep = np.exp(-step_s / correlation_s)
+    white = generator.standard_normal(count) * np.sqrt(1 - keep**2)
+    white[0] /= np.sqrt(1 - keep**2)
+    return np.asarray(lfilter([1.0], [1.0, -keep], white) * standard_deviation)
+
+
+class FlightSimulator:
+    """Writes the logs of one planned flight.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        With ``flight.plan``.
+    site : Site
+        The site of the flight.
+    folder : Path
+        Where antenna files of the link resolve.
+
+    Attributes
+    ----------
+    truth_ : dict
+        Everything that was planted, after :meth:`run`.
+    """
+
+    def __init__(self, settings: FlightFile, site: Site, folder: Path) -> None:
+        self.settings = settings
+        self.site = site
+        self.folder = folder
+
+    def run(self, out: Path, *, progress: Callable[[str], None] = lambda _text: None) -> list[Path]:
+        """Write every log of the flight file and truth.json below ``out``; gives the paths written.
+
+        Raises
+        ------
+        UsageError
+            Without a plan or a time zone, for readers that have no writer, for towers the site does not have.
+        """
+        plan = self.settings.flight.plan
+        if plan is None:
+            raise UsageError("the flight file has no plan", expected="flight.plan with start and waypoints")
+        if self.settings.timezone is None:
+            raise UsageError("the flight file names no time zone", expected="timezone: America/New_York, say")
+        self.plan = plan
+        self.generator = np.random.default_rng(plan.seed)
+        self.trajectory = plan_trajectory(plan)
+        start = pd.Timestamp(plan.start.replace(tzinfo=None)).tz_localize(self.settings.timezone)
+        self.start_utc = start.tz_convert("UTC").tz_localize(None)
+        self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
+        out.mkdir(parents=True, exist_ok=True)
+        written = []
+        for log in self.settings.logs:
+            progress(log.path)
+            data, damage = self._with_bad_lines(self._log_bytes(log))
+            path = out / log.path
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_bytes(data)
+            self.truth_.setdefault("bad_lines", {})[log.path] = damage
+            written.append(path)
+        self.truth_["plan"] = plan.model_dump(mode="json")
+        path = out / "truth.json"
+        path.write_text(json.dumps(self.truth_, indent=1) + "\n", encoding="utf-8")
+        return [*written, path]
+
+    def _log_bytes(self, log: LogSettings) -> bytes:
+        writers = {
+            "vehicle_out": self._telemetry_log,
+            "sounder_log": self._rss_log,
+            "quectel_ri": self._rank_log,
+        }
+        if log.reader not in writers:
+            raise UsageError(
+                f"no writer for log {log.path!r} with reader {log.reader!r}", expected="one of " + ", ".join(writers)
+            )
+        return writers[log.reader](log)
+
+    def _telemetry_log(self, log: LogSettings) -> bytes:
+        frame = telemetry_frame(self.trajectory, self.start_utc, self.plan.telemetry_interval_s, self.site.frame)
+        return format_vehicle_out(frame, str(log.timezone or self.settings.timezone))
+
+    def _poses(self, time_s: FloatArray) -> Poses:
+        position = self.trajectory.position_at(time_s)
+        if self.settings.rt.attitude == "ignored":
+            return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
+        roll, pitch, yaw = plan_attitude(self.trajectory, time_s)
+        if self.settings.rt.attitude == "level":
+            roll, pitch = np.zeros_like(roll), np.zeros_like(pitch)
+        return Poses(position, rotation_from_aircraft(roll, pitch, yaw))
+
+    def _rss_log(self, log: LogSettings) -> bytes:
+        if log.node is None or log.channel is None:
+            raise UsageError(f"log {log.path!r} does not say whose it is", expected="'node' and 'channel'")
+        if log.node not in self.site.towers:
+            raise UsageError(f"the site has no tower {log.node!r}", expected="one of " + ", ".join(self.site.towers))
+        plan = self.plan
+        time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
+        links = self.settings.link
+        link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
+        result = replay(
+            self.site, link, self._poses(time_s), engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth
+        )
+        offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
+        level = result.rss_dbm[:, 0] - offset
+        level = level + correlated_noise(
+            self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
+        )
+        if plan.noise_floor_db is not None:
+            level = np.fmax(level, plan.noise_floor_db)
+        out_of_coverage = ~np.isfinite(level) | (level < LOWEST_DBM)
+        shift = plan.clock_shift_s.get(log.node, 0.0) + plan.clock_drift_s_per_s.get(log.node, 0.0) * time_s
+        self.truth_["rss"].setdefault(log.node, {})[log.channel] = {
+            "offset_db": offset,
+            "fading_db": plan.fading_db,
+            "clock_shift_s": plan.clock_shift_s.get(log.node, 0.0),
+            "clock_drift_s_per_s": plan.clock_drift_s_per_s.get(log.node, 0.0),
+            "samples": len(level),
+            "out_of_coverage": int(out_of_coverage.sum()),
+        }
+        return format_power_log(
+            times_after(self.start_utc, time_s + shift),
+            np.where(out_of_coverage, np.nan, level),
+            str(log.timezone or self.settings.timezone),
+        )
+
+    def _rank_log(self, log: LogSettings) -> bytes:
+        plan, tower = self.plan, log.node or self.settings.rank.tower
+        time_s = np.arange(0.0, self.trajectory.duration_s, plan.rank_interval_s)
+        link = self.settings.link.rank.build([tower], self.folder)
+        poses = self._poses(time_s)
+        result = replay(self.site, link, poses, engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth)
+        truth = channel_rank(result.h[:, 0], plan.rank_k)
+        reported = self._reported(truth, min(result.h.shape[-2:]))
+        latitude, longitude = self.site.frame.to_geographic(poses.position_m[:, 0], poses.position_m[:, 1])
+        self.truth_["rank"][tower] = {
+            "k": plan.rank_k,
+            "error_share": plan.rank_error_share,
+            "no_csi_share": plan.no_csi_share,
+            "samples": len(truth),
+            "histogram": {str(r): int((truth == r).sum()) for r in range(5)},
+        }
+        records = pd.DataFrame(
+            {
+                "time": times_after(self.start_utc, time_s),
+                "rank": reported,
+                "latitude_deg": latitude,
+                "longitude_deg": longitude,
+                "altitude_m": poses.position_m[:, 2],
+            }
+        )
+        return format_ri_csv(records, str(log.timezone or self.settings.timezone))
+
+    def _reported(self, rank: IntArray, layers: int) -> IntArray:
+        """What the modem prints: one layer off now and then, 0 without CSI."""
+        generator, plan = self.generator, self.plan
+        off = generator.random(len(rank)) < plan.rank_error_share
+        step = np.where(generator.random(len(rank)) < 0.5, -1, 1)
+        reported = np.where(off, np.clip(rank + step, 1, layers), rank)
+        return np.where(generator.random(len(rank)) < plan.no_csi_share, 0, reported)
+
+    def _with_bad_lines(self, data: bytes) -> tuple[bytes, list[str]]:
+        """Insert ``plan.bad_lines`` broken lines at seeded places (never first, so that sniffing still works)."""
+        count = self.plan.bad_lines
+        lines = data.splitlines(keepends=True)
+        if count == 0 or len(lines) < 20:
+            return data, []
+        end = b"\r\n" if lines[0].endswith(b"\r\n") else b"\n"
+        places = sorted(
+            self.generator.choice(np.arange(10, len(lines)), size=count, replace=False).tolist(), reverse=True
+        )
+        damage = []
+        for number, place in enumerate(places):
+            torn = lines[place].rstrip()[: max(4, len(lines[place]) // 3)]
+            text = torn if number % 2 == 0 else b"Killed by signal 15 " + torn[:8]
+            lines.insert(place, text + end)
+            damage.append(text.decode("utf-8", errors="replace"))
+        return b"".join(lines), damage[::-1]

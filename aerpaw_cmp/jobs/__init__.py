@@ -1,0 +1,1 @@
+"""Each job as named stages: report, campaign, map, bench."""

@@ -1,0 +1,592 @@
+"""Many flights and settings: run each, pool the offsets, fit on some flights and score on the others.
+
+A campaign.yaml names flight files and, optionally, settings: labels with overrides of flight keys in dotted form
+(``rt.max_depth: 1``). Every setting runs on every flight. A flight that cannot be read is a row with its message.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Executor, ProcessPoolExecutor
+from contextlib import nullcontext
+from dataclasses import dataclass
+from datetime import datetime, timezone
+from functools import lru_cache
+from itertools import combinations
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ..common.errors import AerpawCmpError, UsageError
+from ..common.units import FloatArray
+from ..common.yamlfile import load_yaml, nearest
+from ..compare.offset import Pooling, pooled_offsets
+from ..compare.statistics import correlation, repeatability
+from ..flight.data import FlightData, gather, read_logs
+from ..flight.overrides import Overrides, overridden
+from ..flight.settings import FlightFile, Positive, Settings, load_flight
+from ..report.campaign_data import (
+    CampaignData,
+    Failure,
+    FlownTrack,
+    PooledOffset,
+    RankRow,
+    RankTransfer,
+    Repeat,
+    RssRow,
+    place_means,
+)
+from .campaign_fit import fit_all
+from .compare_flight import compare_rank_series, compare_rss_series, versions
+from .replay import estimate_clocks, replay_rank, replay_rss
+
+Progress = Callable[[str], None]
+Stage = Callable[[str], Any]
+
+AS_WRITTEN = "as written"
+"""Label of the only setting of a campaign that names none."""
+
+
+class HeldOutSettings(Settings):
+    """Parameters that are fitted on some flights and scored on all."""
+
+    fit: Annotated[dict[str, list[float]], Field(min_length=1)]
+    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``."""
+    fit_on: list[str] | None = None
+    """Names of the flights to fit on; without it each flight is left out once."""
+    setting: str | None = None
+    """Label of the setting that the fit starts from; by default the first."""
+    samples: Annotated[int, Field(ge=50)] = 1000
+    """Evenly spread samples per series that the search looks at; all of them are scored."""
+    refine: bool = False
+    """Search between the values, too."""
+
+
+class RepeatSettings(Settings):
+    """When two samples count as taken at the same place, and how residuals are gathered by place."""
+
+    radius_m: Positive = 3.0
+    heading_within_deg: Positive | None = 20.0
+    """Headings of a pair agree within this; null: any heading."""
+    cell_m: Positive = 20.0
+
+
+class CampaignFile(Settings):
+    """The whole campaign.yaml."""
+
+    campaign: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\-]*$")]
+    title: str | None = None
+    flights: Annotated[list[str], Field(min_length=1)]
+    settings: dict[str, dict[str, Any]] = Field(default_factory=dict)
+    calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
+    held_out: HeldOutSettings | None = None
+    repeatability: RepeatSettings = RepeatSettings()
+
+
+def load_campaign(path: Path) -> CampaignFile:
+    """Read and check a campaign.yaml.
+
+    Raises
+    ------
+    UsageError
+        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`; also an override that names no flight key, and values to try that
+        do not increase.
+    """
+    campaign = load_yaml(path, CampaignFile)
+    fit = campaign.held_out
+    for key, values in (fit.fit if fit else {}).items():
+        if not values or np.any(np.diff(values) <= 0):
+            raise UsageError(f"held_out.fit.{key}: {values}", expected="increasing values", path=path)
+        if key.split(".")[0] not in ("link", "rt", "site") and key != "rss.lag":
+            raise UsageError(f"held_out.fit.{key}", expected="a key below link, rt or site, or rss.lag", path=path)
+    labels = list(campaign.settings) or [AS_WRITTEN]
+    if fit and fit.setting is not None and fit.setting not in labels:
+        near = nearest(fit.setting, labels)
+        cause = f"did you mean {near!r}?" if near else None
+        raise UsageError(f"held_out.setting {fit.setting!r}", expected="one of settings", cause=cause, path=path)
+    return campaign
+
+
+# --- one flight under one setting ----------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight file under one setting."""
+
+    path: Path
+    flight: str
+    setting: str
+    overrides: Overrides
+    logs_root: Path | None
+    reference: bool = True
+    """Overlays are drawn for this setting: places and times are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Rows of one task, or why there are none."""
+
+    rss: tuple[RssRow, ...] = ()
+    rank: tuple[RankRow, ...] = ()
+    failure: Failure | None = None
+    track: FlownTrack | None = None
+
+
+@lru_cache(maxsize=2)
+def _logs(path: Path, logs: str, zone: str | None, logs_root: Path | None, settings: _ByText) -> Any:
+    """The logs of a flight: settings after settings reads them once."""
+    del logs, zone  # they make the key
+    return read_logs(settings.value, path.parent, logs_root)
+
+
+@dataclass(frozen=True, slots=True)
+class _ByText:
+    """Carries a value through a cache whose key is made of the other arguments."""
+
+    value: FlightFile
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, _ByText)
+
+    def __hash__(self) -> int:
+        return 0
+
+
+def flight_data(task: Task) -> FlightData:
+    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
+    settings = overridden(load_flight(task.path), task.overrides)
+    text = "\n".join(log.model_dump_json() for log in settings.logs)
+    files = _logs(task.path, text, settings.timezone, task.logs_root, _ByText(settings))
+    return gather(settings, task.path.parent, files, task.logs_root)
+
+
+def run_task(task: Task) -> Outcome:
+    """Replay and compare one flight under one setting; whatever goes wrong becomes a message.
+
+    This runs in worker processes: it takes and gives plain data.
+    """
+
+    def silent(_text: str) -> None:
+        pass
+
+    try:
+        data = flight_data(task)
+        clocks = estimate_clocks(data, silent)
+        pairs = zip(data.rss, replay_rss(data, silent, clocks), strict=True)
+        rss = [compare_rss_series(data, s, r).panel for s, r in pairs]
+        ranked = zip(data.rank, replay_rank(data, silent), strict=True)
+        rank = [compare_rank_series(data, s, r).panel for s, r in ranked]
+    except AerpawCmpError as error:
+        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=str(error)))
+    except Exception as error:  # one flight's fault must not cost the others their numbers
+        text = f"a fault of the program itself: {type(error).__name__}: {error}"
+        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
+    return Outcome(
+        tuple(_rss_row(task, data, panel) for panel in rss),
+        tuple(row for panel in rank for row in _rank_rows(task, panel)),
+        track=_flown(task, [*rss, *rank][0]),
+    )
+
+
+def _flown(task: Task, panel: Any) -> FlownTrack:
+    return FlownTrack(flight=task.flight, time_s=_elapsed_s(panel.time), position_m=_positions_m(panel))
+
+
+def _elapsed_s(time: Any) -> FloatArray:
+    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def _positions_m(panel: Any) -> FloatArray:
+    return np.stack([panel.east_m, panel.north_m, panel.up_m], axis=-1)
+
+
+def _rss_row(task: Task, data: FlightData, panel: Any) -> RssRow:
+    names = (
+        "tower", "channel", "unit", "offset_db", "rmse_db", "correlation", "n", "n_out_of_coverage", "at_search_edge",
+        "rmse_ci95_db", "offset_ci95_db", "correlation_ci95", "n_effective", "lag_s", "lag_verdict", "fitted",
+        "measured_db", "simulated_dbm",
+    )  # fmt: skip
+    return RssRow(
+        flight=task.flight,
+        setting=task.setting,
+        **{name: getattr(panel, name) for name in names},
+        baselines={b.name: b.rmse_db for b in panel.baselines},
+        step_db=data.settings.rss.step_db,
+        span_db=data.settings.rss.span_db,
+        time_s=_elapsed_s(panel.time) if task.reference else np.zeros(0),
+        position_m=_positions_m(panel) if task.reference else np.zeros((0, 3)),
+        distance_m=panel.geometry["distance_m"] if task.reference else np.zeros(0),
+        heading_deg=panel.geometry.get("heading_deg") if task.reference else None,
+        within=panel.extra.get("repeatability", {}),
+    )
+
+
+def _rank_rows(task: Task, panel: Any) -> list[RankRow]:
+    return [
+        RankRow(
+            flight=task.flight,
+            setting=task.setting,
+            tower=panel.tower,
+            n=int(np.isfinite(panel.measured).sum()),
+            best_k=panel.best_k,
+            best_k_ci95=panel.best_k_ci95,
+            **{
+                name: getattr(at, name)
+                for name in (
+                    "k", "n_out_of_coverage", "agreement", "agreement_ci95", "kappa", "total_variation",
+                    "total_variation_ci95", "wasserstein",
+                )
+            },
+        )
+        for at in panel.simulated
+    ]  # fmt: skip
+
+
+def cluster_executor(address: str) -> Executor:
+    """Workers of a running Dask scheduler, which must see the same files under the same paths.
+
+    Raises
+    ------
+    UsageError
+        Without the package ``distributed``, or if no scheduler answers.
+    """
+    try:
+        from distributed import Client
+    except ImportError:
+        raise UsageError(
+            f"--cluster {address!r} needs the package 'distributed'", expected="pip install distributed"
+        ) from None
+    try:
+        executor: Executor = Client(address, timeout="10s").get_executor()
+    except (OSError, ValueError) as error:
+        raise UsageError(f"--cluster {address!r}: no scheduler answers ({error})") from error
+    return executor
+
+
+def run_tasks(tasks: Sequence[Task], workers: int, cluster: str | None, progress: Progress) -> list[Outcome]:
+    """All tasks in order: here, in a pool of processes, or on a cluster."""
+    if cluster is None and workers <= 1:
+        out = []
+        for task in tasks:
+            progress(f"{task.flight}: {task.setting}")
+            out.append(run_task(task))
+        return out
+    pool: Executor
+    if cluster is not None:
+        pool = cluster_executor(cluster)
+    else:
+        # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
+        pool = ProcessPoolExecutor(max_workers=min(workers, len(tasks)), mp_context=get_context("spawn"))
+    with pool:
+        futures = [pool.submit(run_task, task) for task in tasks]
+        outcomes = []
+        for task, future in zip(tasks, futures, strict=True):
+            error = future.exception()
+            if error is None:
+                outcomes.append(future.result())
+            else:
+                text = f"its worker process ended: {error or type(error).__name__}"
+                outcomes.append(Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text)))
+            progress(f"{task.flight}: {task.setting}")
+        return outcomes
+
+
+# --- over all flights -----------------------------------------------------------------------------------------------
+
+
+def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
+    """Shared offsets of each setting, entered into the rows and listed by group."""
+    done: list[RssRow] = []
+    groups: list[PooledOffset] = []
+    for setting in dict.fromkeys(row.setting for row in rows):
+        members = [row for row in rows if row.setting == setting]
+        span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
+        fits = pooled_offsets(
+            {row.key: (row.measured_db, row.simulated_dbm) for row in members},
+            per,
+            step_db=min(r.step_db for r in members),
+            span_db=span,
+        )
+        pooled = [
+            dataclasses.replace(
+                row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db
+            )
+            for row in members
+        ]  # fmt: skip
+        done += pooled
+        by_group: dict[str, list[RssRow]] = {}
+        for row in pooled:
+            by_group.setdefault(_group(row, per), []).append(row)
+        groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
+    return done, groups
+
+
+def _group(row: RssRow, per: Pooling) -> str:
+    names = {
+        "link": f"{row.flight} {row.link}",
+        "tower": row.tower,
+        "channel": row.channel,
+        "flight": row.flight,
+        "all": "all",
+    }
+    return names[per]
+
+
+def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
+    own = np.array([row.offset_db for row in rows])
+    own = own[np.isfinite(own)]
+    nan = float("nan")
+    return PooledOffset(
+        setting=setting,
+        group=name,
+        members=tuple(f"{row.flight} {row.link}" for row in rows),
+        offset_db=rows[0].pooled_offset_db,
+        spread_db=float(own.std(ddof=1)) if len(own) > 1 else nan,
+        range_db=(float(own.min()), float(own.max())) if len(own) else (nan, nan),
+        own_rmse_db=_mean(row.rmse_db for row in rows),
+        pooled_rmse_db=_mean(row.pooled_rmse_db for row in rows),
+        at_search_edge=any(fits[row.key].at_edge for row in rows),
+        units=tuple(dict.fromkeys(row.unit for row in rows)),
+    )
+
+
+def _mean(values: Any) -> float:
+    known = [v for v in values if np.isfinite(v)]
+    return float(np.mean(known)) if known else float("nan")
+
+
+def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
+    """Every pair of flights that share a tower and channel."""
+    out = []
+    for first, second in combinations(rows, 2):
+        if (first.tower, first.channel) != (second.tower, second.channel) or first.flight == second.flight:
+            continue
+        out.append(_repeat(first, second, settings))
+    return out
+
+
+def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
+    within = settings.heading_within_deg
+    headings: dict[str, Any] = {}
+    if within is not None and first.heading_deg is not None and second.heading_deg is not None:
+        headings = {
+            "heading_deg": first.heading_deg,
+            "other_heading_deg": second.heading_deg,
+            "heading_within_deg": within,
+        }
+
+    def between(one: FloatArray, two: FloatArray) -> Any:
+        return repeatability(
+            first.position_m, one, second.position_m, two, radius_m=settings.radius_m, **headings
+        )  # fmt: skip
+
+    level = between(first.measured_db, second.measured_db)
+    residual = between(first.residual_db, second.residual_db)
+    here, there = (place_means(row, settings.cell_m) for row in (first, second))
+    both = sorted(set(here) & set(there))
+    pairs = np.array([(*here[c], *there[c]) for c in both]).reshape(-1, 4)
+    return Repeat(
+        tower=first.tower,
+        channel=first.channel,
+        first=first.flight,
+        second=second.flight,
+        n=level.n,
+        share=level.n / max(int(np.isfinite(first.measured_db).sum()), 1),
+        rmse_db=level.rmse_db,
+        rmse_ci95_db=level.interval_db,
+        offset_db=level.offset_db,
+        single_db=level.rmse_db / 2.0**0.5,
+        residual_rmse_db=residual.rmse_db,
+        place_rmse_db=float((pairs[:, 2] - pairs[:, 0]).std()) if len(both) else float("nan"),
+        place_correlation=correlation(pairs[:, 0], pairs[:, 2]),
+        cells=len(both),
+        height_difference_m=float(np.median(pairs[:, 3] - pairs[:, 1])) if len(both) else float("nan"),
+    )
+
+
+def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
+    """K chosen on the other flights, for every flight that has others with the same tower and K."""
+    out = []
+    for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
+        by: dict[str, dict[float, RankRow]] = {}
+        for row in rows:
+            if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
+                by.setdefault(row.flight, {})[row.k] = row
+        for flight, own in by.items():
+            others = [at for name, at in by.items() if name != flight]
+            common = [k for k in own if others and all(k in at for at in others)]
+            if not common:
+                continue
+            chosen = min(common, key=lambda k: _mean(at[k].total_variation for at in others))
+            best = min(own, key=lambda k: own[k].total_variation)
+            out.append(
+                RankTransfer(
+                    setting=setting,
+                    flight=flight,
+                    tower=tower,
+                    chosen_on=tuple(name for name in by if name != flight),
+                    k=chosen,
+                    total_variation=own[chosen].total_variation,
+                    kappa=own[chosen].kappa,
+                    own_k=best,
+                    own_total_variation=own[best].total_variation,
+                )
+            )
+    return out
+
+
+def run(
+    campaign: CampaignFile,
+    folder: Path,
+    *,
+    logs_root: Path | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
+    stage: Stage = lambda _name: nullcontext(),
+    progress: Progress = lambda _text: None,
+) -> CampaignData:
+    """All flights under all settings, and what can be said only of several flights.
+
+    Parameters
+    ----------
+    campaign : CampaignFile
+    folder : Path
+        Against which the paths of flight files resolve.
+    logs_root : Path, optional
+        Against which the paths of logs resolve, in place of each flight file's folder.
+    workers : int
+        Processes.
+    cluster : str, optional
+        Address of a Dask scheduler, in place of processes here.
+    stage, progress : callable
+        A context manager per named stage; lines of progress.
+
+    Raises
+    ------
+    UsageError
+        Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
+    """
+    settings = campaign.settings or {AS_WRITTEN: {}}
+    files, failures = _flight_files(campaign, folder, settings)
+    tasks = [
+        Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
+        for name, (path, _) in files.items()
+        for label, overrides in settings.items()
+    ]
+    _check_names(campaign, files, failures)
+    with stage("flights"):
+        outcomes = run_tasks(tasks, workers, cluster, progress) if tasks else []
+    failures += [o.failure for o in outcomes if o.failure is not None]
+    with stage("pool"):
+        rows, pooled = pool_offsets([row for o in outcomes for row in o.rss], campaign.calibration)
+        reference = [row for row in rows if row.setting == next(iter(settings))]
+        found = repeats(reference, campaign.repeatability)
+    folds: list[Any] = []
+    trouble = ""
+    if campaign.held_out is not None:
+        with stage("held-out"):
+            try:
+                folds = _held_out(campaign.held_out, tasks, rows, progress)
+            except AerpawCmpError as error:
+                trouble = str(error)
+    good = [t for t, o in zip(tasks, outcomes, strict=True) if o.failure is None]
+    rank = tuple(row for o in outcomes for row in o.rank)
+    tracks = {o.track.flight: o.track for o in reversed(outcomes) if o.track is not None}
+    return CampaignData(
+        name=campaign.campaign,
+        title=campaign.title or campaign.campaign,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        versions=versions(),
+        calibration=campaign.calibration,
+        flights=tuple(dict.fromkeys([*files, *(f.flight for f in failures)])),
+        settings=settings,
+        rss=tuple(rows),
+        rank=rank,
+        rank_transfers=tuple(transfer_ranks(rank)),
+        tracks=tuple(tracks[name] for name in files if name in tracks),
+        failures=tuple(failures),
+        pooled=tuple(pooled),
+        repeats=tuple(found),
+        held_out=tuple(folds),
+        held_out_failure=trouble,
+        radius_m=campaign.repeatability.radius_m,
+        heading_within_deg=campaign.repeatability.heading_within_deg,
+        cell_m=campaign.repeatability.cell_m,
+        site=flight_data(good[0]).site if good else None,
+        synthetic=tuple(name for name, (_, f) in files.items() if f.flight.synthetic),
+        workers=workers,
+    )
+
+
+def _held_out(
+    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], progress: Progress
+) -> list[Any]:
+    """Fit under one setting on the flights that gave RSS under it."""
+    label = settings.setting or tasks[0].setting if tasks else ""
+    heard = {row.flight for row in rows if row.setting == label}
+    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in heard}
+    return fit_all(
+        flights,
+        settings.fit,
+        settings.fit_on,
+        setting=label,
+        samples=settings.samples,
+        refine=settings.refine,
+        progress=progress,
+    )
+
+
+def _flight_files(
+    campaign: CampaignFile, folder: Path, settings: Mapping[str, Overrides]
+) -> tuple[dict[str, tuple[Path, FlightFile]], list[Failure]]:
+    """Flight files that can be read, by name, every override tried on them; and those that cannot."""
+    files: dict[str, tuple[Path, FlightFile]] = {}
+    failures = []
+    for entry in campaign.flights:
+        path = folder / entry
+        try:
+            flight = load_flight(path)
+        except UsageError as error:
+            failures.append(Failure(flight=Path(entry).stem, setting="every setting", message=str(error)))
+            continue
+        name = flight.flight.name
+        if name in files:
+            raise UsageError(f"two flights are named {name!r}: {files[name][0]} and {path}", expected="one name each")
+        files[name] = (path, flight)
+        for label, overrides in settings.items():
+            try:
+                overridden(flight, overrides)
+            except UsageError as error:
+                raise UsageError(
+                    f"settings.{label}: {error.found}", expected=error.expected, cause=error.cause
+                ) from None
+    return files, failures
+
+
+def _check_names(
+    campaign: CampaignFile, files: Mapping[str, tuple[Path, FlightFile]], failures: Sequence[Failure]
+) -> None:
+    if campaign.held_out is None:
+        return
+    known = [*files, *(f.flight for f in failures)]
+    for name in campaign.held_out.fit_on or []:
+        if name not in known:
+            near = nearest(name, known)
+            raise UsageError(
+                f"held_out.fit_on names {name!r}",
+                expected="flights of the campaign: " + ", ".join(known),
+                cause=f"did you mean {near!r}?" if near else None,
+            )
+    for path, flight in files.values():
+        for key, values in campaign.held_out.fit.items():
+            try:
+                overridden(flight, {key: values[0]})
+            except UsageError as error:
+                raise UsageError(
+                    f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause
+                ) from None

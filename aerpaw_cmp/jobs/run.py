@@ -1,0 +1,503 @@
+"""Each job as named stages on one page."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..common.errors import UsageError
+
+if TYPE_CHECKING:
+    from ..flight.data import FlightData
+
+Progress = Callable[[str], None]
+
+
+def _silent(_text: str) -> None:
+    """No progress."""
+
+
+@dataclass(slots=True)
+class Stages:
+    """Seconds of each named stage, in order."""
+
+    progress: Progress = _silent
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time one stage."""
+        self.progress(name)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def run_ingest(
+    paths: list[Path], *, out: Path | None = None, draft: Path | None = None, reader: str | None = None, **options: Any
+) -> dict[str, Any]:
+    """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3.
+
+    With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
+    """
+    from ..logs.flight_file import write_flight
+    from ..logs.ingest import ingest, summary
+    from ..logs.readers import ReadOptions
+
+    if draft is not None:
+        from ..flight.draft import check_target, write_draft
+
+        check_target(draft)
+    files = ingest(paths, options=ReadOptions(**options), reader=reader)
+    if out is not None:
+        write_flight(out, files)
+    account = summary(files)
+    if draft is not None:
+        told = {key: options.get(key) for key in ("timezone", "time_origin")}
+        account["draft"] = write_draft(files, draft, **told)
+    return account
+
+
+def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = _silent) -> list[Path]:
+    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``."""
+    from ..flight.data import choose_site
+    from ..flight.settings import load_flight
+    from ..flight.simulate import FlightSimulator
+
+    settings = load_flight(flight)
+    site = choose_site(settings.site, flight.parent)
+    return FlightSimulator(settings, site, flight.parent).run(out or flight.parent, progress=progress)
+
+
+@dataclass(frozen=True, slots=True)
+class ReportOutcome:
+    """What ``aerpaw-cmp report`` made: the folder, metrics.json as a dict, and stated checks that failed."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    failed_checks: tuple[str, ...]
+
+
+def run_report(
+    flight: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    engine: str | None = None,
+    audit: str | None = None,
+    progress: Progress = _silent,
+) -> ReportOutcome:
+    """Replay a flight, calibrate, compare, report.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    from ..flight.data import gather, read_logs
+    from ..flight.settings import load_flight
+
+    stages = Stages(progress)
+    with stages("read"):
+        settings = _overridden(load_flight(flight), engine, audit)
+        files = read_logs(settings, flight.parent, logs_root)
+        data = gather(settings, flight.parent, files, logs_root)
+    from .compare_flight import audit_replays, compare_rank_series, compare_rss_series
+    from .replay import estimate_clocks, replay_rank, replay_rss
+    from .what_if import foliage_notes
+
+    with stages("clocks"):
+        clocks = estimate_clocks(data, progress)
+    with stages("replay"):
+        rss_replays = replay_rss(data, progress, clocks)
+        rank_replays = replay_rank(data, progress)
+    with stages("compare"):
+        rss = [
+            compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)
+        ]
+        rank = [
+            compare_rank_series(data, series, replayed)
+            for series, replayed in zip(data.rank, rank_replays, strict=True)
+        ]
+    with stages("audit"):
+        engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    speed: tuple[Any, ...] = ()
+    if settings.report.speed_table and settings.rt.audit_links:
+        with stages("speed"):
+            from .speed_table import speed_rows
+
+            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
+    with stages("report"):
+        from ..report.export import metrics as metrics_of
+        from ..report.export import write_report
+
+        notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
+        record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
+        folder = out or Path("reports") / settings.flight.name
+        write_report(record, folder)
+        metrics = metrics_of(record)
+    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
+    """The settings with what the command line says instead."""
+    change: dict[str, Any] = {}
+    if engine is not None:
+        if engine not in ("image", "sionna"):
+            raise UsageError(f"--engine {engine!r}", expected="image or sionna")
+        change["engine"] = engine
+    if audit is not None:
+        numbers = {"full": 10**9, "none": 0}
+        if audit not in numbers and not audit.isdigit():
+            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
+        change["audit_links"] = numbers.get(audit, int(audit) if audit.isdigit() else 0)
+    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
+
+
+def _report_data(
+    data: FlightData,
+    rss: list[Any],
+    rank: list[Any],
+    engine: Any,
+    speed: tuple[Any, ...],
+    notes: tuple[str, ...],
+    stages: Stages,
+) -> Any:
+    from ..report.data import ReportData
+    from .compare_flight import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
+
+    settings = data.settings
+    warnings = list(data.warnings)
+    warnings += [w for result in (*rss, *rank) for w in result.warnings]
+    pairs = pairs_of([r.panel for r in rss])
+    return ReportData(
+        title=settings.report.title or settings.flight.title or settings.flight.name,
+        flight=settings.flight.name,
+        site=data.site,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        versions=versions(),
+        inputs=inputs_of(data),
+        track=track_of(data),
+        waypoints=waypoints_of(data),
+        rss=tuple(r.panel for r in rss),
+        rank=tuple(r.panel for r in rank),
+        pairs=tuple(p.panel for p in pairs),
+        extra_metrics=metrics_beyond_panels([*rss, *rank, *pairs]),
+        engine=engine,
+        speed=speed,
+        synthetic=settings.flight.synthetic,
+        warnings=tuple(dict.fromkeys(warnings)),
+        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
+        settings=settings.model_dump(mode="json"),
+        stages_s=dict(stages.seconds),
+    )
+
+
+def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
+    """Checks that the report states and that did not hold."""
+    failed = []
+    for tower, channels in metrics["rss"].items():
+        for channel, m in channels.items():
+            if m["n"] == 0:
+                failed.append(f"{tower} {channel}: no sample could be compared")
+            elif m["at_search_edge"]:
+                failed.append(f"{tower} {channel}: the best offset lies at the edge of the searched span")
+    audit = (metrics.get("rt") or {}).get("audit") or {}
+    if audit.get("missing_paths"):
+        failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
+    return tuple(failed)
+
+
+def run_bench(
+    *,
+    poses: int = 200,
+    samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
+    ratios: bool = True,
+    progress: Progress = _silent,
+) -> dict[str, Any]:
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
+    from ..propagation.bench import path_search, random_scene, speed_against_error
+    from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
+
+    site, link, some = random_scene(poses)
+    names = list(link.tower_arrays)
+    rows = speed_against_error(site, link, some, samples=samples, progress=progress)
+    found: dict[str, Any] = {}
+    if ratios:
+        progress("path search against PathSolver at 1e6 samples")
+        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
+        progress("Kriging against PyKrige")
+        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
+        progress("ingest against pandas")
+        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    return {
+        "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
+        "replay": {"rows": [row.as_dict() for row in rows]},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "details": found,
+    }
+
+
+def run_site_import(
+    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None
+) -> list[str]:
+    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
+    from ..site.footprints import import_site, write_site_yaml
+
+    model, actions = import_site(files, base=base, untagged=untagged)
+    write_site_yaml(model, out, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+    return actions
+
+
+def run_site_show(
+    site: str | None,
+    out: Path,
+    *,
+    flight: Path | None = None,
+    logs_root: Path | None = None,
+    pose: int | None = None,
+    export: bool = False,
+) -> list[Path]:
+    """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
+
+    Without a site the flight's own is shown; with neither, the packaged one.
+    """
+    from ..report.site_view import write_site_view
+    from ..site.siteyaml import load_site
+
+    if pose is not None and flight is None:
+        raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
+    track, paths = None, ()
+    if flight is None:
+        place = load_site(site or "lake_wheeler")
+    else:
+        from ..flight.data import gather, read_logs
+        from ..flight.settings import load_flight
+        from .compare_flight import track_of
+
+        settings = load_flight(flight)
+        if site is not None:
+            file = str(Path(site).resolve()) if Path(site).is_file() else site
+            settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
+        data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+        place, track = data.site, track_of(data)
+        if pose is not None:
+            paths = _paths_of_pose(data, place, track, pose)
+    written = write_site_view(place, out, track=track, paths=paths)
+    if export:
+        from ..site.export import export_scene
+
+        written += export_scene(place, out / "scene")
+    return written
+
+
+def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
+    """Propagation paths of all towers to one point of the track, as polylines."""
+    import dataclasses
+
+    import numpy as np
+
+    from ..propagation.arrays import Link, Poses, single_element
+    from ..propagation.tracer import replay
+    from ..report.site_view import PathLine
+    from .replay import path_loss, reflecting_crowns
+
+    if track is None or not 0 <= pose < len(track.time):
+        raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
+    point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
+    # paths join the centres of the arrays: which elements they have does not matter
+    link = Link(data.settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
+    data = dataclasses.replace(data, site=site)
+    crowns, depth = reflecting_crowns(data), data.settings.rt.max_depth
+    found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
+    towers = list(site.towers)
+    loss = path_loss(data, link.carrier_hz)
+    if data.settings.rt.foliage == "opaque" and loss is not None:
+        sources = np.array([site.towers[name].position_m for name in towers])
+        found = found.select(np.isfinite(loss(found, sources, point)))
+    lines = []
+    for index in range(len(found)):
+        corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
+        source = site.towers[towers[found.tower[index]]].position_m
+        count, off = int(found.depth[index]), ", one off a crown" if found.off_crown[index] else ""
+        label = f"{towers[found.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
+        lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
+    return tuple(lines)
+
+
+def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int | None]:
+    """The rank that the image engine predicts at the present pose, for ``aerpaw-cmp tap --flight``.
+
+    ``telemetry`` is the growing log; without it, the first telemetry log of the flight file. The middle K counts.
+    """
+    import numpy as np
+
+    from ..compare.rank import channel_rank
+    from ..flight.data import choose_site
+    from ..flight.settings import load_flight
+    from ..live.follow import TelemetryFollower
+    from ..logs.readers import by_name
+    from ..propagation.arrays import Poses, rotation_from_aircraft
+    from ..propagation.tracer import replay
+
+    settings = load_flight(flight)
+    site = choose_site(settings.site, flight.parent)
+    link = settings.link.rank.build([settings.rank.tower], flight.parent)
+    log = next((entry for entry in settings.logs if entry.reader in (None, "vehicle_out")), settings.logs[0])
+    follower = TelemetryFollower(
+        telemetry or flight.parent / log.path,
+        options=log.options(settings.timezone),
+        reader=by_name(log.reader or "vehicle_out"),
+    )
+    k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
+
+    def predict(utc_ns: int) -> int | None:
+        follower.poll()
+        sample = follower.at(utc_ns)
+        if sample is None or not np.isfinite(sample.latitude_deg):
+            return None
+        east, north = site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
+        up = max(sample.altitude_m + site.datum.takeoff_ground_m, 0.5)
+        rotation = np.eye(3)
+        if settings.rt.attitude != "ignored" and np.isfinite(sample.yaw_deg):
+            level = settings.rt.attitude == "level"
+            roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
+            rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
+        pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
+        result = replay(site, link, pose, engine="image", max_depth=settings.rt.max_depth)
+        rank = int(channel_rank(result.h[0, 0], k))
+        return rank or None
+
+    return predict
+
+
+@dataclass(frozen=True, slots=True)
+class MapsOutcome:
+    """What ``aerpaw-cmp map`` made: the folder, its files (the page first) and metrics.json as a dict."""
+
+    folder: Path
+    files: tuple[Path, ...]
+    metrics: dict[str, Any]
+
+
+def run_map(
+    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
+    logs_root: Path | None = None, progress: Progress = _silent, **options: Any,
+) -> MapsOutcome:  # fmt: skip
+    """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
+
+    Parameters
+    ----------
+    site : str
+        site.yaml, or the name of a packaged site.
+    out : Path, optional
+        Folder of the results.
+    quick : bool
+        A coarse map; what ``options`` state still counts.
+    flight : Path, optional
+        flight.yaml whose track trains the test "along a flight".
+    options
+        Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
+    """
+    from ..report.maps_html import maps_metrics, write_maps
+    from ..site.siteyaml import load_site
+    from . import coverage_map as mapping
+    from .compare_flight import versions
+    from .paper_table import paper_markdown
+
+    given = {name: value for name, value in options.items() if value is not None}
+    settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+    place = load_site(site)
+    name = Path(site).stem
+    folder = out or Path("reports") / f"map-{name}"
+    outcome = mapping.make_maps(place, settings, progress)
+    if settings.study:
+        if flight is not None:
+            outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
+        mapping.study_maps(outcome, progress)
+    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    with outcome.stage("export", progress):
+        files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
+    progress("page")
+    record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
+    written = write_maps(record, folder)
+    written.append(folder / "paper.md")
+    written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
+    return MapsOutcome(folder, (*written, *files), maps_metrics(record))
+
+
+def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
+    """East and north (n, 2) [m] of a flight, and its name."""
+    import numpy as np
+
+    from ..flight.data import gather, read_logs
+    from ..flight.settings import load_flight
+    from .compare_flight import track_of
+
+    settings = load_flight(flight)
+    track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
+    if track is None:
+        raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
+    line = np.column_stack([track.east_m, track.north_m])
+    return line[np.isfinite(line).all(axis=1)], settings.flight.name
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignOutcome:
+    """What ``aerpaw-cmp campaign`` made: the folder, campaign.json as a dict, failures, and whether all failed."""
+
+    folder: Path
+    metrics: dict[str, Any]
+    failed_checks: tuple[str, ...]
+    nothing_done: bool
+
+
+def run_campaign(
+    path: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    workers: int = 1,
+    cluster: str | None = None,
+    progress: Progress = _silent,
+) -> CampaignOutcome:
+    """Many flights and settings: replay, compare, pool, hold out, report.
+
+    Raises
+    ------
+    UsageError
+        A campaign.yaml that is wrong; a flight that cannot be read is a row of the result instead.
+    """
+    from dataclasses import replace
+
+    from ..report.campaign_html import campaign_metrics, warnings, write_campaign
+    from .campaign import load_campaign
+    from .campaign import run as run_all
+
+    stages = Stages(progress)
+    data = run_all(
+        load_campaign(path),
+        path.parent,
+        logs_root=logs_root,
+        workers=workers,
+        cluster=cluster,
+        stage=stages,
+        progress=progress,
+    )
+    folder = out or Path("reports") / data.name
+    with stages("report"):
+        write_campaign(replace(data, stages_s=dict(stages.seconds)), folder)
+    edges = [text for text in warnings(data) if "edge of the searched span" in text]
+    failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
+    if data.held_out_failure:
+        failed.append(f"held-out fit: {data.held_out_failure}")
+    metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
+    return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))

@@ -1,0 +1,215 @@
+"""The same paths under other assumptions: antennas, attitude, foliage; fields alone are evaluated again."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Collection, Mapping
+from typing import Any
+
+import numpy as np
+
+from ..common.units import ComplexArray, FloatArray, IntArray
+from ..compare.offset import expected_offset_db, read_reference_powers, reference_power_dbm
+from ..compare.rank import rank_from_singular_values, singular_values
+from ..flight.data import FlightData, RssSeries
+from ..flight.settings import PortSettings
+from ..propagation.arrays import Array, Link, Poses
+from ..propagation.channel import Fields, channel_matrices, mean_pair_power, rss_dbm
+from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
+from ..propagation.tracer import Loss
+from ..site.antennas import Isotropic
+from ..site.installed import InstalledPattern
+from .replay import Replayed, attitude_rotation, path_loss
+
+LEAVES = ("in", "out")
+
+
+def evaluate(
+    data: FlightData, replayed: Replayed, loss: Loss | None, *, link: Link | None = None, poses: Poses | None = None
+) -> Fields:
+    """Fields over the paths that the replay found, with another link, attitude or loss."""
+    link, poses = link or replayed.link, poses or replayed.poses
+    sources = np.array([data.site.towers[name].position_m for name in replayed.replay.towers])
+    paths = replayed.replay.paths
+    loss_db = None if loss is None else loss(paths, sources, poses.position_m)
+    return channel_matrices(paths, replayed.replay.faces, sources, poses, link, loss_db)
+
+
+def level_dbm(data: FlightData, link: Link, fields: Fields) -> FloatArray:
+    """RSS (poses,) of the one tower of a series, coherent or power sum as ``rss.field`` says [dBm]."""
+    power = fields.power if data.settings.rss.field == "power" else mean_pair_power(fields.h)
+    return rss_dbm(power, link.transmit_power_dbm)[:, 0]
+
+
+def rss_alternatives(data: FlightData, replayed: Replayed) -> dict[str, FloatArray]:
+    """Levels at the replayed poses (n,) [dBm] under other assumptions, by name; only those that could differ."""
+    link, loss = replayed.link, path_loss(data, replayed.link.carrier_hz)
+    changed: dict[str, tuple[Link, Poses]] = {}
+    arrays = [*link.tower_arrays.values(), link.uav_array]
+    if any(isinstance(p, InstalledPattern) for a in arrays for p in a.patterns):
+        changed["antennas as measured, without added gain"] = (_with_patterns(link, _alone), replayed.poses)
+    if any(p.name != "iso" for a in arrays for p in a.patterns):
+        changed["isotropic antennas"] = (_with_patterns(link, lambda _: Isotropic()), replayed.poses)
+    if replayed.track is not None and any(p.name != "iso" for p in link.uav_array.patterns):
+        for mode, name in (("logged", "logged attitude"), ("level", "heading only"), ("ignored", "attitude ignored")):
+            if mode != data.settings.rt.attitude:
+                rotation = attitude_rotation(replayed.track, mode)[replayed.valid]
+                changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
+    found = {
+        name: level_dbm(data, other, evaluate(data, replayed, loss, link=other, poses=poses))
+        for name, (other, poses) in changed.items()
+    }
+    for name, fields in foliage_alternatives(data, replayed).items():
+        found[name] = level_dbm(data, link, fields)
+    return found
+
+
+def _with_patterns(link: Link, change: Any) -> Link:
+    def other(array: Array) -> Array:
+        return dataclasses.replace(array, patterns=tuple(change(p) for p in array.patterns))
+
+    arrays = {name: other(array) for name, array in link.tower_arrays.items()}
+    return dataclasses.replace(link, tower_arrays=arrays, uav_array=other(link.uav_array))
+
+
+def _alone(pattern: Any) -> Any:
+    return pattern.base if isinstance(pattern, InstalledPattern) else pattern
+
+
+def foliage_alternatives(data: FlightData, replayed: Replayed) -> dict[str, Fields]:
+    """Fields without trees, in leaf and out of leaf, where ``rt.paired_foliage`` asks and the site has trees."""
+    if not data.settings.rt.paired_foliage or not len(data.site.trees):
+        return {}
+    carrier = replayed.link.carrier_hz
+    kept = data.settings.rt.foliage
+    foliage = "attenuating" if kept == "none" else kept
+    found = {"without trees": evaluate(data, replayed, path_loss(data, carrier, foliage="none"))}
+    for leaves in LEAVES:
+        found[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = evaluate(
+            data, replayed, path_loss(data, carrier, foliage=foliage, leaves=leaves)
+        )
+    return found
+
+
+def foliage_notes(data: FlightData, carriers_hz: Collection[float]) -> tuple[str, ...]:
+    """What a report must say of the foliage models that it used: where they are stretched or assumed."""
+    rt = data.settings.rt
+    if not len(data.site.trees) or not (rt.foliage == "attenuating" or (rt.paired_foliage and rt.foliage != "opaque")):
+        return ()
+    notes = []
+    if rt.foliage_model == "p833" and (rt.gamma_db_per_m is None or rt.maximum_loss_db is None):
+        notes += [note for carrier in sorted(carriers_hz) if (note := p833_note(carrier))]
+    if rt.leaves == "out" or rt.paired_foliage:
+        what = "gamma" if rt.foliage_model == "p833" else "the loss"
+        notes.append(
+            f"Trees out of leaf: {what} in leaf divided by {1 / LEAFLESS_FACTOR:g}. That is an assumption of this "
+            "tool: ITU-R P.833 gives about 20 % near 1 GHz, and no number at this carrier."
+        )
+    return tuple(notes)
+
+
+def p833_note(carrier_hz: float) -> str | None:
+    """That P.833's table is continued beyond its end, or None within it."""
+    low, high = P833_TABLE[0][0], P833_TABLE[-1][0]
+    if low <= carrier_hz / 1e6 <= high:
+        return None
+    model = P833.at(carrier_hz)
+    return (
+        f"Trees at {carrier_hz / 1e9:g} GHz: an extrapolation of ITU-R P.833, whose table of woodland covers {low:g} "
+        f"to {high:g} MHz. Continued it gives gamma = {model.gamma_db_per_m:.2f} dB/m and A_m = {model.maximum_db:.0f} "
+        "dB in leaf; other continuations give 0.45 to 0.7 dB/m at 3.4 GHz, so treat gamma as a sensitivity."
+    )
+
+
+def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, Any]:
+    """What the trees take from the RSS per pose, in leaf and out of leaf [dB]; empty without a paired run."""
+    bare = levels.get("without trees")
+    if bare is None:
+        return {}
+    found: dict[str, Any] = {}
+    for name in ("trees in leaf", "trees out of leaf"):
+        with np.errstate(invalid="ignore"):
+            loss = bare - levels[name]
+        known = np.isfinite(loss)
+        found[name.replace(" ", "_")] = {
+            "n": int(known.sum()),
+            "n_blocked": int((np.isfinite(bare) & ~np.isfinite(levels[name])).sum()),
+            "mean_loss_db": float(loss[known].mean()) if known.any() else float("nan"),
+            "largest_loss_db": float(loss[known].max()) if known.any() else float("nan"),
+            "share_above_1_db": float((np.abs(loss[known]) > 1.0).mean()) if known.any() else float("nan"),
+        }
+    return found
+
+
+PairedRanks = dict[str, dict[float, IntArray]]
+"""Ranks (n,) per K of each run of a paired replay."""
+
+
+def foliage_ranks(data: FlightData, replayed: Replayed, keep: IntArray) -> PairedRanks:
+    """Ranks without trees, in leaf and out of leaf; ``keep`` picks replayed poses. Empty without a paired run."""
+    return {
+        name: _ranks(found.h[keep, 0], data.settings.rank.k)
+        for name, found in foliage_alternatives(data, replayed).items()
+    }
+
+
+def foliage_rank_difference(paired: PairedRanks) -> dict[str, Any]:
+    """Poses at which trees change the rank, per K; empty without a paired run."""
+    if not paired:
+        return {}
+    ranks = dict(paired)
+    bare = ranks.pop("without trees")
+    keep = next(iter(bare.values()))
+    return {
+        name.replace(" ", "_"): {
+            f"{k:g}": {
+                "share_changed": float((rank[k] != bare[k]).mean()) if len(keep) else float("nan"),
+                "mean_change": float((rank[k] - bare[k]).mean()) if len(keep) else float("nan"),
+                "n_lower": int((rank[k] < bare[k]).sum()),
+                "n_higher": int((rank[k] > bare[k]).sum()),
+            }
+            for k in bare
+        }
+        for name, rank in ranks.items()
+    }
+
+
+def _ranks(h: ComplexArray, ks: list[float]) -> dict[float, IntArray]:
+    sigma = singular_values(h)
+    return {k: rank_from_singular_values(sigma, k) for k in ks}
+
+
+def expected_offset(data: FlightData, series: RssSeries) -> dict[str, float]:
+    """Offset that the USRP reference powers predict for a series [dB]; empty where flight.yaml names none.
+
+    Raises
+    ------
+    InputError
+        If the table cannot be read.
+    """
+    budget = data.settings.rss.reference_powers
+    receiver = None if budget is None else budget.receivers.get(series.channel)
+    if budget is None or receiver is None:
+        return {}
+    table = read_reference_powers(data.folder / budget.file)
+    carrier = series.link.carrier_hz
+
+    def reference(port: PortSettings, category: Any) -> float:
+        return reference_power_dbm(
+            table, node=port.node, category=category, channel=port.channel, gain_db=port.gain_db,
+            frequency_hz=carrier, amplifier=port.amplifier,
+        )  # fmt: skip
+
+    received = reference(receiver, "rx")
+    if budget.receiver_gain_removed:  # the log holds dB re full scale minus the gain setting
+        received += receiver.gain_db
+    sent = reference(budget.transmitter, "tx") if budget.transmitter else series.link.transmit_power_dbm
+    expected = expected_offset_db(
+        receiver_reference_dbm=received,
+        transmitter_reference_dbm=sent,
+        simulated_transmit_dbm=series.link.transmit_power_dbm,
+        transmit_amplitude_dbfs=budget.transmit_amplitude_dbfs,
+        transmit_gain_db=budget.transmitter.extra_gain_db if budget.transmitter else 0.0,
+        receive_gain_db=receiver.extra_gain_db,
+    )
+    return {"expected_db": expected, "receiver_reference_dbm": received, "transmitter_reference_dbm": sent}

@@ -1,0 +1,264 @@
+"""The flight file: everything that was read, in one HDF5 file, written whole or not at all.
+
+Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
+
+    /files/00000/meta                     JSON: path, sha256, reader, lines, accepted, blank, warnings
+    /files/00000/rejected                 JSON: list of [number, reason, text]
+    /files/00000/streams/00000/meta       JSON: kind, name, columns [{name, type}], attributes
+    /files/00000/streams/00000/C00000     values of the first column, and so on
+    /files/00000/streams/00000/C00000.words   JSON: the texts that a text column's codes stand for
+
+JSON is stored as UTF-8 bytes, because HDF5 strings cannot hold the NUL characters that torn logs have. Times are
+int64 nanoseconds of UTC. Nothing in the file needs this package to be read.
+
+Behind the HDF5 data, where HDF5 does not look, stand the word ``AERPAWCS`` and the SHA-256 of all bytes before it:
+damage is found before HDF5 sees it, which takes some damage for data and never comes back from some. A file without
+it (cut, or written on by another program) is left to HDF5's own checks.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, BinaryIO
+
+from ..common.errors import InputError, UsageError
+from ..common.files import whole
+from .records import ReadResult, RejectedLine, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FORMAT = "aerpaw-cmp flight"
+VERSION = 1
+_MAGIC = b"\x89HDF\r\n\x1a\n"
+_SEAL = b"AERPAWCS"
+_DIGEST_BYTES = 32
+
+
+@dataclass(frozen=True, slots=True)
+class IngestedFile:
+    """One file that was read.
+
+    Parameters
+    ----------
+    path : str
+        As the user or the folder gave it.
+    sha256 : str
+        Of the bytes on disk, before gunzipping.
+    result : ReadResult
+    """
+
+    path: str
+    sha256: str
+    result: ReadResult
+
+
+def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
+    """Write a flight file atomically: a reader sees the old file or the new one, never a part.
+
+    Raises
+    ------
+    UsageError
+        If the place cannot be written.
+    """
+    import h5py
+
+    try:
+        with whole(Path(path), durable=True) as part:
+            with h5py.File(part, "w") as book:
+                book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
+                shelf = book.create_group("files")
+                for i, file in enumerate(files):
+                    _write_file(shelf.create_group(f"{i:05d}"), file)
+            _seal(part)
+    except OSError as error:
+        raise UsageError(
+            f"cannot write the flight file ({error.strerror or error})",
+            cause="a missing folder or a full disk",
+            path=path,
+        ) from error
+
+
+def _seal(path: Path) -> None:
+    """Append the digest of the content."""
+    with path.open("r+b") as book:
+        digest = _digest(book, path.stat().st_size)
+        book.seek(0, os.SEEK_END)
+        book.write(_SEAL + digest)
+
+
+def _digest(book: BinaryIO, size: int) -> bytes:
+    """SHA-256 of the first ``size`` bytes."""
+    digest = hashlib.sha256()
+    book.seek(0)
+    while size > 0 and (block := book.read(min(size, 1 << 20))):
+        digest.update(block)
+        size -= len(block)
+    return digest.digest()
+
+
+def _refuse_changed(book: BinaryIO, path: str | Path) -> None:
+    """InputError if the file ends with a seal that its content does not have."""
+    content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
+    if content <= 0:
+        return
+    book.seek(content)
+    seal = book.read()
+    if seal.startswith(_SEAL) and seal[len(_SEAL) :] != _digest(book, content):
+        raise InputError(
+            "the flight file is damaged (its content does not have the SHA-256 written with it)",
+            expected="the bytes that 'aerpaw-cmp ingest -o' wrote",
+            cause="a failing disk or transfer: copy it again or ingest the logs again",
+            path=path,
+        )
+
+
+def _write_file(group: Any, file: IngestedFile) -> None:
+    result = file.result
+    _write_json(
+        group,
+        "meta",
+        {
+            "path": file.path,
+            "sha256": file.sha256,
+            "reader": result.reader,
+            "lines": result.lines,
+            "accepted": result.accepted,
+            "blank": result.blank,
+            "warnings": list(result.warnings),
+        },
+    )
+    _write_json(group, "rejected", [[line.number, line.reason, line.text] for line in result.rejected])
+    shelf = group.create_group("streams")
+    for i, stream in enumerate(result.streams):
+        _write_stream(shelf.create_group(f"{i:05d}"), stream)
+
+
+def _write_stream(group: Any, stream: Stream) -> None:
+    columns = [{"name": str(name), "type": _type(stream.frame[name])} for name in stream.frame.columns]
+    _write_json(
+        group,
+        "meta",
+        {"kind": stream.kind, "name": stream.name, "columns": columns, "attributes": dict(stream.attributes)},
+    )
+    for i, column in enumerate(columns):
+        _write_column(group, f"C{i:05d}", stream.frame[column["name"]], column["type"])
+
+
+def _type(column: pd.Series[Any]) -> str:
+    kind = column.dtype.kind
+    return {"M": "time", "f": "float", "i": "integer", "u": "integer", "b": "boolean"}.get(kind, "text")
+
+
+def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> None:
+    import numpy as np
+    import pandas as pd
+
+    if kind == "text":
+        codes, words = pd.factorize(column.astype(object))
+        _write_json(group, f"{name}.words", [str(word) for word in words])
+        values = codes.astype(np.int32)  # -1: no text at all
+    elif kind == "time":
+        values = column.to_numpy().astype("datetime64[ns]").astype(np.int64)
+    else:
+        values = column.to_numpy().astype({"float": np.float64, "integer": np.int64, "boolean": np.bool_}[kind])
+    # the shuffle filter and light deflate: a tenth of the size for smooth columns, at little time
+    options = {"compression": "gzip", "compression_opts": 1, "shuffle": True} if len(values) > 256 else {}
+    group.create_dataset(name, data=values, **options)
+
+
+def _write_json(group: Any, name: str, content: Any) -> None:
+    import numpy as np
+
+    text = json.dumps(content, ensure_ascii=True).encode("ascii")
+    group.create_dataset(name, data=np.frombuffer(text, dtype=np.uint8))
+
+
+def read_flight(path: str | Path) -> list[IngestedFile]:
+    """Read a flight file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, no flight file, of a newer version, or damaged.
+    """
+    import h5py
+
+    place = Path(path)
+    try:
+        with place.open("rb") as probe:
+            magic = probe.read(len(_MAGIC))
+            if magic == _MAGIC:
+                _refuse_changed(probe, path)
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror or error})", expected="a flight file", path=path) from error
+    if magic != _MAGIC:
+        raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
+    try:
+        with h5py.File(place, "r") as book:
+            found, version = book.attrs.get("format"), book.attrs.get("version")
+            if found != FORMAT:
+                raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
+            if version != VERSION:
+                raise InputError(
+                    f"flight file of version {version}", expected=f"version {VERSION}", cause="a newer tool", path=path
+                )
+            shelf = book["files"]
+            return [_read_file(shelf[name]) for name in sorted(shelf)]
+    except InputError:
+        raise
+    except Exception as error:  # h5py raises OSError, KeyError, RuntimeError, ... on damage, all meaning the same
+        raise InputError(
+            f"the flight file is damaged ({type(error).__name__}: {error})",
+            cause="a cut copy: ingest the logs again",
+            path=path,
+        ) from error
+
+
+def _read_file(group: Any) -> IngestedFile:
+    meta = _read_json(group, "meta")
+    rejected = tuple(RejectedLine(*entry) for entry in _read_json(group, "rejected"))
+    shelf = group["streams"]
+    streams = tuple(_read_stream(shelf[name]) for name in sorted(shelf))
+    result = ReadResult(
+        meta["reader"],
+        streams,
+        meta["lines"],
+        meta["accepted"],
+        meta["blank"],
+        rejected,
+        tuple(meta["warnings"]),
+    )
+    return IngestedFile(meta["path"], meta["sha256"], result)
+
+
+def _read_stream(group: Any) -> Stream:
+    import pandas as pd
+
+    meta = _read_json(group, "meta")
+    columns = {
+        column["name"]: _read_column(group, f"C{i:05d}", column["type"]) for i, column in enumerate(meta["columns"])
+    }
+    return Stream(meta["kind"], meta["name"], pd.DataFrame(columns), meta["attributes"])
+
+
+def _read_column(group: Any, name: str, kind: str) -> Any:
+    import numpy as np
+    import pandas as pd
+
+    values = group[name][()]
+    if kind == "time":
+        return values.astype("datetime64[ns]")
+    if kind != "text":
+        return values
+    words = np.array([*_read_json(group, f"{name}.words"), None], dtype=object)
+    return pd.Series(words[values], dtype=object)
+
+
+def _read_json(group: Any, name: str) -> Any:
+    return json.loads(group[name][()].tobytes())

@@ -1,0 +1,319 @@
+"""Find logs, sniff them, read them and account for every line.
+
+A path named by the user must be readable; inside a folder, files of unknown kinds are skipped and reported.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import os
+import zlib
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from ..common.errors import InputError, UsageError, one_line
+from .flight_file import IngestedFile
+from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
+from .records import has_wall_clock
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+MAX_BYTES = 512 * 2**20
+"""Largest file read, and largest content of a gzip file: a log of a day is a hundred times smaller."""
+
+FIRST_REJECTED = 3
+"""Rejected lines of a file that a summary quotes."""
+
+_GZIP = b"\x1f\x8b"
+_HDF5 = b"\x89HDF\r\n\x1a\n"
+
+__all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
+
+OptionsFor = ReadOptions | Callable[[Path], ReadOptions]
+
+
+@dataclass(frozen=True, slots=True)
+class Skipped:
+    """A file of a folder that no reader took, and why."""
+
+    path: str
+    reason: str
+
+
+class Ingested(list[IngestedFile]):
+    """The files that were read, in order; ``skipped`` names those of folders that were not."""
+
+    def __init__(self, files: Sequence[IngestedFile] = (), skipped: Sequence[Skipped] = ()) -> None:
+        super().__init__(files)
+        self.skipped: tuple[Skipped, ...] = tuple(skipped)
+
+
+def read_bytes(path: str | Path) -> tuple[bytes, str]:
+    """Content of a log, gunzipped where needed, and the sha256 of the file.
+
+    Raises
+    ------
+    InputError
+        If the file is missing, not readable, no file, too large, or a damaged gzip file.
+    """
+    raw = _raw(Path(path))
+    digest = hashlib.sha256(raw).hexdigest()
+    return (_gunzip(raw, path) if raw.startswith(_GZIP) else raw), digest
+
+
+def _raw(place: Path, limit: int | None = None) -> bytes:
+    """Bytes on disk, all or the first ``limit``."""
+    try:
+        if place.is_dir():
+            raise InputError("a folder stands where a log is expected", path=place)
+        if not place.is_file() and place.exists():
+            raise InputError("not a regular file", expected="a log", path=place)
+        size = place.stat().st_size
+        if size > MAX_BYTES:
+            raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=place)
+        if limit is None:
+            return place.read_bytes()
+        with place.open("rb") as file:
+            return file.read(limit)
+    except FileNotFoundError as error:
+        raise InputError("the file does not exist", cause="a misspelt path", path=place) from error
+    except PermissionError as error:
+        raise InputError("no permission to read", cause="the file belongs to another user", path=place) from error
+    except (OSError, ValueError) as error:
+        raise InputError(f"cannot be read ({error})", path=place) from error
+
+
+def _gunzip(raw: bytes, path: str | Path) -> bytes:
+    """Content of all members of a gzip file, never more than ``MAX_BYTES``."""
+    out = io.BytesIO()
+    rest = raw
+    while rest.startswith(_GZIP):
+        machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
+        try:
+            out.write(machine.decompress(rest, MAX_BYTES + 1 - out.tell()))
+        except zlib.error as error:
+            raise InputError(f"a damaged gzip file ({error})", cause="a cut download", path=path) from error
+        if out.tell() > MAX_BYTES:
+            raise InputError(f"the gzip file unpacks to more than {MAX_BYTES} bytes", cause="no log", path=path)
+        if not machine.eof:
+            raise InputError("the gzip file ends too early", cause="a cut download", path=path)
+        rest = machine.unused_data
+    return out.getvalue()
+
+
+def ingest(
+    paths: Sequence[str | Path] | str | Path,
+    *,
+    options: OptionsFor | None = None,
+    reader: str | None = None,
+) -> Ingested:
+    """Read files and folders.
+
+    Parameters
+    ----------
+    paths : sequence of path
+        Files and folders; folders are searched to the bottom, in sorted order. Hidden files are left out.
+    options : ReadOptions or callable, optional
+        What the files cannot say themselves; a callable gives them per path.
+    reader : str, optional
+        Name of the reader, instead of sniffing.
+
+    Returns
+    -------
+    Ingested
+        List of :class:`IngestedFile`; its ``skipped`` names files of folders that no reader took.
+
+    Raises
+    ------
+    InputError
+        If a named file cannot be read or is of no known kind, or a folder holds no log at all.
+    UsageError
+        If an option is missing (``timezone:``) or the reader is unknown.
+    """
+    chosen = by_name(reader) if reader is not None else None
+    files: list[IngestedFile] = []
+    skipped: list[Skipped] = []
+    for path in [paths] if isinstance(paths, (str, Path)) else paths:
+        place = Path(path)
+        if not _is_folder(place):
+            files.append(read_file(place, options=options, reader=chosen))
+            continue
+        found, left = _folder(place, options, chosen)
+        files += found
+        skipped += left
+        if not found:
+            known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
+            looked = "1 file" if len(left) == 1 else f"{len(left)} files"
+            first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
+            raise InputError(
+                f"the folder holds no log that {known} ({looked} looked at){first}",
+                expected="one of the formats of 'aerpaw-cmp formats'",
+                path=place,
+            )
+    return Ingested(files, skipped)
+
+
+def _is_folder(place: Path) -> bool:
+    try:
+        return place.is_dir()
+    except (OSError, ValueError):
+        return False  # an impossible path: read_bytes says so
+
+
+def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
+    """Read one file; see :func:`ingest`."""
+    place = Path(path)
+    head = _raw(place, HEAD_BYTES)
+    if head.startswith(_HDF5):
+        raise InputError(
+            "an HDF5 file, such as 'ingest -o' writes",
+            expected="the logs themselves (aerpaw_cmp.logs.flight_file.read_flight gives back what a flight file holds)",
+            cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
+            path=path,
+        )
+    if reader is None and not head.startswith(_GZIP):
+        reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
+    data, digest = read_bytes(place)
+    if not data.strip() or data.startswith(b"version https://git-lfs"):
+        identify(data, path=str(path))  # raises the message for an empty file or a pointer
+    return _read(place, data, digest, reader or identify(data, path=str(path)), options)
+
+
+def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
+    from . import limits  # loads pandas, as any reader does
+
+    given = options(path) if callable(options) else options or ReadOptions()
+    given = replace(given, file_name=path.name)
+    try:
+        result = limits.check(reader.read(data, given))
+    except (InputError, UsageError) as error:
+        if error.path is None:  # readers know bytes only
+            raise type(error)(
+                error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
+            ) from error
+        raise
+    if not result.accepted:
+        first = f": {result.rejected[0].reason}" if result.rejected else ""
+        raise InputError(
+            f"reader {reader.name!r} found no record in {result.lines} lines{first}",
+            expected=f"lines such as {reader.sample!r}",
+            cause="a log of another kind, or an aborted run",
+            path=path,
+        )
+    return IngestedFile(str(path), digest, result)
+
+
+def _folder(
+    folder: Path, options: OptionsFor | None, chosen: Reader | None
+) -> tuple[list[IngestedFile], list[Skipped]]:
+    """All logs below a folder; what cannot be read is reported, not fatal."""
+    files: list[IngestedFile] = []
+    skipped: list[Skipped] = []
+    try:
+        places = sorted(p for p in folder.rglob("*") if not p.name.startswith(".") and (p.is_file() or p.is_symlink()))
+    except OSError as error:
+        raise InputError(f"the folder cannot be searched ({error})", path=folder) from error
+    for place in places:
+        if not place.is_file():  # links to folders are not followed: they may go round in circles
+            what = "a link to a folder; name that folder, too" if place.is_dir() else "a link to nothing"
+            skipped.append(Skipped(str(place), what))
+            continue
+        try:
+            files.append(read_file(place, options=options, reader=chosen))
+        except InputError as error:
+            skipped.append(Skipped(str(place), error.found))
+    return files, skipped
+
+
+def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
+    """What ``ingest --json`` prints: files, their account, streams and warnings; ``skipped`` where folders had such."""
+    entries = [
+        {
+            "path": file.path,
+            "reader": file.result.reader,
+            "lines": file.result.lines,
+            "accepted": file.result.accepted,
+            "rejected": len(file.result.rejected),
+            "first_rejected": [asdict(line) for line in file.result.rejected[:FIRST_REJECTED]],
+            "blank": file.result.blank,
+            "streams": [
+                {"kind": stream.kind, "name": stream.name, "rows": len(stream.frame), **_span(stream.frame)}
+                for stream in file.result.streams
+            ],
+            "warnings": list(file.result.warnings),
+        }
+        for file in files
+    ]
+    skipped = [{"path": s.path, "reason": s.reason} for s in getattr(files, "skipped", ())]
+    warnings = [f"{file.path}: {text}" for file in files for text in file.result.warnings]
+    return {"files": entries, "skipped": skipped, "warnings": warnings}
+
+
+def _span(frame: pd.DataFrame) -> dict[str, Any]:
+    """First and last time (ISO, UTC) and mean rate; None where undefined."""
+    if not len(frame):
+        return {"start": None, "end": None, "rate_hz": None}
+    time = frame["time"]
+    start, end = time.min(), time.max()
+    seconds = (end - start).total_seconds()
+    rate = (len(frame) - 1) / seconds if seconds > 0 else None
+    return {"start": start.isoformat() + "Z", "end": end.isoformat() + "Z", "rate_hz": rate}
+
+
+ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", "blank", "rate Hz", "start UTC", "s")
+"""Columns of :func:`account_rows`."""
+
+
+def account_rows(account: Mapping[str, Any]) -> tuple[str, list[list[str]]]:
+    """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file."""
+    paths = [Path(file["path"]) for file in account["files"]]
+    folder = os.path.commonpath([path.parent for path in paths]) if len(paths) > 1 else ""
+    return folder, [_account_row(file, folder) for file in account["files"]]
+
+
+def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
+    streams = file["streams"]
+    kinds: dict[str, list[str]] = {}
+    for stream in streams:
+        kinds.setdefault(stream["kind"], []).append(f"{stream['name']} {stream['rows']}")
+    rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
+    start, seconds = _start_and_length([s for s in streams if s["start"]])
+    return [
+        one_line(os.path.relpath(file["path"], folder) if folder else str(file["path"])),
+        file["reader"],
+        "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
+        *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),
+        ", ".join(sorted(rates)) or "-",
+        start,
+        seconds,
+    ]
+
+
+def _start_and_length(streams: Sequence[Mapping[str, Any]]) -> tuple[str, str]:
+    import numpy as np
+
+    if not streams:
+        return "-", "-"
+    first = min(np.datetime64(stream["start"].rstrip("Z")) for stream in streams)
+    last = max(np.datetime64(stream["end"].rstrip("Z")) for stream in streams)
+    whole = str(first.astype("datetime64[s]")).replace("T", " ")
+    return whole if has_wall_clock(first) else "relative", f"{(last - first) / np.timedelta64(1, 's'):.1f}"
+
+
+def account_notes(account: Mapping[str, Any]) -> list[str]:
+    """What a table has no room for: warnings, the first rejected lines and the files left out, a line each."""
+    notes = []
+    for file in account["files"]:
+        path = one_line(file["path"])
+        notes += [f"{path}: {text}" for text in file["warnings"]]
+        for line in file["first_rejected"]:
+            notes.append(f"{path}:{line['number']}: rejected: {line['reason']}: {line['text'][:80]!r}")
+        more = file["rejected"] - len(file["first_rejected"])
+        if more:
+            lines = "line" if more == 1 else "lines"
+            notes.append(f"{path}: and {more} more rejected {lines}, all in the flight file (-o)")
+    return notes + [f"{one_line(left['path'])}: skipped: {left['reason']}" for left in account["skipped"]]

@@ -1,0 +1,173 @@
+"""Numeric and character arrays of MATLAB level-5 files, read so that a damaged file is a message.
+
+SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation
+fault, which nobody can catch. Here every size is checked before it is used. What a merged flight and a gain grid need
+is read: full real numeric arrays and character matrices, plain or compressed; variables of other classes are left out.
+Layout: "MAT-File Format" (MathWorks), chapter 1, level 5.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+import zlib
+from collections.abc import Collection, Iterator
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import AnyArray
+
+MAGIC = b"MATLAB 5.0 MAT-file"
+MOST_BYTES = 1 << 30
+"""Of one variable after decompression."""
+
+_COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
+_STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
+_CLASSES = {6: "f8", 7: "f4", 8: "i1", 9: "u1", 10: "i2", 11: "u2", 12: "i4", 13: "u4", 14: "i8", 15: "u8"}
+_CHARACTERS = 4
+_ENCODINGS = {2: "utf-8", 16: "utf-8", 4: "utf-16", 17: "utf-16", 18: "utf-32"}
+
+
+@dataclass(frozen=True, slots=True)
+class _Element:
+    kind: int
+    body: bytes
+
+
+def _damaged(what: str) -> InputError:
+    return InputError(f"the MATLAB file is damaged ({what})", expected="a whole file", cause="a cut download")
+
+
+def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
+    """The wanted variables of a file.
+
+    Parameters
+    ----------
+    data : bytes
+        The file.
+    wanted : collection of str or None
+        Names, None for all; what the file does not have, or holds in another class, is missing from the result.
+
+    Returns
+    -------
+    dict of str to ndarray
+        Numeric arrays in their shape; a character matrix as an array of its rows.
+
+    Raises
+    ------
+    InputError
+        If it is no level-5 file, or any size or type in it cannot be.
+    """
+    if not data.startswith(MAGIC) or len(data) < 128:
+        raise InputError(
+            "no MATLAB 5 file",
+            expected="a file that begins with 'MATLAB 5.0 MAT-file'",
+            cause="another kind of file, or a version 7.3 file: save it again with -v7",
+        )
+    order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
+    if order is None:
+        raise _damaged("no byte order")
+    found: dict[str, AnyArray] = {}
+    for element in _elements(data, 128, order, padded=False):
+        one = _inflated(element, order) if element.kind == _COMPRESSED else element
+        if one.kind != _MATRIX:
+            raise _damaged(f"element of type {one.kind} where a variable was expected")
+        name, array = _variable(one.body, order, wanted)
+        if array is not None:
+            found[name] = array
+    return found
+
+
+def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_Element]:
+    """Elements one after the other; inside a variable they are padded to eight bytes and may be small."""
+    while at < len(data):
+        if len(data) - at < 8:
+            if data[at:].strip(b"\0"):
+                raise _damaged("it ends inside a tag")
+            return
+        kind, size = struct.unpack_from(order + "II", data, at)
+        if padded and kind >> 16:  # small element: size and type share one word, the bytes follow in the other
+            size, kind = kind >> 16, kind & 0xFFFF
+            if size > 4:
+                raise _damaged("a small element of more than 4 bytes")
+            yield _Element(kind, data[at + 4 : at + 4 + size])
+            at += 8
+            continue
+        if size > len(data) - at - 8:
+            raise _damaged(f"{size} bytes announced, {len(data) - at - 8} left")
+        yield _Element(kind, data[at + 8 : at + 8 + size])
+        at += 8 + (-(-size // 8) * 8 if padded else size)
+
+
+def _inflated(element: _Element, order: str) -> _Element:
+    machine = zlib.decompressobj()
+    try:
+        plain = machine.decompress(element.body, MOST_BYTES)
+    except zlib.error as error:
+        raise _damaged(str(error)) from None
+    if machine.unconsumed_tail:
+        raise InputError("a variable of the MATLAB file is too large", expected=f"at most {MOST_BYTES >> 20} MiB")
+    if not machine.eof:
+        raise _damaged("a compressed variable is cut")
+    if len(plain) < 8:
+        raise _damaged("an empty variable")
+    kind, size = struct.unpack_from(order + "II", plain)
+    if size > len(plain) - 8:
+        raise _damaged(f"{size} bytes announced, {len(plain) - 8} left")
+    return _Element(kind, plain[8 : 8 + size])
+
+
+def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[str, AnyArray | None]:
+    """Name and array of a variable; None for one that is not wanted or of another class."""
+    parts = _elements(body, 0, order, padded=True)
+    flags, dimensions, name = (next(parts, None) for _ in range(3))
+    if flags is None or dimensions is None or name is None:
+        raise _damaged("a variable without flags, dimensions or name")
+    if flags.kind != _UINT32 or len(flags.body) != 8 or dimensions.kind != _INT32 or name.kind != _INT8:
+        raise _damaged("a variable whose head is of another type")
+    if len(dimensions.body) < 8 or len(dimensions.body) % 4:
+        raise _damaged("dimensions that are no numbers")
+    shape = struct.unpack(f"{order}{len(dimensions.body) // 4}i", dimensions.body)
+    if min(shape) < 0:
+        raise _damaged("a negative dimension")
+    title = name.body.decode("ascii", errors="replace")
+    word = struct.unpack(order + "II", flags.body)[0]
+    family, is_complex = word & 0xFF, bool(word & 0x0800)
+    unwanted = wanted is not None and title not in wanted
+    if unwanted or is_complex or (family not in _CLASSES and family != _CHARACTERS):
+        return title, None
+    values = next(parts, None)
+    if values is None:
+        raise _damaged(f"variable {title!r} without values")
+    if family == _CHARACTERS:
+        return title, _rows(values, shape, order)
+    return title, _numbers(values, shape, order, _CLASSES[family])
+
+
+def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) -> AnyArray:
+    stored = _STORED.get(values.kind)
+    if stored is None:
+        raise _damaged(f"values of type {values.kind}")
+    count = math.prod(shape)
+    if len(values.body) != count * np.dtype(stored).itemsize:
+        raise _damaged(f"{len(values.body)} bytes for {count} values")
+    return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
+
+
+def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:
+    """Rows of a character matrix as text, trailing blanks removed."""
+    encoding = _ENCODINGS.get(values.kind)
+    if encoding is None or len(shape) != 2:
+        raise _damaged("characters of an unknown kind")
+    if encoding != "utf-8":
+        encoding += "-le" if order == "<" else "-be"
+    text = values.body.decode(encoding, errors="replace")
+    if len(text) != math.prod(shape):
+        raise _damaged(f"{len(text)} characters for {shape[0]} rows of {shape[1]}")
+    letters = np.array(list(text), dtype="<U1").reshape(shape, order="F")
+    if shape[1] == 0 or shape[0] == 0:
+        return np.zeros(shape[0], dtype="<U1")
+    joined: AnyArray = np.char.rstrip(np.ascontiguousarray(letters).view(f"<U{shape[1]}")[:, 0])
+    return joined

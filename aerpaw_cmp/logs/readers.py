@@ -1,0 +1,176 @@
+"""The reader contract, and the way from a file's bytes to its reader.
+
+A reader is a pure function of bytes: no file, no port. Each format module builds one :class:`Reader` and
+lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from functools import cache
+from typing import Literal
+
+from ..common.errors import InputError, UsageError
+from .records import Kind, ReadResult
+
+ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
+HEAD_BYTES = 65_536
+"""Sniffers see at most this much of a file."""
+
+
+@dataclass(frozen=True, slots=True)
+class ReadOptions:
+    """What a file cannot say about itself. All optional; a reader uses what concerns it.
+
+    Parameters
+    ----------
+    timezone : str, optional
+        IANA zone of zone-less clocks. A reader that meets such a clock without it raises ``UsageError``.
+    clock : {"local", "utc", "local_as_utc"}, optional
+        Overrides the reader's own rule; ``local_as_utc`` is local wall time stored as if it were UTC.
+    time_origin : str, optional
+        ISO time (with zone, or local in ``timezone``) of a log whose times are relative.
+    ri_base : {"zero", "one"}, optional
+        What the source prints for rank 1. Readers that know their base ignore it.
+    columns : mapping, optional
+        Generic CSV only: record column to file column.
+    kind : str, optional
+        Generic CSV only.
+    node, channel : str, optional
+        Which tower and which channel the log belongs to.
+    frequency_hz : float, optional
+        Carrier.
+    unit : str, optional
+        Unit of RSS where the file does not fix it.
+    floor_db : float
+        RSS at or below this is out of coverage.
+    file_name : str
+        Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
+    """
+
+    timezone: str | None = None
+    clock: Literal["local", "utc", "local_as_utc"] | None = None
+    time_origin: str | None = None
+    ri_base: Literal["zero", "one"] | None = None
+    columns: Mapping[str, str] = field(default_factory=dict)
+    kind: Kind | None = None
+    node: str | None = None
+    channel: str | None = None
+    frequency_hz: float | None = None
+    unit: str | None = None
+    floor_db: float = -200.0
+    file_name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Reader:
+    """One log format.
+
+    Parameters
+    ----------
+    name : str
+        Short, lower case, used in flight.yaml.
+    title : str
+        One line for ``aerpaw-cmp formats``.
+    kinds : tuple of str
+        Kinds of stream it can give.
+    sample : str
+        One typical line.
+    sniff : callable
+        ``sniff(head: bytes) -> bool``: content only, never the file name; must not raise.
+    read : callable
+        ``read(data: bytes, options: ReadOptions) -> ReadResult``.
+    """
+
+    name: str
+    title: str
+    kinds: tuple[Kind, ...]
+    sample: str
+    sniff: Callable[[bytes], bool]
+    read: Callable[[bytes, ReadOptions], ReadResult]
+
+
+@cache
+def catalogue() -> tuple[Reader, ...]:
+    """All readers of the entry-point group, read once.
+
+    Raises
+    ------
+    UsageError
+        If the group is empty or two readers share a name.
+    """
+    from importlib.metadata import entry_points
+
+    readers: list[Reader] = []
+    for point in entry_points(group=ENTRY_POINT_GROUP):
+        readers.extend(point.load())
+    if not readers:
+        raise UsageError(
+            f"no readers are installed under the entry-point group {ENTRY_POINT_GROUP!r}",
+            cause="the package was not installed: run 'pip install -e .' in the checkout",
+        )
+    names = [reader.name for reader in readers]
+    double = sorted({name for name in names if names.count(name) > 1})
+    if double:
+        raise UsageError(f"two installed readers share the name {double[0]!r}", expected="unique reader names")
+    return tuple(readers)
+
+
+def by_name(name: str) -> Reader:
+    """The reader of that name, or ``UsageError`` naming the known ones."""
+    for reader in catalogue():
+        if reader.name == name:
+            return reader
+    from difflib import get_close_matches
+
+    known = [reader.name for reader in catalogue()]
+    near = get_close_matches(name, known, 1)
+    raise UsageError(
+        f"unknown reader {name!r}",
+        expected="one of " + ", ".join(sorted(known)),
+        cause=f"did you mean {near[0]!r}?" if near else None,
+    )
+
+
+def identify(data: bytes, *, path: str | None = None) -> Reader:
+    """The one reader whose sniffer accepts the content.
+
+    Raises
+    ------
+    InputError
+        If none does, if several do (they are named), or if the content is empty or a Git-LFS pointer.
+    """
+    if not data.strip():
+        raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
+    head = data[:HEAD_BYTES]
+    if head.startswith(b"version https://git-lfs"):
+        raise InputError(
+            "a Git-LFS pointer stands in place of the data",
+            expected="the log itself",
+            cause="the repository was cloned without 'git lfs pull'",
+            path=path,
+        )
+    candidates = [reader for reader in catalogue() if reader.sniff(head)]
+    if len(candidates) == 1:
+        return candidates[0]
+    if candidates:
+        names = ", ".join(reader.name for reader in candidates)
+        raise InputError(
+            f"several readers accept this content: {names}",
+            expected="exactly one",
+            cause="name one with 'reader:' in flight.yaml or --reader",
+            path=path,
+        )
+    binary = b"\0" in head
+    raise InputError(
+        "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
+        expected="one of the formats of 'aerpaw-cmp formats'",
+        cause="another kind of file, or a damaged one" if binary else "a log of a kind that is not supported",
+        path=path,
+    )
+
+
+def _excerpt(head: bytes) -> str:
+    line = head.lstrip().split(b"\n", 1)[0][:80]
+    return ascii(line.decode("utf-8", errors="replace"))

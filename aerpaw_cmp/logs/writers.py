@@ -1,0 +1,225 @@
+"""Records to the bytes of real AERPAW log formats, the inverse of the readers: what ``simulate`` writes.
+
+Pure functions of arrays; nothing here opens a file. Layouts follow the tools that write the real logs, to the
+column: CR LF line ends where Python's ``csv`` wrote them, octal offsets and ``*`` runs where ``od`` did.
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.errors import UsageError
+from ..common.units import AnyArray, FloatArray
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+FLT_MIN_DB = -758.5956
+"""20 log10 of the smallest normal float32: what the sounder's logarithm gives without a signal."""
+RX_GAIN_DB = 30.0
+"""Default gain that the sounder takes off its levels."""
+
+
+def local_text(times: ArrayLike, timezone: str, *, digits: int = 6) -> list[str]:
+    """UTC times as naive local text ``YYYY-mm-dd HH:MM:SS.ffffff``.
+
+    Parameters
+    ----------
+    times : array of datetime64
+        UTC.
+    timezone : str
+        IANA zone of the clock that the log pretends to have.
+    digits : int
+        Digits of the fraction, 0, 3 or 6; cut, not rounded, as ``strftime`` does.
+
+    Raises
+    ------
+    UsageError
+        If the zone is unknown.
+
+    Examples
+    --------
+    >>> local_text(["2024-07-02T15:33:52.312016"], "America/New_York")
+    ['2024-07-02 11:33:52.312016']
+    """
+    import pandas as pd
+
+    index = pd.DatetimeIndex(np.asarray(times, dtype="datetime64[ns]"), tz="UTC")
+    try:
+        local = index.tz_convert(timezone).tz_localize(None).to_numpy().astype("datetime64[us]")
+    except Exception as error:  # zoneinfo and pandas raise several kinds for a wrong name
+        raise UsageError(f"unknown time zone {timezone!r}", expected="an IANA name, e.g. America/New_York") from error
+    texts = [str(text).replace("T", " ") for text in np.datetime_as_string(local, unit="us")]
+    return texts if digits == 6 else [text[: 20 + digits] if digits else text[:19] for text in texts]
+
+
+def format_vehicle_out(frame: pd.DataFrame, timezone: str, *, volts: float = 48.0) -> bytes:
+    """Telemetry as ``vehicleOut``, 10 fields: radians in the order pitch, yaw, roll; CR LF.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        Telemetry records. A row without a position is written as the logger does: -999 and fix 0.
+    timezone : str
+        Zone of the vehicle's clock.
+    volts : float
+        Battery voltage of every row.
+    """
+    nowhere = frame[["latitude_deg", "longitude_deg", "altitude_m"]].isna().any(axis=1).to_numpy()
+    longitude, latitude, altitude = (
+        np.where(nowhere, -999.0, frame[name].to_numpy()) for name in ("longitude_deg", "latitude_deg", "altitude_m")
+    )
+    angles = np.radians(frame[["pitch_deg", "yaw_deg", "roll_deg"]].fillna(0.0).to_numpy())
+    angles = (angles + np.pi) % (2 * np.pi) - np.pi  # the autopilot writes yaw in -pi..pi
+    speed = frame[["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]].fillna(0.0).to_numpy() + 0.0
+    fix = np.where(nowhere, 0, np.where(frame["fix"] < 0, 3, frame["fix"]))
+    satellites = np.where(frame["satellites"] < 0, 12, frame["satellites"])
+    lines = [
+        f'{i + 1},{_short(lon, 7)},{_short(lat, 7)},{_short(alt, 3)},"({_tuple(angle, 17)})","({_tuple(v, 2)})",'
+        f"{volts:g},{time},{f},{s}\r\n"
+        for i, (lon, lat, alt, angle, v, time, f, s) in enumerate(
+            zip(
+                longitude.tolist(),
+                latitude.tolist(),
+                altitude.tolist(),
+                angles.tolist(),
+                speed.tolist(),
+                local_text(frame["time"].to_numpy(), timezone),
+                fix.tolist(),
+                satellites.tolist(),
+                strict=True,
+            )
+        )
+    ]
+    return "".join(lines).encode("ascii")
+
+
+def _short(value: float, places: int) -> str:
+    """Rounded as DroneKit rounds, written as Python writes it; -999 stays an integer."""
+    return "-999" if value == -999.0 else repr(round(value, places) + 0.0)
+
+
+def _tuple(values: list[float], places: int) -> str:
+    return ",".join(repr(round(value, places) + 0.0) for value in values)
+
+
+def format_power_log(
+    times: ArrayLike, rss_db: ArrayLike, timezone: str, *, gain_db: float = RX_GAIN_DB, foot: bool = False
+) -> bytes:
+    """Levels as the sounder's ``power_log``: ``od -f -w4`` through ``ts``.
+
+    Parameters
+    ----------
+    times : array of datetime64, shape (n,)
+        UTC arrival times.
+    rss_db : array, shape (n,)
+        Levels [dB re full scale], written as float32; NaN (out of coverage) becomes the no-signal floor.
+    timezone : str
+        Zone of the tower's clock.
+    gain_db : float
+        Receiver gain, which sets the floor.
+    foot : bool
+        Write od's closing offset, as a sounder that ends by itself does. Always written where the log ends inside
+        a run of equal samples, whose length would be lost otherwise.
+
+    Notes
+    -----
+    Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
+    """
+    level = np.asarray(rss_db, dtype=np.float64)
+    level = np.where(np.isnan(level), FLT_MIN_DB - gain_db, level).astype(np.float32)
+    stamps = local_text(times, timezone)
+    if len(stamps) != len(level):
+        raise ValueError(f"{len(stamps)} times and {len(level)} levels")
+    same = np.concatenate(([False], level[1:] == level[:-1])) if len(level) else np.zeros(0, dtype=bool)
+    lines = []
+    for i, (stamp, value) in enumerate(zip(stamps, level, strict=True)):
+        if not same[i]:
+            lines.append(f"[{stamp}] {4 * i:07o}{str(value).removesuffix('.0'):>16}\n")
+        elif not same[i - 1]:
+            lines.append(f"[{stamp}] *\n")
+    if len(level) and (foot or same[-1]):
+        lines.append(f"[{stamps[-1]}] {4 * len(level):07o}\n")
+    return "".join(lines).encode("ascii")
+
+
+def _ri(values: ArrayLike) -> AnyArray:
+    """RI as a Quectel writes it: layers from 1, and 0 for no CSI."""
+    rank = np.asarray(values, dtype=np.float64)
+    return np.where(np.isnan(rank), 0, rank).astype(np.int64)
+
+
+def format_quectel_csv(
+    times: ArrayLike, rank: ArrayLike, timezone: str, *, mcs: ArrayLike | None = None, cqi: ArrayLike | None = None
+) -> bytes:
+    """Rank as AERPAW's ``Basic_and_Other_Params.csv``, launched version, its first line ``OK`` included.
+
+    Parameters
+    ----------
+    times : array of datetime64, shape (n,)
+        UTC.
+    rank : array, shape (n,)
+        1 to 8; NaN (no CSI) is written as four zeros.
+    timezone : str
+        Zone of the logger's clock.
+    mcs, cqi : array, shape (n,), optional
+        As reported; by default those of a good link (27, 15).
+    """
+    ri = _ri(rank)
+    some = ri > 0
+    columns = [
+        np.where(some, np.full(len(ri), default) if given is None else np.nan_to_num(np.asarray(given, float)), 0)
+        for given, default in ((mcs, 27), (cqi, 15))
+    ]
+    mcs_column, cqi_column = (column.astype(np.int64).tolist() for column in columns)
+    lines = [
+        f'{time},"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",{m},{r},{c},{3 if r else 0}\r\n'
+        for time, m, r, c in zip(
+            local_text(times, timezone, digits=3), mcs_column, ri.tolist(), cqi_column, strict=True
+        )
+    ]
+    return ("OK\n" + "".join(lines)).encode("ascii")
+
+
+def format_ri_csv(frame: pd.DataFrame, timezone: str) -> bytes:
+    """Rank records with positions as the published six-column table ``ID,Time and date,...,NR RI``.
+
+    Parameters
+    ----------
+    frame : pandas.DataFrame
+        Rank records with ``latitude_deg longitude_deg altitude_m``; NaN rank is written as 0.
+    timezone : str
+        Zone of the logger's clock.
+    """
+    columns = (
+        local_text(frame["time"].to_numpy(), timezone, digits=3),
+        *(frame[name].tolist() for name in ("longitude_deg", "latitude_deg", "altitude_m")),
+        _ri(frame["rank"].to_numpy()).tolist(),
+    )
+    lines = [
+        f"{i + 1},{time},{_cell(lon, 7)},{_cell(lat, 7)},{_cell(alt, 3)},{ri}\r\n"
+        for i, (time, lon, lat, alt, ri) in enumerate(zip(*columns, strict=True))
+    ]
+    return ("ID,Time and date,Longitude,Latitude,Altitude,NR RI\r\n" + "".join(lines)).encode("ascii")
+
+
+def _cell(value: float, places: int) -> str:
+    return "" if np.isnan(value) else repr(round(value, places))
+
+
+def format_nemo_csv(frame: pd.DataFrame, time_origin: str) -> bytes:
+    """Rank records with positions as the Nemo table, times in milliseconds after ``time_origin`` (UTC)."""
+    origin = np.datetime64(time_origin.removesuffix("Z"), "ns")
+    relative_ms: FloatArray = (frame["time"].to_numpy().astype("datetime64[ns]") - origin).astype(np.int64) / 1e6
+    names = ("latitude_deg", "longitude_deg", "altitude_m", "rank", "rsrp_dbm", "sinr_db", "cqi")
+    absent = [float("nan")] * len(frame)
+    columns = [frame[name].tolist() if name in frame.columns else absent for name in names]
+    lines = [
+        f"{i}," + ",".join("" if np.isnan(value) else repr(value) for value in row) + "\r\n"
+        for i, row in enumerate(zip(relative_ms.tolist(), *columns, strict=True))
+    ]
+    header = "index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\r\n"
+    return (header + "".join(lines)).encode("ascii")

@@ -1,0 +1,257 @@
+"""Is this machine ready? Each check says what it found and, when it is not well, the line that mends it.
+
+Nothing here changes the machine; ``tools/setup_llvm.py`` (run by ``make setup``) does.
+"""
+
+from __future__ import annotations
+
+import os
+import platform
+import shutil
+import sys
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from importlib import metadata
+from pathlib import Path
+from typing import Any, Literal
+
+from ..common.errors import AerpawCmpError
+from . import llvm
+
+Status = Literal["ok", "warn", "fail"]
+
+MEMORY_NEEDED_BYTES = 2 * 1024**3
+"""A report of 10 000 poses and 5 towers stays below this."""
+
+DISK_NEEDED_BYTES = 1024**3
+"""Reports, flight files and the path cache of a day in the field."""
+
+
+@dataclass(frozen=True, slots=True)
+class Check:
+    """One thing looked at.
+
+    Parameters
+    ----------
+    name : str
+        What was looked at.
+    status : {"ok", "warn", "fail"}
+        ``warn``: a job that needs it will be slow or refused, the others run. ``fail``: no replay on this machine.
+    found : str
+        What was found.
+    remedy : str
+        What mends it; empty when ``ok``.
+    """
+
+    name: str
+    status: Status
+    found: str
+    remedy: str = ""
+
+
+def checks() -> list[Check]:
+    """All checks, in the order in which a newcomer meets them. Takes a few seconds: LLVM is tried, not believed."""
+    gpu = gpu_check()
+    compilers = list(llvm_checks())
+    if "tried" in gpu.found and gpu.status == "ok":  # a GPU that works needs no LLVM
+        compilers = [replace(check, status="warn") if check.status == "fail" else check for check in compilers]
+    return [
+        python_check(),
+        *package_checks(),
+        *compilers,
+        gpu,
+        cores_check(),
+        memory_check(),
+        disk_check(Path.cwd()),
+        cache_check(llvm.cache_folder()),
+        readers_check(),
+        *serial_checks(),
+    ]
+
+
+def as_dict(found: Sequence[Check]) -> dict[str, Any]:
+    """What ``doctor --json`` prints: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
+    return {"ready": ready(found), "checks": [asdict(check) for check in found]}
+
+
+def ready(found: Sequence[Check]) -> bool:
+    """Whether no check failed (warnings are allowed)."""
+    return all(check.status != "fail" for check in found)
+
+
+def python_check(version: tuple[int, ...] = sys.version_info[:3]) -> Check:
+    """Python of 3.10 or newer."""
+    found = f"{'.'.join(map(str, version))} ({sys.executable})"
+    if version < (3, 10):
+        return Check("Python", "fail", found, "install Python 3.10 or newer, then 'make clean setup'")
+    return Check("Python", "ok", found)
+
+
+def _version(name: str) -> str | None:
+    try:
+        return metadata.version(name)
+    except metadata.PackageNotFoundError:
+        return None
+
+
+def package_checks() -> Iterator[Check]:
+    """Sionna RT, Mitsuba and Dr.Jit are installed, in the versions that Sionna RT pins."""
+    pins: dict[str, str] = {}
+    try:
+        for requirement in metadata.requires("sionna-rt") or []:
+            name, _, exact = requirement.partition("==")
+            pins[name.strip()] = exact.strip()
+    except metadata.PackageNotFoundError:
+        pass
+    for title, name in (("Sionna RT", "sionna-rt"), ("Mitsuba", "mitsuba"), ("Dr.Jit", "drjit")):
+        version = _version(name)
+        pin = pins.get(name)
+        if version is None:
+            yield Check(title, "fail", "not installed", "make setup")
+        elif pin and version != pin:
+            yield Check(title, "fail", f"{version}, but Sionna RT needs {pin}", f"pip install '{name}=={pin}'")
+        else:
+            yield Check(title, "ok", version)
+
+
+def llvm_checks() -> Iterator[Check]:
+    """One row per library up to the first that works, each tried in a child process."""
+    try:
+        trials = llvm.first_that_works(llvm.candidates())
+    except AerpawCmpError as error:
+        yield Check("LLVM", "fail", str(error), f"unset {llvm.LIBRARY_VARIABLE}")
+        return
+    works = bool(trials) and trials[-1].ok
+    if not trials:
+        yield Check("LLVM", "fail", "no libLLVM found", llvm.install_line())
+    for trial in trials:
+        name = trial.library.label if trial.library else "LLVM"
+        if trial.ok:
+            yield Check("LLVM", "ok", f"{name}, tried: two paths traced in a child process, lengths right")
+        elif not trial.blames_library:
+            remedy = llvm.install_line() if trial.missing else "make setup"
+            yield Check("LLVM", "fail", f"{name} could not be tried: {trial.reason}", remedy)
+        else:
+            remedy = "none needed, another one works" if works else llvm.install_line()
+            yield Check("LLVM", "warn" if works else "fail", f"{name}: {trial.reason}", remedy)
+
+
+def gpu_check() -> Check:
+    """Which Mitsuba variant a replay would use; a GPU is tried the same way as LLVM, in a child process."""
+    if shutil.which("nvidia-smi") is None and not Path("/proc/driver/nvidia").exists():
+        return Check("GPU", "ok", "none found: replays use llvm_ad_mono_polarized")
+    trial = llvm.try_variant("cuda_ad_mono_polarized")
+    if trial.ok:
+        return Check("GPU", "ok", "tried: replays use cuda_ad_mono_polarized")
+    remedy = "update the NVIDIA driver ('nvidia-smi' must list the GPU); replays use LLVM until then"
+    return Check("GPU", "warn", f"an NVIDIA driver is there, but {trial.reason}", remedy)
+
+
+def cores_check() -> Check:
+    """Processor cores that this process may use."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return Check("CPU", "ok", f"{cores} core{'s' if cores > 1 else ''}, {platform.machine()}")
+
+
+def available_memory_bytes(root: Path = Path("/")) -> int | None:
+    """Memory that can still be had: the kernel's estimate, or the control group's limit when that is lower."""
+    try:
+        lines = (root / "proc/meminfo").read_text().splitlines()
+        available = next(int(line.split()[1]) * 1024 for line in lines if line.startswith("MemAvailable:"))
+    except (OSError, StopIteration, ValueError, IndexError):
+        return None
+    group = root / "sys/fs/cgroup"
+    try:
+        limit, used = ((group / name).read_text().strip() for name in ("memory.max", "memory.current"))
+        if limit != "max":
+            available = min(available, int(limit) - int(used))
+    except (OSError, ValueError):
+        pass  # no such group: the machine is the limit
+    return available
+
+
+def memory_check(available: int | None = None) -> Check:
+    """Enough memory for a report."""
+    available = available_memory_bytes() if available is None else available
+    if available is None:
+        return Check("Memory", "warn", "unknown on this system", "have 2 GiB free for a report")
+    found = f"{available / 1024**3:.1f} GiB free"
+    if available < MEMORY_NEEDED_BYTES:
+        return Check("Memory", "warn", found, "a report needs up to 2 GiB: close other programs")
+    return Check("Memory", "ok", found)
+
+
+def disk_check(folder: Path) -> Check:
+    """Enough room where reports are written."""
+    free = shutil.disk_usage(folder).free
+    found = f"{free / 1024**3:.1f} GiB free in {folder}"
+    if free < DISK_NEEDED_BYTES:
+        return Check("Disk", "warn", found, "free some space, or write reports elsewhere with '-o FOLDER'")
+    return Check("Disk", "ok", found)
+
+
+def cache_check(folder: Path) -> Check:
+    """The folder of cached paths and kernels can be written to."""
+    remedy = "set AERPAW_CMP_CACHE to a folder that you may write to"
+    existing = next((place for place in (folder, *folder.parents) if place.exists()), folder)
+    if not existing.is_dir():
+        return Check("Cache", "warn", f"{existing} is not a folder", remedy)
+    if not os.access(existing, os.W_OK | os.X_OK):
+        return Check("Cache", "warn", f"{folder} cannot be written to", remedy)
+    return Check("Cache", "ok", str(folder))
+
+
+def readers_check() -> Check:
+    """The log formats that this installation reads."""
+    from ..logs.readers import catalogue
+
+    try:
+        names = [reader.name for reader in catalogue()]
+    except AerpawCmpError as error:
+        return Check("Readers", "fail", str(error), "make setup")
+    except Exception as error:  # a reader of another distribution may raise anything on import
+        return Check("Readers", "fail", f"{type(error).__name__} while loading them: {error}", "make setup")
+    return Check("Readers", "ok", f"{len(names)}: {', '.join(names)}")
+
+
+def holders(device: str) -> list[str]:
+    """Processes that have a device open, as ``name (pid)``; those of other users are visible to root only."""
+    try:
+        from ..live import ports
+    except ImportError:  # no termios: not a system that the tap runs on
+        return []
+    return [f"{holder.name} ({holder.pid})" for holder in ports.holders(Path(device), others_only=False)]
+
+
+def serial_checks() -> Iterator[Check]:
+    """Serial ports, whether this user may open them and who holds them; no port is opened."""
+    try:
+        from serial.tools import list_ports
+    except ImportError:
+        yield Check("Serial", "fail", "pyserial is not installed", "make setup")
+        return
+    ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
+    if not ports:
+        yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
+    for port in ports:
+        yield serial_check(port.device, port.description or "")
+
+
+def serial_check(device: str, description: str = "") -> Check:
+    """One port: present, allowed, free."""
+    found = f"{device} {description}".strip()
+    if not os.access(device, os.R_OK | os.W_OK):
+        return Check(
+            "Serial", "warn", f"{found}: not allowed", f"sudo usermod -aG {_group(device)} $USER, then log in anew"
+        )
+    if busy := holders(device):
+        stop = "sudo systemctl stop ModemManager" if any("ModemManager" in name for name in busy) else "stop it"
+        return Check("Serial", "warn", f"{found}: held by {', '.join(busy)}", stop)
+    return Check("Serial", "ok", found)
+
+
+def _group(device: str) -> str:
+    try:
+        return Path(device).group()
+    except (OSError, KeyError, NotImplementedError):
+        return "dialout"

@@ -1,0 +1,465 @@
+"""The LLVM that Dr.Jit compiles with: find one, try it in a child process, install one.
+
+Standard library only, so that set-up can use it before anything else works.
+
+Why a trial: Dr.Jit 1.5 refuses LLVM 14 and loads LLVM 15 and 16, but on machines with AVX-512 these two abort the
+whole process in the first solver call ("Cannot select: fmaximum"). An abort cannot be caught, so the choice is tried
+in a child process with an empty kernel cache (a cached kernel would hide the fault).
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from hashlib import sha256
+from importlib import metadata
+from pathlib import Path
+
+from ..common.errors import CheckError
+
+MINIMUM_MAJOR = 17
+"""14 is refused by Dr.Jit; 15 and 16 abort on AVX-512. 19 and 22 were tried on such a machine."""
+
+LIBRARY_VARIABLE = "DRJIT_LIBLLVM_PATH"
+"""What Dr.Jit reads; a path set by the user is tried, never replaced."""
+
+FOLDERS_VARIABLE = "AERPAW_CMP_LLVM_FOLDERS"
+"""Folders to look into instead of the system's, separated as in PATH."""
+
+TRIAL_TIMEOUT_S = 300.0
+
+APT_RUNTIME = "libatomic1"
+"""Dr.Jit's wheel links libatomic.so.1, which a minimal Debian does not have."""
+
+_FOLDERS = (
+    "/usr/lib/*-linux-gnu",
+    "/lib/*-linux-gnu",
+    "/usr/lib64",
+    "/usr/lib",
+    "/usr/lib/llvm*/lib",
+    "/usr/lib/llvm*/lib64",
+    "/usr/local/lib",
+    "/usr/local/opt/llvm*/lib",
+    "/opt/homebrew/opt/llvm*/lib",
+    f"{sys.prefix}/lib",
+)
+
+_NAME = re.compile(r"libLLVM(?:-(?P<dash>\d+(?:\.\d+)*))?\.(?:so|dylib)(?:\.(?P<dot>\d+(?:\.\d+)*))?")
+
+# One triangle of ground, one link: the direct and the reflected path of known length.
+TRIAL_PROGRAM = """
+import json, math, sys
+try:
+    import resource
+    resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
+except (ImportError, ValueError, OSError):
+    pass
+import drjit, mitsuba
+mitsuba.set_variant(sys.argv[1])
+import numpy
+from sionna.rt import ITURadioMaterial, PathSolver, PlanarArray, Receiver, SceneObject, Transmitter, load_scene
+scene = load_scene()
+scene.frequency = 3.4e9
+scene.tx_array = scene.rx_array = PlanarArray(num_rows=1, num_cols=1, pattern="iso", polarization="VH")
+mesh = mitsuba.Mesh("ground", vertex_count=3, face_count=1)
+buffers = mitsuba.traverse(mesh)
+buffers["vertex_positions"] = mitsuba.Float([-500.0, -500.0, 0.0, 500.0, -500.0, 0.0, 0.0, 800.0, 0.0])
+buffers["faces"] = mitsuba.UInt32([0, 1, 2])
+buffers.update()
+material = ITURadioMaterial("soil", "medium_dry_ground", thickness=0.1)
+scene.add(SceneObject(mi_mesh=mesh, name="ground", radio_material=material))
+scene.add(Transmitter("tower", [0.0, 0.0, 10.0]))
+scene.add(Receiver("uav", [30.0, 0.0, 20.0]))
+paths = PathSolver()(scene, max_depth=1, samples_per_src=1000, synthetic_array=True)
+found = sorted(float(delay) * 299792458.0 for delay in numpy.ravel(paths.tau))
+expected = [math.hypot(30.0, 10.0), math.hypot(30.0, 30.0)]
+right = len(found) == 2 and all(abs(a - b) < 1e-3 for a, b in zip(found, expected))
+llvm = list(drjit.detail.llvm_version()) if "llvm" in sys.argv[1] else []
+print(json.dumps({"right": right, "found_m": found, "llvm": llvm}))
+"""
+
+
+@dataclass(frozen=True, slots=True)
+class Library:
+    """A libLLVM file; ``version`` is empty when its name does not tell."""
+
+    path: Path
+    version: tuple[int, ...]
+
+    @property
+    def label(self) -> str:
+        """``LLVM 19.1 (/usr/lib/...)``."""
+        return f"LLVM {'.'.join(map(str, self.version)) or '?'} ({self.path})"
+
+
+@dataclass(frozen=True, slots=True)
+class Trial:
+    """What a child process made of one library, or of one GPU variant (``library`` is None).
+
+    ``reason`` is empty when ``ok``; ``blames_library`` is False when the trial could not even start, and
+    ``missing`` then names the shared library that Dr.Jit itself lacks, if that was the cause.
+    """
+
+    library: Library | None
+    ok: bool
+    reason: str = ""
+    blames_library: bool = True
+    missing: str = ""
+
+
+def version_in_name(name: str) -> tuple[int, ...] | None:
+    """Version told by a libLLVM file name; empty if it tells none, None if it is no libLLVM.
+
+    >>> version_in_name("libLLVM.so.19.1"), version_in_name("libLLVM-15.so.1"), version_in_name("libLLVM.so")
+    ((19, 1), (15,), ())
+    >>> version_in_name("libLLVM-C.so") is None
+    True
+    """
+    match = _NAME.fullmatch(name)
+    if match is None:
+        return None
+    digits = match["dash"] or match["dot"] or ""
+    return tuple(int(part) for part in digits.split(".") if part)
+
+
+def _library(path: Path) -> Library | None:
+    """The file behind a name; links are followed because ``libLLVM.so`` often points to ``libLLVM.so.19.1``."""
+    if not path.is_file():
+        return None
+    versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
+    if versions == [None, None]:
+        return None
+    return Library(path.resolve(), next((version for version in versions if version), ()))
+
+
+def _system_paths() -> list[Path]:
+    """Every file the linker or the usual folders offer under a libLLVM name."""
+    paths: list[Path] = []
+    if ldconfig := shutil.which("ldconfig") or shutil.which("/sbin/ldconfig"):
+        listing = subprocess.run([ldconfig, "-p"], capture_output=True, text=True, check=False).stdout
+        paths += [Path(line.rpartition("=> ")[2]) for line in listing.splitlines() if "libLLVM" in line]
+    for pattern in _FOLDERS:
+        folder = Path(pattern)
+        paths += folder.parents[-1].glob(str(folder.relative_to(folder.anchor) / "libLLVM*"))
+    return paths
+
+
+def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
+    """The libLLVM files in the order they are worth trying: newest first, unknown versions last.
+
+    With ``DRJIT_LIBLLVM_PATH`` set, that file alone.
+
+    Raises
+    ------
+    CheckError
+        If ``DRJIT_LIBLLVM_PATH`` names no file.
+    """
+    if chosen := environ.get(LIBRARY_VARIABLE):
+        path = Path(chosen)
+        if not path.is_file():
+            raise CheckError(
+                f"{LIBRARY_VARIABLE} names {chosen}, which is not a file",
+                expected="the path of a libLLVM",
+                cause=f"an old setting; 'unset {LIBRARY_VARIABLE}' lets one be found",
+            )
+        return [_library(path) or Library(path.resolve(), ())]
+    if folders := environ.get(FOLDERS_VARIABLE):
+        paths = [path for folder in folders.split(os.pathsep) for path in Path(folder).glob("libLLVM*")]
+    else:
+        paths = _system_paths()
+    found = {library.path: library for path in paths if (library := _library(path))}
+    return sorted(found.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
+
+
+def _too_old(version: Sequence[int]) -> str:
+    if version and version[0] < MINIMUM_MAJOR:
+        return f"LLVM {version[0]} is too old; {MINIMUM_MAJOR} or newer is needed"
+    return ""
+
+
+def _missing_library(text: str) -> str:
+    match = re.search(r"(lib\S+\.so[.\d]*)(?:: cannot open shared object file|$)", text, flags=re.MULTILINE)
+    return match[1] if match else ""
+
+
+def _failure(child: subprocess.CompletedProcess[str]) -> str:
+    """Why a child failed, in one line: the signal that ended it and what it said last."""
+    if missing := _missing_library(child.stderr):
+        return f"Dr.Jit cannot be loaded, the system has no {missing}"
+    lines = [line.strip() for line in child.stderr.splitlines() if line.strip()]
+    said = next((line for line in lines if "LLVM ERROR" in line), lines[-1] if lines else "no message")
+    how = f"was ended by signal {-child.returncode}" if child.returncode < 0 else f"ended with {child.returncode}"
+    return f"the trial {how}: {said[:200]}"
+
+
+def _run_trial(
+    library: Library | None, variant: str, python: str, program: str, timeout_s: float
+) -> tuple[str, dict[str, object]]:
+    """Reason of failure (empty if none) and the child's answer."""
+    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-trial-") as scratch:
+        environ = {**os.environ, "DRJIT_CACHE_DIR": scratch}
+        if library is not None:
+            environ[LIBRARY_VARIABLE] = str(library.path)
+        try:
+            child = subprocess.run(
+                [python, "-c", program, variant],
+                cwd=scratch,
+                env=environ,
+                stdin=subprocess.DEVNULL,
+                capture_output=True,
+                text=True,
+                errors="replace",
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired:
+            return f"the trial gave no answer within {timeout_s:g} s", {}
+    if child.returncode:
+        return _failure(child), {}
+    try:
+        answer = dict(json.loads(child.stdout.splitlines()[-1]))
+    except (ValueError, IndexError, TypeError):
+        return f"the trial's answer is unreadable: {child.stdout[-200:]!r}", {}
+    if not answer.get("right"):
+        return f"the trial's path lengths are wrong: {answer.get('found_m')}", answer
+    return "", answer
+
+
+def try_library(
+    library: Library,
+    *,
+    python: str = sys.executable,
+    program: str = TRIAL_PROGRAM,
+    timeout_s: float = TRIAL_TIMEOUT_S,
+) -> Trial:
+    """Trace two paths with this library in a child process (about 2 s); never raises, never crashes."""
+    if reason := _too_old(library.version):
+        return Trial(library, False, reason)
+    reason, answer = _run_trial(library, "llvm_ad_mono_polarized", python, program, timeout_s)
+    told = answer.get("llvm")
+    if isinstance(told, list) and told:
+        library = Library(library.path, tuple(int(part) for part in told))
+    return _verdict(library, reason or _too_old(library.version))
+
+
+def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float = TRIAL_TIMEOUT_S) -> Trial:
+    """Trace two paths with another Mitsuba variant (``cuda_ad_mono_polarized``) in a child process."""
+    return _verdict(None, _run_trial(None, variant, python, TRIAL_PROGRAM, timeout_s)[0])
+
+
+def _verdict(library: Library | None, reason: str) -> Trial:
+    missing = _missing_library(reason) if reason.startswith("Dr.Jit cannot be loaded") else ""
+    return Trial(library, not reason, reason, not missing and "No module named" not in reason, missing)
+
+
+def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
+    """Try libraries in order (by default with :func:`try_library`) until one works; the trials made, that one last."""
+    attempt = attempt or try_library
+    trials: list[Trial] = []
+    for library in libraries:
+        trials.append(attempt(library))
+        # what is missing is Sionna itself: the next library would fare no better
+        if trials[-1].ok or not trials[-1].blames_library:
+            break
+    return trials
+
+
+def cache_folder(environ: Mapping[str, str] = os.environ) -> Path:
+    """Where this program keeps what it can make again: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    if chosen := environ.get("AERPAW_CMP_CACHE"):
+        return Path(chosen)
+    base = environ.get("XDG_CACHE_HOME") or "~/.cache"
+    return Path(base).expanduser() / "aerpaw-cmp"
+
+
+def _verdict_file(library: Library) -> Path:
+    """Where a good trial is remembered: it holds for this file, these versions and this processor."""
+    try:
+        processor = next(
+            (line for line in Path("/proc/cpuinfo").read_text().splitlines() if line.startswith(("flags", "Features"))),
+            platform.processor(),
+        )
+    except OSError:
+        processor = platform.processor()
+    stat = library.path.stat()
+    versions = []
+    for name in ("sionna-rt", "mitsuba", "drjit"):
+        try:
+            versions.append(metadata.version(name))
+        except metadata.PackageNotFoundError:
+            versions.append("none")
+    # the nodes of a cluster share home folders: hence the processor in the key
+    key = repr((str(library.path), stat.st_size, stat.st_mtime_ns, versions, processor, sys.prefix))
+    return cache_folder() / "llvm" / sha256(key.encode()).hexdigest()[:24]
+
+
+def _remembered_trial(library: Library) -> Trial:
+    """As :func:`try_library`, but a good trial is made once per machine. Failures are tried anew each time."""
+    note = _verdict_file(library)
+    if note.is_file() and not _too_old(library.version):
+        return Trial(library, True)
+    trial = try_library(library)
+    if trial.ok:
+        try:
+            note.parent.mkdir(parents=True, exist_ok=True)
+            note.write_text(f"{library.label}\n")
+        except OSError:
+            pass  # an unwritable cache costs two seconds per run, nothing else
+    return trial
+
+
+@cache
+def _trials() -> tuple[Trial, ...]:
+    """The trials that led to this process's choice, made once."""
+    return tuple(first_that_works(candidates(), _remembered_trial))
+
+
+def llvm_library() -> Path | None:
+    """The newest LLVM that passed its trial on this machine, or None."""
+    trials = _trials()
+    if trials and trials[-1].ok and trials[-1].library:
+        return trials[-1].library.path
+    return None
+
+
+def prepare_llvm() -> Path:
+    """Point Dr.Jit to an LLVM that works; call it before importing drjit, mitsuba or sionna.
+
+    Returns
+    -------
+    Path
+        The library, now also in ``os.environ["DRJIT_LIBLLVM_PATH"]``.
+
+    Raises
+    ------
+    CheckError
+        If no usable LLVM is found; the message holds the line that installs one.
+    """
+    path = llvm_library()
+    if path is None:
+        raise CheckError(f"{explain(_trials())}. Mend it with: {install_line()}")
+    os.environ[LIBRARY_VARIABLE] = str(path)
+    return path
+
+
+def explain(trials: Sequence[Trial]) -> str:
+    """One sentence on why none of the tried libraries serves."""
+    if not trials:
+        return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and no libLLVM was found"
+    tried = "; ".join(f"{trial.library.label if trial.library else 'GPU'}: {trial.reason}" for trial in trials)
+    return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and none works here ({tried})"
+
+
+# ---------------------------------------------------------------------------------------------- installing
+
+
+def _os_families() -> set[str]:
+    try:
+        release = platform.freedesktop_os_release()
+    except OSError:
+        return {platform.system().lower()}
+    return {release.get("ID", ""), *release.get("ID_LIKE", "").split()}
+
+
+def apt_packages(search_output: str) -> list[str]:
+    """LLVM runtime packages new enough, newest first, from the output of ``apt-cache search``.
+
+    >>> apt_packages(os.linesep.join(["libllvm14 - x", "libllvm19 - x", "libllvm17t64 - x", "libllvm19-dbg - x"]))
+    ['libllvm19', 'libllvm17t64']
+    """
+    found = re.findall(r"^(libllvm(\d+)(?:t64)?)\s", search_output + "\n", flags=re.MULTILINE)
+    new_enough = sorted(((int(major), name) for name, major in found if int(major) >= MINIMUM_MAJOR), reverse=True)
+    return [name for _, name in new_enough]
+
+
+def _offered_by_apt() -> list[str]:
+    apt_cache = shutil.which("apt-cache")
+    if apt_cache is None:
+        return []
+    command = [apt_cache, "search", "--names-only", "^libllvm[0-9]+(t64)?$"]
+    return apt_packages(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
+
+
+def install_line() -> str:
+    """The one line that installs an LLVM on this machine."""
+    families = _os_families()
+    if families & {"debian", "ubuntu"}:
+        package = next(iter(_offered_by_apt()), "libllvm19")
+        return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
+    if families & {"fedora", "rhel", "centos"}:
+        return "sudo dnf install -y llvm-libs libatomic"
+    if families & {"arch"}:
+        return "sudo pacman -S --needed llvm-libs"
+    if families & {"suse", "opensuse"}:
+        return "sudo zypper install -y libLLVM19 libatomic1"
+    if families & {"darwin"}:
+        return "brew install llvm"
+    return f"export {LIBRARY_VARIABLE}=/path/to/libLLVM.so  # any LLVM of {MINIMUM_MAJOR} or newer"
+
+
+def root_prefix() -> list[str] | None:
+    """What to put before a command that needs root: nothing, sudo, or None when it may not be run."""
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        return []
+    sudo = shutil.which("sudo")
+    if sudo is None:
+        return None
+    silent = subprocess.run([sudo, "-n", "true"], capture_output=True, check=False).returncode == 0
+    if silent:
+        return [sudo, "-n"]
+    return [sudo] if sys.stdin is not None and sys.stdin.isatty() else None
+
+
+def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | None = None) -> Trial | None:
+    """Install the distribution's newest LLVM runtime with apt, trying older ones if its trial fails.
+
+    Parameters
+    ----------
+    say : callable
+        Told each command before it runs.
+    attempt : callable, optional
+        The trial; :func:`try_library` by default.
+
+    Returns
+    -------
+    Trial or None
+        The trial of what was installed; None if nothing could be (not Debian or Ubuntu, no root, no package).
+    """
+    prefix = root_prefix()
+    if prefix is None or not _os_families() & {"debian", "ubuntu"} or shutil.which("apt-get") is None:
+        return None
+
+    def apt_get(*arguments: str) -> bool:
+        command = [*prefix, "env", "DEBIAN_FRONTEND=noninteractive", "apt-get", *arguments]
+        say(" ".join(command))
+        # a person may have to answer sudo; apt itself asks nothing
+        done = subprocess.run(command, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True, check=False)
+        if done.returncode:
+            say(done.stdout.strip()[-1000:])
+        return done.returncode == 0
+
+    def apt_install(*packages: str) -> Trial | None:
+        if not apt_get("install", "-y", "-qq", "--no-install-recommends", *packages):
+            return None
+        trials = first_that_works(candidates(), attempt)
+        return trials[-1] if trials else None
+
+    apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
+    # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
+    wanted: list[tuple[str, ...]] = [(APT_RUNTIME,)] if candidates() else []
+    wanted += [(package, APT_RUNTIME) for package in _offered_by_apt()]
+    last: Trial | None = None
+    for packages in wanted:
+        last = apt_install(*packages) or last
+        if last is not None and last.ok:
+            break
+    return last

@@ -1,0 +1,219 @@
+"""One engine checked against the other on a spread of links."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from ..common.units import FloatArray, IntArray
+from ..site.site import Site
+from .arrays import Link, Poses
+from .crowns import Crowns
+from .image import planes_of
+from .paths import PathSet, joined
+from .tracer import Engine, Loss, Replay
+from .tracer import replay as run_replay
+
+RANK_K = (10.0, 100.0, 1000.0)
+"""Singular-value ratios of the paper."""
+
+
+@dataclass(frozen=True, slots=True)
+class Difference:
+    """What one replay has and another has not, on the same poses.
+
+    Parameters
+    ----------
+    missing_paths, extra_paths : int
+        Paths of the reference that the engine lacks; paths of the engine that the reference lacks.
+    reference_paths : int
+    rss_max_error_db, rss_rms_error_db : float
+        Of the coherent RSS, over links that both cover; NaN when there is none.
+    coverage_differs : int
+        Links that only one of the two covers.
+    rank_disagreement : dict of float to float
+        Share of links whose rank differs, for each K; a link without a path has rank 0.
+    """
+
+    missing_paths: int
+    extra_paths: int
+    reference_paths: int
+    rss_max_error_db: float
+    rss_rms_error_db: float
+    coverage_differs: int
+    rank_disagreement: dict[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class Audit:
+    """A replay checked by the other engine.
+
+    Parameters
+    ----------
+    engine, reference : str
+    links : int
+        Pose-tower pairs checked.
+    difference : Difference
+    seconds, reference_seconds : float
+        Time of the replay (all its links) and of the reference on the checked links; a reference whose paths came
+        from the cache counts with the time its search once took.
+    """
+
+    engine: str
+    reference: str
+    links: int
+    difference: Difference
+    seconds: float
+    reference_seconds: float
+
+    @property
+    def missing_paths(self) -> int:
+        """Paths that the reference has and the replay lacks."""
+        return self.difference.missing_paths
+
+    @property
+    def extra_paths(self) -> int:
+        """Paths that the replay has and the reference lacks."""
+        return self.difference.extra_paths
+
+    @property
+    def rss_max_error_db(self) -> float:
+        """Largest difference of RSS on links both cover."""
+        return self.difference.rss_max_error_db
+
+    @property
+    def rank_disagreement(self) -> dict[float, float]:
+        """Share of links whose rank differs, per K."""
+        return self.difference.rank_disagreement
+
+    def as_dict(self) -> dict[str, object]:
+        """For ``metrics.json``: plain numbers, K as text, None for a difference that no link could show."""
+        d = self.difference
+        return {
+            "engine": self.engine,
+            "reference": self.reference,
+            "links": self.links,
+            "reference_paths": d.reference_paths,
+            "missing_paths": d.missing_paths,
+            "extra_paths": d.extra_paths,
+            "rss_max_error_db": _number(d.rss_max_error_db),
+            "rss_rms_error_db": _number(d.rss_rms_error_db),
+            "coverage_differs": d.coverage_differs,
+            "rank_disagreement": {f"{k:g}": share for k, share in d.rank_disagreement.items()},
+            "seconds": self.seconds,
+            "reference_seconds": self.reference_seconds,
+        }
+
+
+def audit(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    replay: Replay,
+    *,
+    reference: Engine | None = None,
+    links: int | None = 200,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    loss: Loss | None = None,
+    crowns: Crowns | None = None,
+    cache_dir: str | Path | None = None,
+    ks: Sequence[float] = RANK_K,
+) -> Audit:
+    """Check a replay by another engine, on the whole scene (nothing left out).
+
+    Parameters
+    ----------
+    site, link, poses
+        As given to the replay.
+    replay : Replay
+        The result to check.
+    reference : {"image", "sionna"}, optional
+        Default: the engine that the replay did not take.
+    links : int or None
+        About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
+    max_depth, samples, batch, loss, crowns, cache_dir
+        As given to the replay.
+    ks : sequence of float
+        Singular-value ratios of the rank comparison.
+
+    Returns
+    -------
+    Audit
+    """
+    chosen = _spread(poses, None if links is None else -(-links // max(1, len(replay.towers))))
+    other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
+    few = Poses(poses.position_m[chosen], poses.rotation[chosen])
+    checked = run_replay(
+        site,
+        link,
+        few,
+        other,
+        max_depth=max_depth,
+        samples=samples,
+        batch=batch,
+        loss=loss,
+        crowns=crowns,
+        cache_dir=cache_dir,
+    )
+    return Audit(
+        engine=replay.engine,
+        reference=other,
+        links=len(chosen) * len(replay.towers),
+        difference=compare(replay, checked, chosen, ks),
+        seconds=replay.seconds,
+        reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
+    )
+
+
+def _spread(poses: Poses, count: int | None) -> IntArray:
+    """Indices of poses with a position, evenly spread."""
+    good = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    if count is None or count >= len(good):
+        return good
+    return np.asarray(good[np.linspace(0, len(good) - 1, count).round().astype(np.int64)])
+
+
+def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:
+    """Differences of a replay from a reference that has only the poses ``chosen``."""
+    # numbered together: the facets of crowns that a replay lists depend on its poses
+    plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
+    ours = _keys(replay, plane[0], chosen)
+    theirs = _keys(reference, plane[1], np.arange(len(chosen)))
+    level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
+    both = np.isfinite(level) & np.isfinite(level_reference)
+    error = np.abs(level[both] - level_reference[both])
+    return Difference(
+        missing_paths=len(theirs - ours),
+        extra_paths=len(ours - theirs),
+        reference_paths=len(theirs),
+        rss_max_error_db=float(error.max()) if error.size else float("nan"),
+        rss_rms_error_db=float(np.sqrt((error**2).mean())) if error.size else float("nan"),
+        coverage_differs=int((replay.has_path[chosen] != reference.has_path).sum()),
+        rank_disagreement=_rank_disagreement(replay.h[chosen], reference.h, ks),
+    )
+
+
+def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dict[float, float]:
+    from ..compare.rank import channel_rank
+
+    return {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference, k))) for k in ks}  # type: ignore[arg-type]
+
+
+def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> set[tuple[int, ...]]:
+    """Paths as (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
+    place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
+    place[chosen] = np.arange(len(chosen))
+    paths: PathSet = replay.paths.select(place[replay.paths.pose] >= 0)
+    plane = np.append(planes, -1)
+    rows = np.column_stack([place[paths.pose], paths.tower, plane[paths.faces]])
+    # without the padding: the two may have different depths
+    return {tuple(n for n in row if n >= 0) for row in rows.tolist()}
+
+
+def _number(value: float | FloatArray) -> float | None:
+    return float(value) if np.isfinite(value) else None

@@ -1,0 +1,77 @@
+"""Closed-form baselines beside every ray-traced number: free space and two-ray ground reflection."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..common.units import FloatArray, wavelength_m
+from ..site.materials import material
+from .channel import reflection_coefficients
+
+
+def free_space_dbm(
+    sources_m: FloatArray, targets_m: FloatArray, carrier_hz: float, transmit_power_dbm: float = 0.0
+) -> FloatArray:
+    """Received power between isotropic antennas in empty space (Friis) [dBm].
+
+    Parameters
+    ----------
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+    carrier_hz, transmit_power_dbm : float
+
+    Returns
+    -------
+    (poses, towers)
+    """
+    distance = np.linalg.norm(targets_m[:, None, :] - sources_m[None, :, :], axis=2)
+    with np.errstate(divide="ignore"):
+        return np.asarray(transmit_power_dbm + 20.0 * np.log10(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
+
+
+def two_ray_dbm(
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    carrier_hz: float,
+    transmit_power_dbm: float = 0.0,
+    *,
+    ground_material: str = "medium_dry_ground",
+    ground_m: FloatArray | float = 0.0,
+    polarisation: str = "vertical",
+) -> FloatArray:
+    """Line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
+
+    Parameters
+    ----------
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+    carrier_hz, transmit_power_dbm : float
+    ground_material : str
+        Half-space below ``ground_m``.
+    ground_m : float or (towers,)
+        Height of the ground at each tower.
+    polarisation : {"vertical", "horizontal"}
+        Decides the Fresnel coefficient: TM or TE. For vertical antennas whose gain does not depend on direction
+        this is the field along theta, which the reflection keeps.
+
+    Returns
+    -------
+    (poses, towers)
+        NaN for poses below the ground.
+    """
+    wavelength = wavelength_m(carrier_hz)
+    across = np.linalg.norm(targets_m[:, None, :2] - sources_m[None, :, :2], axis=2)
+    ground = np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (len(sources_m),))
+    low = sources_m[None, :, 2] - ground
+    high = targets_m[:, None, 2] - ground[None, :]
+    direct = np.hypot(across, high - low)
+    bounced = np.hypot(across, high + low)
+    eta = np.asarray(material(ground_material).relative_permittivity(carrier_hz))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        te, tm = reflection_coefficients(np.abs(high + low) / bounced, eta, np.asarray(np.inf), wavelength)
+        gamma = tm if polarisation == "vertical" else te
+        # the difference of the two lengths, without cancellation
+        extra = 4.0 * high * low / (bounced + direct)
+        field = 1.0 / direct + gamma / bounced * np.exp(-2j * np.pi * extra / wavelength)
+        level = transmit_power_dbm + 20.0 * np.log10(wavelength / (4.0 * np.pi) * np.abs(field))
+    return np.asarray(np.where(high >= 0.0, level, np.nan))

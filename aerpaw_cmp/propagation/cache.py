@@ -1,0 +1,77 @@
+"""Content-addressed cache of paths on disk.
+
+Paths depend on the faces, the ends and the search, not on arrays, attitude or power: one entry serves every array.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import hashlib
+import io
+import zipfile
+from dataclasses import asdict
+from importlib import metadata
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .. import __version__
+from ..common.files import whole
+from ..common.units import FloatArray
+from .paths import PathSet
+
+if TYPE_CHECKING:
+    from .tracer import Scene, Settings
+
+LAYOUT = 2
+"""Raised whenever the entries or the search change."""
+
+_COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
+
+
+class PathCache:
+    """Path sets as ``<sha256>.npz`` in one folder.
+
+    Parameters
+    ----------
+    folder : Path
+        Created when the first entry is saved.
+    """
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+
+    def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, settings: Settings) -> str:
+        """Digest of everything that decides the paths."""
+        digest = hashlib.sha256()
+        versions = [__version__, str(LAYOUT)]
+        if settings.engine == "sionna":
+            versions += [metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
+            versions += [str(carrier_hz), *scene.faces.material]
+        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()))])
+        digest.update(text.encode())
+        faces = scene.faces
+        for polygon in faces.polygon:
+            digest.update(b"-" if polygon is None else polygon.wkb)
+        columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
+        for column in (*columns, scene.sources_m, scene.usable, scene.excluded, targets_m):
+            digest.update(str(column.shape).encode() + np.ascontiguousarray(column).tobytes())
+        return digest.hexdigest()
+
+    def load(self, key: str) -> tuple[PathSet, float] | None:
+        """Paths and the seconds that their search took; None when the entry is missing or damaged."""
+        try:
+            # in memory first: np.load leaves a damaged file open
+            data = io.BytesIO((self.folder / f"{key}.npz").read_bytes())
+            with np.load(data, allow_pickle=False) as entry:
+                return PathSet(*(entry[name] for name in _COLUMNS)), float(entry["seconds"])
+        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            return None
+
+    def save(self, key: str, paths: PathSet, seconds: float) -> None:
+        """Write an entry; another process sees either nothing or all of it."""
+        with contextlib.suppress(OSError):  # a cache that cannot be written is no reason to fail
+            self.folder.mkdir(parents=True, exist_ok=True)
+            with whole(self.folder / f"{key}.npz") as part, part.open("wb") as stream:
+                np.savez(stream, seconds=seconds, **{column: getattr(paths, column) for column in _COLUMNS})

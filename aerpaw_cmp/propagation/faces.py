@@ -1,0 +1,300 @@
+"""The planar faces of a site: one ground plane per ground height, walls and flat roofs of the buildings.
+
+Walls reach below the ground so that no crack stays at their foot; buildings have no bottom. Collinear edges of a
+footprint are one wall, however many vertices the map gave it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+from shapely.geometry.polygon import orient
+
+from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
+from ..site.site import Building, Site
+from .paths import Faces
+
+WALL_FOOT_M = 0.5
+"""Walls start this far below the lower of their base and the site ground."""
+
+COLLINEAR = 1e-9
+"""Sine of the angle between two edges below which they are one wall."""
+
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+@dataclass(frozen=True, slots=True)
+class _Face:
+    normal: FloatArray
+    along: FloatArray
+    across: FloatArray
+    offset_m: float
+    lower: tuple[float, float]
+    upper: tuple[float, float]
+    polygon: Polygon | None
+    material: str
+    label: str
+    solid: int
+
+
+def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
+    """Faces of a site.
+
+    Parameters
+    ----------
+    site : Site
+    towers : sequence of str, optional
+        Towers whose ground heights need a plane (default: all of the site, at least ``up = 0``).
+
+    Returns
+    -------
+    Faces
+        Ground planes first (``solid`` is -1), then walls and roof of each building.
+    """
+    grounds = sorted({site.towers[name].ground_m for name in (towers or site.towers)}) or [0.0]
+    faces = [_ground(height, site.ground_material, len(grounds) > 1) for height in grounds]
+    for index, building in enumerate(site.buildings):
+        for part in _parts(building.footprint):
+            faces.extend(_walls(building, part, index))
+            faces.append(_roof(building, part, index))
+    return Faces(
+        normal=np.array([f.normal for f in faces]),
+        offset_m=np.array([f.offset_m for f in faces]),
+        material=tuple(f.material for f in faces),
+        label=tuple(f.label for f in faces),
+        along=np.array([f.along for f in faces]),
+        across=np.array([f.across for f in faces]),
+        lower=np.array([f.lower for f in faces]),
+        upper=np.array([f.upper for f in faces]),
+        polygon=tuple(f.polygon for f in faces),
+        solid=np.array([f.solid for f in faces], dtype=np.int64),
+    )
+
+
+def _ground(height_m: float, material: str, several: bool) -> _Face:
+    label = f"ground at {height_m:g} m" if several else "ground"
+    infinite = (np.inf, np.inf)
+    return _Face(
+        _UP,
+        np.array([1.0, 0, 0]),
+        np.array([0, 1.0, 0]),
+        height_m,
+        (-np.inf, -np.inf),
+        infinite,
+        None,
+        material,
+        label,
+        -1,
+    )
+
+
+def _parts(footprint: Polygon) -> list[Polygon]:
+    """Valid, counter-clockwise polygons (holes clockwise) without collinear vertices."""
+    valid = footprint if footprint.is_valid else shapely.make_valid(footprint)
+    polygons = [part for part in shapely.get_parts(valid) if part.geom_type == "Polygon" and part.area > 0.0]
+    return [
+        orient(Polygon(_corners(part.exterior), [_corners(hole) for hole in part.interiors]), 1.0) for part in polygons
+    ]
+
+
+def _corners(ring: shapely.LinearRing) -> FloatArray:
+    """Vertices (corners, 2) of a ring at which it turns."""
+    points = np.asarray(ring.coords, dtype=np.float64)[:-1, :2]
+    while len(points) > 3:
+        before = points - np.roll(points, 1, axis=0)
+        after = np.roll(points, -1, axis=0) - points
+        length = np.linalg.norm(before, axis=1) * np.linalg.norm(after, axis=1)
+        turn = before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
+        flat = np.abs(turn) <= COLLINEAR * length
+        if not flat.any():
+            break
+        points = np.delete(points, np.flatnonzero(flat)[0], axis=0)  # one at a time: neighbours change
+    return points
+
+
+def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
+    foot = min(building.base_m, 0.0) - WALL_FOOT_M
+    top = building.base_m + building.height_m
+    faces: list[_Face] = []
+    for ring in (footprint.exterior, *footprint.interiors):
+        points = np.asarray(ring.coords, dtype=np.float64)
+        for start, end in pairwise(points):
+            edge = end - start
+            length = float(np.hypot(*edge))
+            # the solid lies left of every edge, so the outward normal is to the right
+            along = np.array([edge[0], edge[1], 0.0]) / length
+            normal = np.array([along[1], -along[0], 0.0])
+            first = float(along[:2] @ start)
+            label = f"{building.name} wall {len(faces) + 1}"
+            offset = float(normal[:2] @ start)
+            faces.append(
+                # along x up = (along_north, -along_east, 0): the outward normal
+                _Face(
+                    normal,
+                    along,
+                    _UP,
+                    offset,
+                    (first, foot),
+                    (first + length, top),
+                    None,
+                    building.material,
+                    label,
+                    solid,
+                )
+            )
+    return faces
+
+
+def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
+    """Roof; its axes follow the longest edge, so that a rectangular roof fills its bounds."""
+    points = np.asarray(footprint.exterior.coords, dtype=np.float64)
+    edges = np.diff(points, axis=0)
+    longest = edges[np.argmax(np.hypot(edges[:, 0], edges[:, 1]))]
+    along = np.array([longest[0], longest[1], 0.0]) / np.hypot(*longest)
+    across = np.array([-along[1], along[0], 0.0])
+    turned = shapely.transform(footprint, lambda p: p @ np.column_stack([along[:2], across[:2]]))
+    low_a, low_b, high_a, high_b = turned.bounds
+    fills = np.isclose(turned.area, (high_a - low_a) * (high_b - low_b), rtol=1e-12, atol=0.0)
+    polygon = None if fills else turned
+    if polygon is not None:
+        shapely.prepare(polygon)
+    height = building.base_m + building.height_m
+    label = f"{building.name} roof"
+    return _Face(_UP, along, across, height, (low_a, low_b), (high_a, high_b), polygon, building.material, label, solid)
+
+
+def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: float) -> BoolArray:
+    """Which points, taken as lying in the plane of their face, belong to the face.
+
+    Parameters
+    ----------
+    faces : Faces
+    index : (points,) int
+        Face of each point.
+    points_m : (points, 3)
+    tolerance_m : float
+        How far outside an edge a point still counts; negative: how far inside it must lie.
+
+    Returns
+    -------
+    (points,) bool
+    """
+    a = np.einsum("ij,ij->i", faces.along[index], points_m)
+    b = np.einsum("ij,ij->i", faces.across[index], points_m)
+    low, high = faces.lower[index] - tolerance_m, faces.upper[index] + tolerance_m
+    good = (a >= low[:, 0]) & (a <= high[:, 0]) & (b >= low[:, 1]) & (b <= high[:, 1])
+    for face in np.unique(index[good]):
+        polygon = faces.polygon[face]
+        if polygon is None:
+            continue
+        rows = np.flatnonzero(good & (index == face))
+        hit = shapely.intersects_xy(polygon, a[rows], b[rows])
+        if tolerance_m > 0.0 and not hit.all():
+            hit = hit | shapely.dwithin(polygon, shapely.points(a[rows], b[rows]), tolerance_m)
+        elif tolerance_m < 0.0 and hit.any():
+            hit = hit & ~shapely.dwithin(polygon.boundary, shapely.points(a[rows], b[rows]), -tolerance_m)
+        good[rows] = hit
+    return np.asarray(good)
+
+
+def corners(faces: Faces, reach_m: float = np.inf) -> FloatArray:
+    """Corners (faces, 4, 3) of the in-plane bounds, in order round the face; infinite ones cut at ``reach_m``."""
+    low = np.clip(faces.lower, -reach_m, reach_m)
+    high = np.clip(faces.upper, -reach_m, reach_m)
+    a = np.stack([low[:, 0], high[:, 0], high[:, 0], low[:, 0]], axis=1)
+    b = np.stack([low[:, 1], low[:, 1], high[:, 1], high[:, 1]], axis=1)
+    return np.asarray(
+        (faces.normal * faces.offset_m[:, None])[:, None, :]
+        + a[..., None] * faces.along[:, None, :]
+        + b[..., None] * faces.across[:, None, :]
+    )
+
+
+def triangles(faces: Faces, reach_m: float) -> tuple[FloatArray, IntArray, IntArray]:
+    """Triangulation of all faces, for ray tracers.
+
+    Parameters
+    ----------
+    faces : Faces
+    reach_m : float
+        Infinite faces end here.
+
+    Returns
+    -------
+    vertices_m : (vertices, 3)
+    triangle : (triangles, 3) int
+        Vertex indices, counter-clockwise seen from the front.
+    face : (triangles,) int
+        Face of each triangle.
+    """
+    vertices: list[FloatArray] = []
+    owner: list[int] = []
+    box = corners(faces, reach_m)
+    for index, polygon in enumerate(faces.polygon):
+        if polygon is None:
+            quad = box[index]
+            parts = [quad[[0, 1, 2]], quad[[0, 2, 3]]]
+        else:
+            base = faces.normal[index] * faces.offset_m[index]
+            axes = np.stack([faces.along[index], faces.across[index]])
+            pieces = shapely.get_parts(shapely.constrained_delaunay_triangles(polygon))
+            parts = [base + np.asarray(orient(piece, 1.0).exterior.coords)[:3] @ axes for piece in pieces]
+        vertices.extend(parts)
+        owner.extend([index] * len(parts))
+    stacked = np.concatenate(vertices) if vertices else np.zeros((0, 3))
+    return stacked, np.arange(len(stacked), dtype=np.int64).reshape(-1, 3), np.array(owner, dtype=np.int64)
+
+
+def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
+    """Points (points,) strictly inside a building."""
+    result = np.zeros(len(points_m), dtype=np.bool_)
+    for building in site.buildings:
+        top = building.base_m + building.height_m
+        low = np.flatnonzero(points_m[:, 2] < top)
+        if len(low):
+            result[low] |= shapely.contains_xy(building.footprint, points_m[low, 0], points_m[low, 1])
+    return result
+
+
+def smaller_than_fresnel_zone(
+    faces: Faces, sources_m: FloatArray, targets_m: FloatArray, frequency_hz: float
+) -> BoolArray:
+    """Faces smaller than the first Fresnel zone of every link: they scatter, they are no mirrors.
+
+    The zone on a face at distances d1 and d2 has the area ``pi lambda d1 d2 / (d1 + d2)`` at least; a face is
+    named only when it is smaller for the nearest source and the nearest target it can have.
+
+    Returns
+    -------
+    (faces,) bool
+    """
+    span = faces.upper - faces.lower
+    area = span[:, 0] * span[:, 1]
+    for index, polygon in enumerate(faces.polygon):
+        if polygon is not None:
+            area[index] = polygon.area
+    near_source = _distance(faces, sources_m)
+    near_target = _distance(faces, targets_m)
+    total = near_source + near_target
+    with np.errstate(invalid="ignore", divide="ignore"):
+        zone = np.pi * wavelength_m(frequency_hz) * near_source * near_target / total
+    return np.asarray(area < np.where(total > 0.0, zone, 0.0))
+
+
+def _distance(faces: Faces, points_m: FloatArray) -> FloatArray:
+    """Distance (faces,) from each face (its bounds) to the nearest of the points."""
+    best = np.full(len(faces), np.inf)
+    for chunk in np.array_split(points_m, max(1, len(points_m) * len(faces) // 1_000_000)):
+        height = faces.normal @ chunk.T - faces.offset_m[:, None]
+        a = faces.along @ chunk.T
+        b = faces.across @ chunk.T
+        out_a = np.maximum(np.maximum(faces.lower[:, :1] - a, a - faces.upper[:, :1]), 0.0)
+        out_b = np.maximum(np.maximum(faces.lower[:, 1:] - b, b - faces.upper[:, 1:]), 0.0)
+        if chunk.size:
+            best = np.minimum(best, np.sqrt(height**2 + out_a**2 + out_b**2).min(axis=1))
+    return best

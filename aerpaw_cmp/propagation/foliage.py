@@ -1,0 +1,462 @@
+"""Loss in trees along traced paths, in closed form; crowns that reflect are in :mod:`aerpaw_cmp.propagation.crowns`.
+
+Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is cut with every
+crown near it; the chords add up to the path's depth in foliage, and a model turns depth into loss. Nothing is traced
+again when a parameter changes, and the phase is left alone.
+
+Where crowns overlap both chords count. Trunks count only for :class:`Opaque`: as thin cylinders they shade
+centimetres where a crown shades metres.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import Literal, Protocol
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..site.site import Trees
+
+Shape = Literal["cone", "ellipsoid", "cylinder"]
+"""Form of a crown between its base and the tree's top; the paper's is the cone."""
+
+LEAFLESS_FACTOR = 1 / 1.2
+"""ITU-R P.833: near 1 GHz trees in leaf attenuate about 20 % more (dB/m) than leafless ones."""
+
+_PIECE_M = 8.0  # paths are looked up in pieces of this length
+_CELL_M = 4.0
+_MAX_CELLS = 4_000_000
+_PAIRS_AT_ONCE = 1_500_000  # of a piece and a body; about 150 MB of temporary arrays
+
+
+# ---------------------------------------------------------------- models: depth in foliage to loss
+
+
+class FoliageModel(Protocol):
+    """Anything that turns depth in foliage (...) [m] into loss (...) [dB]."""
+
+    def loss_db(self, depth_m: FloatArray) -> FloatArray:
+        """Loss [dB], 0 at depth 0."""
+        ...
+
+
+@dataclass(frozen=True, slots=True)
+class NoFoliage:
+    """Trees are not there."""
+
+    def loss_db(self, depth_m: FloatArray) -> FloatArray:
+        """Zero."""
+        return np.zeros_like(np.asarray(depth_m, dtype=np.float64))
+
+
+@dataclass(frozen=True, slots=True)
+class Opaque:
+    """Whatever touches a crown or a trunk is blocked (loss inf), as in arXiv 2502.10324."""
+
+    def loss_db(self, depth_m: FloatArray) -> FloatArray:
+        """Inf where depth > 0."""
+        depth = np.asarray(depth_m, dtype=np.float64)
+        return np.where(np.isnan(depth), np.nan, np.where(depth > 0, np.inf, 0.0))
+
+
+# P.833 (woodland, one terminal inside) tabulated: frequency [MHz], gamma [dB/m], A_m [dB]
+P833_TABLE: tuple[tuple[float, float, float], ...] = (
+    (105.9, 0.04, 9.4),
+    (466.475, 0.12, 18.0),
+    (949.0, 0.17, 26.5),
+    (1852.2, 0.30, 29.0),
+    (2117.5, 0.34, 34.1),
+)
+_GAMMA_EXPONENT = 0.70  # log-log fit of the table
+_MAXIMUM_EXPONENT = 0.43  # A_m = A1 f^0.43, P.833's own fit for Mulhouse
+
+
+@dataclass(frozen=True, slots=True)
+class P833:
+    """ITU-R P.833 woodland: ``A = A_m (1 - exp(-gamma d / A_m))``.
+
+    Parameters
+    ----------
+    gamma_db_per_m : float
+        Specific attenuation of short depths; 0.5 at 3.4 GHz (0.45 to 0.7 is plausible).
+    maximum_db : float
+        A_m, which the loss approaches in depth; 38 dB at 3.4 GHz.
+
+    Examples
+    --------
+    >>> P833(0.48, 38.0).loss_db(np.array([0.0, 10.0, 50.0])).round(1).tolist()
+    [0.0, 4.5, 17.8]
+    """
+
+    gamma_db_per_m: float = 0.5
+    maximum_db: float = 38.0
+
+    def __post_init__(self) -> None:
+        if not (0 <= self.gamma_db_per_m < math.inf and 0 < self.maximum_db < math.inf):
+            raise UsageError(
+                f"gamma is {self.gamma_db_per_m} dB/m and A_m {self.maximum_db} dB", expected="gamma >= 0 and A_m > 0"
+            )
+
+    @classmethod
+    def at(cls, frequency_hz: float, *, in_leaf: bool = True) -> P833:
+        """Parameters from the table, log-log interpolated.
+
+        Beyond its ends (106 MHz, 2.1 GHz) the nearest entry is continued with f^0.70 (gamma) and f^0.43 (A_m): 0.47
+        dB/m and 42 dB at 3.4 GHz, in leaf. Leafless gamma is ``LEAFLESS_FACTOR`` times that.
+
+        Raises
+        ------
+        UsageError
+            Outside 30 MHz to 100 GHz, the scope of P.833.
+        """
+        if not 30e6 <= frequency_hz <= 100e9:
+            raise UsageError(f"P.833 at {frequency_hz / 1e6:g} MHz", expected="30 MHz to 100 GHz")
+        table = np.log(np.array(P833_TABLE))
+        mhz = math.log(frequency_hz / 1e6)
+        inside = float(np.clip(mhz, table[0, 0], table[-1, 0]))
+        gamma = np.interp(inside, table[:, 0], table[:, 1]) + _GAMMA_EXPONENT * (mhz - inside)
+        maximum = np.interp(inside, table[:, 0], table[:, 2]) + _MAXIMUM_EXPONENT * (mhz - inside)
+        return cls(math.exp(gamma) * (1.0 if in_leaf else LEAFLESS_FACTOR), math.exp(maximum))
+
+    def loss_db(self, depth_m: FloatArray) -> FloatArray:
+        """Loss [dB] of depth [m]."""
+        depth = np.asarray(depth_m, dtype=np.float64)
+        return np.asarray(-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db))
+
+
+@dataclass(frozen=True, slots=True)
+class Weissberger:
+    """Modified exponential decay of Weissberger (1982), 0.23 to 95 GHz, depths to 400 m.
+
+    ``0.45 f^0.284 d`` up to 14 m, ``1.33 f^0.284 d^0.588`` beyond (f in GHz); at 14 m the two differ by 0.3 %.
+    Deeper than 400 m the second form is continued. Leafless trees take ``LEAFLESS_FACTOR`` of the loss: the model is
+    for trees in leaf and gives no other number.
+    """
+
+    frequency_hz: float = 3.4e9
+    in_leaf: bool = True
+
+    def __post_init__(self) -> None:
+        if not 0.23e9 <= self.frequency_hz <= 95e9:
+            raise UsageError(f"Weissberger at {self.frequency_hz / 1e9:g} GHz", expected="0.23 to 95 GHz")
+
+    def loss_db(self, depth_m: FloatArray) -> FloatArray:
+        """Loss [dB] of depth [m]."""
+        depth = np.asarray(depth_m, dtype=np.float64)
+        scale = (self.frequency_hz / 1e9) ** 0.284 * (1.0 if self.in_leaf else LEAFLESS_FACTOR)
+        return np.asarray(scale * np.where(depth <= 14.0, 0.45 * depth, 1.33 * np.abs(depth) ** 0.588))
+
+
+def foliage_model(
+    name: str,
+    frequency_hz: float,
+    *,
+    in_leaf: bool = True,
+    gamma_db_per_m: float | None = None,
+    maximum_db: float | None = None,
+) -> FoliageModel:
+    """A model by the words of flight.yaml: ``none``, ``opaque``, ``attenuating`` (= ``p833``) or ``weissberger``.
+
+    ``gamma_db_per_m`` and ``maximum_db`` replace the table's values in P.833.
+    """
+    if name in ("attenuating", "p833"):
+        table = P833.at(frequency_hz, in_leaf=in_leaf)
+        return P833(
+            table.gamma_db_per_m if gamma_db_per_m is None else gamma_db_per_m,
+            table.maximum_db if maximum_db is None else maximum_db,
+        )
+    if gamma_db_per_m is not None or maximum_db is not None:
+        raise UsageError(f"the foliage model '{name}' has neither gamma nor A_m", expected="the model 'attenuating'")
+    if name == "weissberger":
+        return Weissberger(frequency_hz, in_leaf)
+    if name == "opaque":
+        return Opaque()
+    if name == "none":
+        return NoFoliage()
+    raise UsageError(f"unknown foliage model '{name}'", expected="none, opaque, attenuating (p833) or weissberger")
+
+
+# ---------------------------------------------------------------- paths through trees
+
+
+def foliage_loss_db(
+    source_m: FloatArray,
+    vertices_m: FloatArray,
+    target_m: FloatArray,
+    trees: Trees | CrownIndex,
+    model: FoliageModel,
+    bounced: IntArray | None = None,
+) -> FloatArray:
+    """Loss of each path in foliage [dB].
+
+    Parameters
+    ----------
+    source_m, target_m : (paths, 3)
+        Ends of the paths, east-north-up [m].
+    vertices_m : (paths, depth, 3)
+        Reflection points in order; NaN where unused. ``depth`` may be 0.
+    trees : Trees or CrownIndex
+        Keep an index when many batches of paths meet the same trees.
+    model : FoliageModel
+        Depth to loss.
+    bounced : (paths, depth) int, optional
+        Tree whose crown reflects at each vertex, -1 for none (:attr:`aerpaw_cmp.propagation.paths.PathSet.tree`); at most
+        one per path. Only for :class:`Opaque` do crowns reflect: to any other model such a path does not exist.
+
+    Returns
+    -------
+    ndarray, (paths,)
+        The model's loss of the path's total depth; NaN where an end is not finite.
+    """
+    opaque = isinstance(model, Opaque)
+    if isinstance(model, NoFoliage):
+        loss = np.zeros(len(source_m))
+    else:
+        index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+        depth = foliage_depth_m(source_m, vertices_m, target_m, index, bounced if opaque else None)
+        if opaque:
+            depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
+        loss = model.loss_db(depth)
+    if bounced is not None and not opaque:
+        loss[(bounced >= 0).any(axis=1)] = np.inf
+    return loss
+
+
+def foliage_depth_m(
+    source_m: FloatArray,
+    vertices_m: FloatArray,
+    target_m: FloatArray,
+    trees: Trees | CrownIndex,
+    bounced: IntArray | None = None,
+) -> FloatArray:
+    """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`.
+
+    The crown off which a path bounces does not count on the two segments that meet there: a bounce is on its outside.
+    """
+    source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
+    vertices = np.asarray(vertices_m, dtype=np.float64)
+    index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+    depth = np.zeros(len(source))
+    end = target
+    last = vertices.shape[1] - 1
+    for k in range(last, -2, -1):  # from the target back; an unused vertex is the next one
+        start = source if k < 0 else np.where(np.isnan(vertices[:, k]), end, vertices[:, k])
+        moved = (start != end).any(axis=1)
+        own = None if bounced is None else bounced[moved][:, max(k, 0) : min(k, last - 1) + 2].max(axis=1, initial=-1)
+        depth[moved] += index.chords_m(start[moved], end[moved], own)
+        end = start
+    depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
+    return depth
+
+
+class CrownIndex:
+    """Crowns sorted into a grid, for many segments.
+
+    Parameters
+    ----------
+    trees : Trees
+        Any number.
+    shape : {"cone", "ellipsoid", "cylinder"}
+        Form of all crowns.
+    """
+
+    def __init__(self, trees: Trees, shape: Shape = "cone") -> None:
+        self.trees = trees
+        self.shape: Shape = shape
+        self._trunks: CrownIndex | None = None
+        base = trees.ground_m + trees.crown_base_m
+        top = trees.ground_m + trees.height_m
+        self._set(base, top, trees.crown_diameter_m / 2)
+
+    def trunks(self) -> CrownIndex:
+        """The trunks of the same trees, as cylinders from the ground to the crown."""
+        if self._trunks is None:
+            other = CrownIndex.__new__(CrownIndex)
+            other.trees, other.shape, other._trunks = self.trees, "cylinder", None
+            ground = self.trees.ground_m
+            other._set(ground, ground + self.trees.crown_base_m, self.trees.trunk_diameter_m / 2)
+            self._trunks = other
+        return self._trunks
+
+    def _set(self, base_m: FloatArray, top_m: FloatArray, radius_m: FloatArray) -> None:
+        solid = (radius_m > 0) & (top_m > base_m)
+        self._tree = np.flatnonzero(solid)
+        #: columns: east, north, base, top, radius
+        self._bodies = np.stack(
+            [self.trees.east_m[solid], self.trees.north_m[solid], base_m[solid], top_m[solid], radius_m[solid]], axis=-1
+        )
+        if not np.isfinite(self._bodies).all():
+            raise UsageError("a tree has a position or size that is not a number")
+        if len(self._bodies):
+            self._build_grid()
+
+    def _build_grid(self) -> None:
+        """Lists, per cell, the bodies within reach of any point of the cell (compressed rows)."""
+        centre, widest = self._bodies[:, :2], float(self._bodies[:, 4].max())
+        reach = widest + _PIECE_M / 2
+        low = centre.min(axis=0) - reach
+        span = centre.max(axis=0) + reach - low
+        self._cell_m = max(_CELL_M, math.sqrt(float(span.prod()) / _MAX_CELLS))
+        self._low, self._shape2 = low, (span / self._cell_m).astype(np.int64) + 1
+        home = ((centre - low) / self._cell_m).astype(np.int64)
+        steps = math.ceil(reach / self._cell_m)
+        around = np.arange(-steps, steps + 1)
+        offset = np.stack(np.meshgrid(around, around, indexing="ij"), axis=-1).reshape(-1, 2)
+        body, cell = [], []
+        for shift in offset:
+            at = home + shift
+            corner = low + at * self._cell_m
+            gap = np.maximum(np.maximum(corner - centre, centre - corner - self._cell_m), 0.0)
+            near = (
+                (np.hypot(gap[:, 0], gap[:, 1]) <= self._bodies[:, 4] + _PIECE_M / 2 + 1e-9)
+                & (at >= 0).all(axis=1)
+                & (at < self._shape2).all(axis=1)
+            )
+            body.append(np.flatnonzero(near))
+            cell.append(at[near, 0] * self._shape2[1] + at[near, 1])
+        cells, bodies = np.concatenate(cell), np.concatenate(body)
+        order = np.argsort(cells, kind="stable")
+        self._members = bodies[order]
+        self._row = np.zeros(int(self._shape2.prod()) + 1, dtype=np.int64)
+        np.cumsum(np.bincount(cells, minlength=len(self._row) - 1), out=self._row[1:])
+
+    def chords_m(self, start_m: FloatArray, end_m: FloatArray, without: IntArray | None = None) -> FloatArray:
+        """Length inside bodies of each segment (n,) [m]; ends (n, 3); ``without`` (n,) a tree that does not count."""
+        total = np.zeros(len(start_m))
+        if not len(self._bodies) or not len(start_m):
+            return total
+        first, last = self._within_heights(start_m, end_m)
+        along = np.hypot(end_m[:, 0] - start_m[:, 0], end_m[:, 1] - start_m[:, 1])
+        live = np.flatnonzero(last >= first)  # NaN compares false
+        pieces = np.ceil((last - first)[live] * along[live] / _PIECE_M).clip(1).astype(np.int64)
+        done = np.cumsum(pieces)
+        at_once = max(_PAIRS_AT_ONCE // max(int(np.diff(self._row).max()), 1), 1)
+        begin = 0
+        while begin < len(live):
+            used = done[begin - 1] if begin else 0
+            stop = max(begin + 1, int(np.searchsorted(done, used + at_once, side="right")))
+            some = live[begin:stop]
+            own = None if without is None else without[some]
+            total[some] = self._sum(start_m[some], end_m[some], first[some], last[some], pieces[begin:stop], own)
+            begin = stop
+        return total
+
+    def _within_heights(self, start_m: FloatArray, end_m: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Share of each segment (first, last) that lies between the lowest base and the highest top."""
+        low, high = self._bodies[:, 2].min(), self._bodies[:, 3].max()
+        return _slab(start_m[:, 2], end_m[:, 2] - start_m[:, 2], low, high)
+
+    def _sum(
+        self,
+        start: FloatArray,
+        end: FloatArray,
+        first: FloatArray,
+        last: FloatArray,
+        pieces: IntArray,
+        without: IntArray | None,
+    ) -> FloatArray:
+        """Chords of a batch, looked up piece by piece; each body counts in the piece nearest to it."""
+        move = end - start
+        segment = np.repeat(np.arange(len(start)), pieces)
+        number = np.arange(len(segment)) - np.repeat(np.cumsum(pieces) - pieces, pieces)
+        width = (last - first) / pieces
+        piece, body = self._candidates(start, move, first[segment] + (number + 0.5) * width[segment], segment)
+
+        # the piece that holds the point nearest to the body's axis speaks for the whole segment
+        owner = segment[piece]
+        low, wide = first[owner], width[owner]
+        step_east, step_north = move[owner, 0], move[owner, 1]
+        east = self._bodies[body, 0] - start[owner, 0]
+        north = self._bodies[body, 1] - start[owner, 1]
+        square = step_east * step_east + step_north * step_north
+        nearest = np.divide(east * step_east + north * step_north, square, out=low.copy(), where=square > 0)
+        np.clip(nearest, low, last[owner], out=nearest)
+        turn = np.divide(nearest - low, wide, out=np.zeros_like(low), where=wide > 0).astype(np.int64)
+        east -= nearest * step_east
+        north -= nearest * step_north
+        close = east * east + north * north < self._bodies[body, 4] ** 2
+        if without is not None:
+            close &= self._tree[body] != without[owner]
+        hit = np.flatnonzero(close & (np.minimum(turn, pieces[owner] - 1) == number[piece]))
+        owner, body = owner[hit], body[hit]
+        share = _chord_share(start[owner], move[owner], self._bodies[body], self.shape)
+        length = np.sqrt((move**2).sum(axis=1))
+        return np.bincount(owner, weights=share * length[owner], minlength=len(start)).astype(np.float64)
+
+    def _candidates(
+        self, start: FloatArray, move: FloatArray, middle: FloatArray, segment: IntArray
+    ) -> tuple[IntArray, IntArray]:
+        """Pairs (piece, body) of pieces, given by the middle of each, and the bodies listed in its cell."""
+        i = np.floor((start[segment, 0] + middle * move[segment, 0] - self._low[0]) / self._cell_m).astype(np.int64)
+        j = np.floor((start[segment, 1] + middle * move[segment, 1] - self._low[1]) / self._cell_m).astype(np.int64)
+        rows, columns = self._shape2
+        inside = np.flatnonzero((i >= 0) & (i < rows) & (j >= 0) & (j < columns))
+        cell = i[inside] * columns + j[inside]
+        count = self._row[cell + 1] - self._row[cell]
+        piece = np.repeat(inside, count)
+        slot = np.arange(len(piece)) + np.repeat(self._row[cell] - (np.cumsum(count) - count), count)
+        return piece, self._members[slot]
+
+
+def _slab(at: FloatArray, step: FloatArray, low: AnyArray, high: AnyArray) -> tuple[FloatArray, FloatArray]:
+    """Interval of t in [0, 1] with ``low <= at + t step <= high``; first > last when there is none."""
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, two = (low - at) / step, (high - at) / step
+    level = step == 0
+    inside = (at >= low) & (at <= high)
+    first = np.where(level, np.where(inside, 0.0, 1.0), np.maximum(np.minimum(one, two), 0.0))
+    last = np.where(level, np.where(inside, 1.0, 0.0), np.minimum(np.maximum(one, two), 1.0))
+    return first, last
+
+
+def _chord_share(start: FloatArray, move: FloatArray, bodies: FloatArray, shape: Shape) -> FloatArray:
+    """Share of each segment (n,) inside its body (n, 5: east, north, base, top, radius).
+
+    The side of a body is a quadric, ``A t^2 + 2 B t + C <= 0`` along the segment.
+    """
+    base, top, radius = bodies[:, 2], bodies[:, 3], bodies[:, 4]
+    first, last = _slab(start[:, 2], move[:, 2], base, top)
+    east, north = start[:, 0] - bodies[:, 0], start[:, 1] - bodies[:, 1]
+    a = move[:, 0] ** 2 + move[:, 1] ** 2
+    b = east * move[:, 0] + north * move[:, 1]
+    c = east**2 + north**2
+    if shape == "cone":  # r = slope (top - up)
+        slope, below = radius / (top - base), start[:, 2] - top
+        a = a - (slope * move[:, 2]) ** 2
+        b = b - slope**2 * below * move[:, 2]
+        c = c - (slope * below) ** 2
+    elif shape == "ellipsoid":
+        flat, below = 2 * radius / (top - base), start[:, 2] - (base + top) / 2
+        a = a + (flat * move[:, 2]) ** 2
+        b = b + flat**2 * below * move[:, 2]
+        c = c + (flat * below) ** 2 - radius**2
+    else:
+        c = c - radius**2
+    return _quadric_share(a, b, c, first, last, move[:, 2])
+
+
+def _quadric_share(
+    a: FloatArray, b: FloatArray, c: FloatArray, first: FloatArray, last: FloatArray, rise: FloatArray
+) -> FloatArray:
+    """Length of {t in [first, last]: a t^2 + 2 b t + c <= 0}, for the part of a double cone below its apex."""
+    root2 = b * b - a * c
+    # q avoids the cancellation of -b + sqrt(...); a = 0 (parallel to the cone's side) gives one root at infinity
+    q = -(b + np.copysign(np.sqrt(np.maximum(root2, 0.0)), b))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        one, two = q / np.where(a == 0, 0.0, a), c / q
+    nothing = q == 0  # b = 0 and a c = 0
+    one, two = np.where(nothing, 0.0, one), np.where(nothing, 0.0, two)
+    lower, upper = np.minimum(one, two), np.maximum(one, two)
+    steep = a < 0  # steeper than the cone's side: inside before the first root (rising) or after the second (falling)
+    lower, upper = (
+        np.where(steep, np.where(rise > 0, -np.inf, upper), lower),
+        np.where(steep, np.where(rise > 0, lower, np.inf), upper),
+    )
+    missed = (root2 < 0) & ~steep
+    flat: BoolArray = (a == 0) & (b == 0)
+    lower, upper = np.where(flat, -np.inf, lower), np.where(flat, np.where(c <= 0, np.inf, -np.inf), upper)
+    inside = np.minimum(upper, last) - np.maximum(lower, first)
+    return np.where(missed, 0.0, np.maximum(inside, 0.0))

@@ -1,0 +1,503 @@
+"""Every specular path by the image method: exhaustive, float64, vectorised over poses.
+
+For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path exists when
+
+1. each image lies in front of the next face, and the target in front of the last (decided per sequence);
+2. going back from the target, each line to the current image meets its face inside the polygon;
+3. no segment is cut by another face.
+
+A sequence is followed only while the beam from the image through its last face can still reach the next one.
+Sides are decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point.
+A solid hides only with its open inside: a segment that merely touches edges is decided by the points halfway between
+the touches. So a path along a wall stays, and there is no crack between two walls.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray
+from .faces import corners, inside
+from .paths import Faces, PathSet
+
+RELATIVE_TOLERANCE = 1e-12
+"""Of the largest coordinate: some thousand times the rounding error of a plane equation."""
+
+MINIMUM_LENGTH_M = 0.01
+"""A link shorter than this has no path: there is no far field, and no direction when it is zero."""
+
+SEQUENCE_BUDGET = 200_000
+"""Face sequences per tower beyond which the ``image`` engine gives up."""
+
+CELLS_PER_CHUNK = 1_000_000
+"""Bounds the memory of every dense step (8 MB per array)."""
+
+Progress = Callable[[float], None]
+Select = Callable[[int, "list[Sequences]"], "list[Sequences]"]
+
+
+def find_paths(
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    max_depth: int = 2,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    budget: int = SEQUENCE_BUDGET,
+    select: Select | None = None,
+    progress: Progress | None = None,
+) -> PathSet:
+    """All paths with at most ``max_depth`` reflections.
+
+    Parameters
+    ----------
+    faces : Faces
+        Closed solids and ground planes.
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+        NaN positions have no path.
+    max_depth : int
+        0 to 3.
+    usable : (towers, faces) bool, optional
+        Faces that may reflect for each tower (default: all). All faces hide.
+    excluded : (towers, poses) bool, optional
+        Links without any path, e.g. poses inside buildings.
+    budget : int
+        Largest number of sequences followed per tower.
+    select : callable, optional
+        ``select(tower, levels)`` gives the sequences to follow of those that geometry allows.
+    progress : callable, optional
+        Called with the share done.
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces.
+
+    Raises
+    ------
+    UsageError
+        If the scene has more sequences than the budget.
+    """
+    if not 0 <= max_depth <= 3:
+        raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
+    hiding = Occlusion(faces, tolerance_m)
+    known = targets_m[np.isfinite(targets_m).all(axis=1)]
+    box = corners(faces, 10.0 * float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
+    # without a second reflection nobody asks
+    facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
+    found: list[PathSet] = []
+    for tower, source in enumerate(sources_m):
+        usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
+        gap = np.linalg.norm(targets_m - source, axis=1)
+        alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
+        if excluded is not None:
+            alive &= ~excluded[tower]
+        poses = np.flatnonzero(alive)
+        if len(poses):
+            tree = Sequences.of(
+                faces, box, facing, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m
+            )
+            for level in select(tower, tree) if select else tree:
+                found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
+        if progress:
+            progress((tower + 1) / len(sources_m))
+    return merge(found, max_depth, faces)
+
+
+def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
+    """Absolute tolerance [m] of side tests in this scene."""
+    sizes = [np.nanmax(np.abs(p), initial=0.0, where=np.isfinite(p)) for p in (*points_m, faces.lower, faces.upper)]
+    return RELATIVE_TOLERANCE * max(1.0, *(float(s) for s in sizes))
+
+
+@dataclass(frozen=True, slots=True)
+class Sequences:
+    """Face sequences of one length with their images.
+
+    Parameters
+    ----------
+    faces : (sequences, depth) int
+    images_m : (sequences, depth, 3)
+        The source mirrored at the first 1, 2, ... faces.
+    """
+
+    faces: IntArray
+    images_m: FloatArray
+
+    @classmethod
+    def of(
+        cls,
+        faces: Faces,
+        box: FloatArray,
+        facing: BoolArray,
+        source: FloatArray,
+        targets: FloatArray,
+        usable: BoolArray,
+        max_depth: int,
+        budget: int,
+        tolerance_m: float,
+    ) -> list[Sequences]:
+        """Sequences of depth 0 .. max_depth that geometry does not rule out for any target.
+
+        ``box`` are the corners of the faces, ``facing`` which of them can follow which.
+        """
+        level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
+        levels = [level]
+        facing = facing & usable[None, :]
+        lit = (faces.normal @ targets.T - faces.offset_m[:, None] > tolerance_m).any(axis=1)
+        low, high = targets.min(axis=0), targets.max(axis=0)
+        hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
+        total = 1
+        for _ in range(max_depth):
+            level = _grow(faces, level, source, usable, facing, box, tolerance_m, budget - total)
+            total += len(level.faces)
+            if not len(level.faces):
+                break
+            levels.append(level)
+        return [_reaching(faces, step, lit, box, hull, tolerance_m) for step in levels]
+
+
+def _facing(faces: Faces, box: FloatArray, tolerance_m: float) -> BoolArray:
+    """Pairs (first, second) of which each has a point in front of the other."""
+    side = np.einsum("fi,gki->fgk", faces.normal, box) - faces.offset_m[:, None, None]
+    ahead = (side > tolerance_m).any(axis=2)
+    return np.asarray(ahead & ahead.T)
+
+
+def _grow(
+    faces: Faces,
+    level: Sequences,
+    source: FloatArray,
+    usable: BoolArray,
+    facing: BoolArray,
+    box: FloatArray,
+    tolerance_m: float,
+    budget: int,
+) -> Sequences:
+    """Sequences one face longer."""
+    grown: list[IntArray] = []
+    images: list[FloatArray] = []
+    count = 0
+    step = max(1, CELLS_PER_CHUNK // (8 * len(faces)))
+    for start in range(0, len(level.faces), step):
+        now = level.faces[start : start + step]
+        past = level.images_m[start : start + step]
+        last_image = past[:, -1] if now.shape[1] else np.broadcast_to(source, (len(now), 3))
+        height = last_image @ faces.normal.T - faces.offset_m
+        good = height > tolerance_m
+        if now.shape[1]:
+            good &= facing[now[:, -1]]
+            row, face = np.nonzero(good)
+            keep = _beam_meets(last_image[row], box[now[row, -1]], box[face], tolerance_m)
+            keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[now[row, -1], 0])
+            row, face = row[keep], face[keep]
+        else:
+            row, face = np.nonzero(good & usable)
+        mirrored = last_image[row] - 2.0 * height[row, face][:, None] * faces.normal[face]
+        grown.append(np.concatenate([now[row], face[:, None]], axis=1))
+        images.append(np.concatenate([past[row], mirrored[:, None]], axis=1))
+        count += len(row)
+        if count > budget:
+            raise UsageError(
+                f"the scene has more than {budget} face sequences of {now.shape[1] + 1} reflections "
+                f"({len(faces)} faces)",
+                expected="a rural scene with few faces",
+                cause="take engine 'sionna', a smaller max_depth, or leave out small faces",
+            )
+    return Sequences(np.concatenate(grown), np.concatenate(images))
+
+
+def _beam_meets(apex: FloatArray, window: FloatArray, target: FloatArray, tolerance_m: float) -> BoolArray:
+    """Whether the beam from ``apex`` through the quadrilateral ``window`` may meet the points ``target``.
+
+    apex (n, 3), window (n, 4, 3), target (n or 1, points, 3). Conservative: True unless one side plane of the
+    beam has all target points outside.
+    """
+    ray = window - apex[:, None, :]
+    side = np.cross(ray, np.roll(ray, -1, axis=1))
+    centre = window.mean(axis=1) - apex
+    # the sense in which the window goes round decides which way the side planes point
+    sense = np.sign(np.einsum("nki,ni->nk", side, centre).sum(axis=1))
+    size = np.linalg.norm(side, axis=2) + 1e-300
+    offset = np.matmul(target - apex[:, None, :], np.swapaxes(side, 1, 2)) * sense[:, None, None]
+    outside = offset < -tolerance_m * size[:, None, :]
+    return np.asarray(~outside.all(axis=1).any(axis=1))
+
+
+def _reaching(
+    faces: Faces, level: Sequences, lit: BoolArray, box: FloatArray, hull: FloatArray, tolerance_m: float
+) -> Sequences:
+    """Sequences whose last face, and the beam through it, can reach the box of targets."""
+    if not level.faces.shape[1]:
+        return level
+    last = level.faces[:, -1]
+    keep = lit[last]
+    row = np.flatnonzero(keep & np.isfinite(faces.lower[last, 0]))
+    for part in np.array_split(row, max(1, len(row) // 20_000)):
+        keep[part] = _beam_meets(level.images_m[part, -1], box[last[part]], hull[None], tolerance_m)
+    return Sequences(level.faces[keep], level.images_m[keep])
+
+
+def _paths_of_level(
+    faces: Faces,
+    level: Sequences,
+    source: FloatArray,
+    targets: FloatArray,
+    poses: IntArray,
+    tower: int,
+    max_depth: int,
+    hiding: Occlusion,
+) -> PathSet:
+    """Paths of all sequences of one length."""
+    depth = level.faces.shape[1]
+    pieces: list[PathSet] = []
+    pose_step = min(len(poses), 4096)
+    sequence_step = max(1, CELLS_PER_CHUNK // pose_step)
+    for first in range(0, len(poses), pose_step):
+        some = poses[first : first + pose_step]
+        for start in range(0, len(level.faces), sequence_step):
+            part = slice(start, start + sequence_step)
+            if depth:
+                row, column = meets_last_face(
+                    faces, level.faces[part, -1], level.images_m[part, -1], targets[some], hiding.tolerance_m
+                )
+            else:
+                row, column = np.zeros(len(some), np.int64), np.arange(len(some))
+            sequence, pose = level.faces[part][row], some[column]
+            vertices, good = trace_back(faces, sequence, level.images_m[part][row], targets[pose], hiding.tolerance_m)
+            sequence, pose, vertices = sequence[good], pose[good], vertices[good]
+            free = ~hiding.any_segment(np.broadcast_to(source, (len(pose), 3)), vertices, targets[pose])
+            pieces.append(_pad(pose[free], tower, sequence[free], vertices[free], max_depth))
+    return merge(pieces, max_depth, None)
+
+
+def meets_last_face(
+    faces: Faces, last: IntArray, image: FloatArray, targets: FloatArray, tolerance_m: float
+) -> tuple[IntArray, IntArray]:
+    """(sequence, target) pairs whose line from the last image meets the bounds of the last face.
+
+    The in-plane coordinates of the meeting point are linear in those of the target, which are shared by all
+    sequences that end on the face.
+    """
+    used, position = np.unique(last, return_inverse=True)
+    height = (faces.normal[used] @ targets.T - faces.offset_m[used, None])[position]
+    below = np.einsum("ij,ij->i", faces.normal[last], image) - faces.offset_m[last]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = below[:, None] / (below[:, None] - height)
+    share[height <= tolerance_m] = 0.0
+    good = height > tolerance_m
+    for axis, which in ((faces.along, 0), (faces.across, 1)):
+        start = np.einsum("ij,ij->i", axis[last], image)[:, None]
+        point = (axis[used] @ targets.T)[position]
+        point -= start
+        point *= share
+        point += start
+        good &= point >= faces.lower[last, which, None] - tolerance_m
+        good &= point <= faces.upper[last, which, None] + tolerance_m
+    row, column = np.nonzero(good)
+    return row, column
+
+
+def trace_back(
+    faces: Faces,
+    sequence: IntArray,
+    images_m: FloatArray,
+    targets_m: FloatArray,
+    tolerance_m: float,
+    edge_m: float | None = None,
+) -> tuple[FloatArray, BoolArray]:
+    """Reflection points of sequences, from the target back to the source.
+
+    Parameters
+    ----------
+    faces : Faces
+    sequence : (paths, depth) int
+    images_m : (paths, depth, 3)
+    targets_m : (paths, 3)
+    tolerance_m : float
+        For sides.
+    edge_m : float, optional
+        How far outside its face a point may lie (default: ``tolerance_m``).
+
+    Returns
+    -------
+    vertices_m : (paths, depth, 3)
+    good : (paths,) bool
+        Every point inside its face, and the sides in order.
+    """
+    count, depth = sequence.shape
+    vertices = np.zeros((count, depth, 3))
+    good = np.ones(count, dtype=np.bool_)
+    point = targets_m
+    for step in range(depth - 1, -1, -1):
+        face, image = sequence[:, step], images_m[:, step]
+        normal, offset = faces.normal[face], faces.offset_m[face]
+        ahead = np.einsum("ij,ij->i", normal, point) - offset
+        behind = offset - np.einsum("ij,ij->i", normal, image)
+        good &= (ahead > tolerance_m) & (behind > 0.0)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            share = behind / (behind + ahead)
+        share = np.where(good, share, 0.0)
+        point = image + share[:, None] * (point - image)
+        vertices[:, step] = point
+        good &= inside(faces, face, point, tolerance_m if edge_m is None else edge_m)
+    return vertices, good
+
+
+def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatArray:
+    """Images (paths, depth, 3) of the sources (paths, 3) at the faces of ``sequence`` (paths, depth)."""
+    images = np.zeros((*sequence.shape, 3))
+    point = sources_m
+    for step in range(sequence.shape[1]):
+        normal = faces.normal[sequence[:, step]]
+        height = np.einsum("ij,ij->i", normal, point) - faces.offset_m[sequence[:, step]]
+        point = point - 2.0 * height[:, None] * normal
+        images[:, step] = point
+    return images
+
+
+class Occlusion:
+    """Answers whether segments are cut by the faces of solids.
+
+    Parameters
+    ----------
+    faces : Faces
+        Faces with ``solid >= 0`` hide, the ground does not: nothing that is traced lies below it.
+    tolerance_m : float
+        A face is crossed by a segment whose ends lie farther than this on either side.
+    """
+
+    def __init__(self, faces: Faces, tolerance_m: float) -> None:
+        self.faces = faces
+        self.tolerance_m = tolerance_m
+        self.members = [np.flatnonzero(faces.solid == solid) for solid in np.unique(faces.solid[faces.solid >= 0])]
+        box = corners(faces, 0.0) if not self.members else corners(faces, 1e9)
+        self.low = np.array([box[m].min(axis=(0, 1)) for m in self.members]).reshape(-1, 3) - tolerance_m
+        self.high = np.array([box[m].max(axis=(0, 1)) for m in self.members]).reshape(-1, 3) + tolerance_m
+
+    def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
+        """Which polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
+        cut = np.zeros(len(sources_m), dtype=np.bool_)
+        start = sources_m
+        for step in range(vertices_m.shape[1] + 1):
+            end = vertices_m[:, step] if step < vertices_m.shape[1] else targets_m
+            rows = np.flatnonzero(~cut)
+            cut[rows] = self.segments(start[rows], end[rows])
+            start = end
+        return cut
+
+    def segments(self, start: FloatArray, end: FloatArray) -> BoolArray:
+        """Which segments (n, 3) - (n, 3) are cut."""
+        cut = np.zeros(len(start), dtype=np.bool_)
+        if not self.members:
+            return cut
+        step = max(1, CELLS_PER_CHUNK // len(self.members))
+        for first in range(0, len(start), step):
+            part = slice(first, first + step)
+            a, b = start[part], end[part]
+            near = self._boxes(a, b)
+            here = np.zeros(len(a), dtype=np.bool_)
+            for solid, members in enumerate(self.members):
+                rows = np.flatnonzero(near[:, solid] & ~here)
+                if len(rows):
+                    here[rows] = self._crosses(a[rows], b[rows], members)
+            cut[part] = here
+        return cut
+
+    def _boxes(self, start: FloatArray, end: FloatArray) -> BoolArray:
+        """Which segments meet which bounding boxes: slab test, (segments, solids)."""
+        direction = end - start
+        direction = np.where(direction == 0.0, 1e-300, direction)
+        enter = np.zeros((len(start), len(self.members)))
+        leave = np.ones_like(enter)
+        with np.errstate(over="ignore"):
+            for axis in range(3):
+                inverse = 1.0 / direction[:, axis, None]
+                one = (self.low[:, axis] - start[:, axis, None]) * inverse
+                two = (self.high[:, axis] - start[:, axis, None]) * inverse
+                np.maximum(enter, np.minimum(one, two), out=enter)
+                np.minimum(leave, np.maximum(one, two), out=leave)
+        return np.asarray(enter <= leave)
+
+    def _crosses(self, start: FloatArray, end: FloatArray, members: IntArray) -> BoolArray:
+        """Which segments cross one of the faces ``members``."""
+        faces, tolerance_m = self.faces, self.tolerance_m
+        normal, offset = faces.normal[members], faces.offset_m[members]
+        before = start @ normal.T - offset
+        after = end @ normal.T - offset
+        through = ((before > tolerance_m) & (after < -tolerance_m)) | ((before < -tolerance_m) & (after > tolerance_m))
+        row, column = np.nonzero(through)
+        share = before[row, column] / (before[row, column] - after[row, column])
+        point = start[row] + share[:, None] * (end[row] - start[row])
+        face = members[column]
+        surely = inside(faces, face, point, -tolerance_m)
+        result = np.zeros(len(start), dtype=np.bool_)
+        result[row[surely]] = True
+        touch = np.flatnonzero(~surely & ~result[row])
+        touch = touch[inside(faces, face[touch], point[touch], tolerance_m)]
+        if len(touch):
+            self._touching(result, start, end, row[touch], share[touch], members)
+        return result
+
+    def _touching(
+        self, result: BoolArray, start: FloatArray, end: FloatArray, row: IntArray, share: FloatArray, members: IntArray
+    ) -> None:
+        """Mark segments that pass through edges of a solid and run inside it between two of them."""
+        order = np.lexsort((share, row))
+        row, share = row[order], share[order]
+        pair = np.flatnonzero(row[1:] == row[:-1])
+        halfway = ((share[1:] + share[:-1]) / 2)[pair]
+        row = row[pair]
+        point = start[row] + halfway[:, None] * (end[row] - start[row])
+        for roof in members[self.faces.normal[members, 2] == 1.0]:
+            below = point[:, 2] < self.faces.offset_m[roof] - self.tolerance_m
+            under = inside(self.faces, np.full(len(point), roof), point, -self.tolerance_m)
+            result[row[below & under]] = True
+
+
+def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, max_depth: int) -> PathSet:
+    count, depth = sequence.shape
+    faces = np.full((count, max_depth), -1, dtype=np.int64)
+    points = np.full((count, max_depth, 3), np.nan)
+    faces[:, :depth] = sequence
+    points[:, :depth] = vertices
+    return PathSet(pose, np.full(count, tower), np.full(count, depth), faces, points)
+
+
+def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet:
+    """One sorted set of several; with ``faces``, of paths over coplanar faces that overlap only one is kept."""
+    pieces = [piece for piece in pieces if len(piece)]
+    if not pieces:
+        return PathSet.empty(max_depth)
+    pose = np.concatenate([p.pose for p in pieces])
+    tower = np.concatenate([p.tower for p in pieces])
+    depth = np.concatenate([p.depth for p in pieces])
+    sequence = np.concatenate([p.faces for p in pieces])
+    vertices = np.concatenate([p.vertices_m for p in pieces])
+    tree = np.concatenate([p.tree for p in pieces])
+    order = np.lexsort((*sequence.T[::-1], depth, tower, pose))
+    if faces is not None and len(order):
+        plane = planes_of(faces)
+        same = np.append(plane, -1)[sequence[order]]
+        key = np.column_stack([pose[order], tower[order], same])
+        repeated = np.zeros(len(order), dtype=np.bool_)
+        if len(np.unique(plane)) < len(plane):
+            _, first = np.unique(key, axis=0, return_index=True)
+            repeated[:] = True
+            repeated[first] = False
+        order = order[~repeated]
+    return PathSet(pose[order], tower[order], depth[order], sequence[order], vertices[order], tree[order])
+
+
+def planes_of(faces: Faces) -> IntArray:
+    """Number (faces,) of the plane each face lies in; coplanar faces that look the same way share it."""
+    key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
+    _, plane = np.unique(key + 0.0, axis=0, return_inverse=True)
+    return np.asarray(plane.reshape(-1), dtype=np.int64)

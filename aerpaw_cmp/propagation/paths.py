@@ -1,0 +1,132 @@
+"""One path record for every engine, as columns.
+
+A path is an ordered list of reflecting faces between the source (tower) and the target (UAV). Lengths, phases
+and fields are not stored: :mod:`aerpaw_cmp.propagation.channel` evaluates them in float64 from the faces.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from shapely.geometry import Polygon
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True)
+class Faces:
+    """Planar reflecting faces of a scene.
+
+    A point ``x`` on a face has the in-plane coordinates ``(along . x, across . x)`` [m]. Only the first four
+    columns decide fields; the others decide which points belong to a face. Left out, faces are whole planes.
+
+    Parameters
+    ----------
+    normal : (faces, 3)
+        Outward unit normal.
+    offset_m : (faces,)
+        ``normal . x = offset_m`` on the face.
+    material : tuple of str, length faces
+        Names that ``site.materials.face_material`` knows.
+    label : tuple of str, length faces
+        For reports, e.g. ``"ground"``, ``"barn wall 3"``.
+    along, across : (faces, 3)
+        In-plane unit axes, ``along x across = normal``.
+    lower, upper : (faces, 2)
+        Bounds of the in-plane coordinates; infinite for the ground.
+    polygon : tuple of Polygon or None, length faces
+        The face in its plane, where it does not fill its bounds.
+    solid : (faces,) int
+        Index of the building, -1 for the ground, which never hides anything. Faces of crowns, which only the paths
+        of :mod:`aerpaw_cmp.propagation.crowns` bring along, count on from the last building by tree.
+    """
+
+    normal: FloatArray
+    offset_m: FloatArray
+    material: tuple[str, ...]
+    label: tuple[str, ...]
+    along: FloatArray = field(default_factory=lambda: np.zeros(0))
+    across: FloatArray = field(default_factory=lambda: np.zeros(0))
+    lower: FloatArray = field(default_factory=lambda: np.zeros(0))
+    upper: FloatArray = field(default_factory=lambda: np.zeros(0))
+    polygon: tuple[Polygon | None, ...] = ()
+    solid: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        count = len(self.normal)
+        if len(self.along) == count:
+            return
+        # any axis that is not the normal will do for a whole plane
+        helper = np.eye(3)[np.argmin(np.abs(self.normal), axis=1)] if count else np.zeros((0, 3))
+        along = np.cross(helper, self.normal)
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        object.__setattr__(self, "along", along)
+        object.__setattr__(self, "across", np.cross(self.normal, along))
+        object.__setattr__(self, "lower", np.full((count, 2), -np.inf))
+        object.__setattr__(self, "upper", np.full((count, 2), np.inf))
+        object.__setattr__(self, "polygon", (None,) * count)
+        object.__setattr__(self, "solid", np.full(count, -1, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return len(self.normal)
+
+
+def joined(one: Faces, two: Faces) -> Faces:
+    """The faces of both, the first keeping their numbers."""
+    columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+    return Faces(
+        material=one.material + two.material,
+        label=one.label + two.label,
+        polygon=one.polygon + two.polygon,
+        **{name: np.concatenate([getattr(one, name), getattr(two, name)]) for name in columns},
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class PathSet:
+    """All paths of a replay, sorted by pose, tower, depth, faces.
+
+    Parameters
+    ----------
+    pose, tower : (paths,) int
+        Index of pose and tower.
+    depth : (paths,) int
+        Number of reflections; 0 is the line of sight.
+    faces : (paths, max_depth) int
+        Face indices from tower to UAV, -1 where unused.
+    vertices_m : (paths, max_depth, 3)
+        Reflection points for array centres, NaN where unused.
+    tree : (paths, max_depth) int
+        Tree whose crown reflects, -1 where something else does; left out, no crown does.
+    """
+
+    pose: IntArray
+    tower: IntArray
+    depth: IntArray
+    faces: IntArray
+    vertices_m: FloatArray
+    tree: IntArray = field(default_factory=lambda: np.zeros((0, 0), dtype=np.int64))
+
+    def __post_init__(self) -> None:
+        if self.tree.shape != self.faces.shape:
+            object.__setattr__(self, "tree", np.full(self.faces.shape, -1, dtype=np.int64))
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+    @property
+    def off_crown(self) -> BoolArray:
+        """Paths (paths,) that bounce off a crown."""
+        return np.asarray((self.tree >= 0).any(axis=1))
+
+    def select(self, rows: AnyArray) -> PathSet:
+        """The paths of a mask or of indices."""
+        pose, tower, depth, tree = self.pose[rows], self.tower[rows], self.depth[rows], self.tree[rows]
+        return PathSet(pose, tower, depth, self.faces[rows], self.vertices_m[rows], tree)
+
+    @classmethod
+    def empty(cls, max_depth: int) -> PathSet:
+        """No path at all."""
+        zero = np.zeros(0, dtype=np.int64)
+        return cls(zero, zero, zero, np.zeros((0, max_depth), dtype=np.int64), np.zeros((0, max_depth, 3)))

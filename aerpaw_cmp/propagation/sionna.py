@@ -1,0 +1,499 @@
+"""Sionna RT as a path finder; the only file that imports sionna, mitsuba and drjit.
+
+Sionna computes in float32 and finds paths by sampling. Only *which faces a path meets* is taken from it; reflection
+points come from the image method in float64 and fields from :mod:`aerpaw_cmp.propagation.channel`.
+
+Guards against what Sionna RT 2.2.0 does silently:
+
+- its hash table of candidates is shared by all receivers of a call and loses paths: a table of 2**24 slots and
+  batches of at most 100 poses;
+- it drops paths past ``max_num_paths_per_src`` and corrupts memory when that is below the number of receivers: the
+  limit is 1e6 and a batch that comes near it is an error;
+- positions given as numbers recompile kernels: they are arrays, and each batch has the same size (the last is padded);
+- a line of sight must have Friis' amplitude and no path a gain above one, or the run stops.
+"""
+
+from __future__ import annotations
+
+import gc
+from collections.abc import Iterator
+from dataclasses import dataclass
+from importlib import metadata
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import CheckError, UsageError
+from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from ..machine.llvm import prepare_llvm
+from ..site.materials import material
+from .arrays import Array, Link, Poses
+from .faces import inside, triangles
+from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
+from .paths import Faces, PathSet
+
+SPECULAR_TABLE_SLOTS = 2**24
+MAXIMUM_PATHS = 1_000_000
+LARGEST_BATCH = 100
+NO_SHAPE = 0xFFFFFFFF
+HALF_SPACE_THICKNESS_M = 10.0
+"""Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
+EDGE_TOLERANCE_M = 1e-3
+"""A float32 reflection point may lie this far outside its face."""
+
+
+def load_variant(prefer: str | None = None) -> str:
+    """Choose CUDA when a GPU is there, LLVM otherwise; the name of the variant.
+
+    Parameters
+    ----------
+    prefer : {"cuda", "llvm"}, optional
+        Ask for one of them.
+
+    Raises
+    ------
+    UsageError
+        If Dr.Jit finds no device of that kind.
+    CheckError
+        If no LLVM serves.
+    """
+    kinds = (prefer,) if prefer else ("cuda", "llvm")
+    without_llvm: CheckError | None = None
+    if "llvm" in kinds:
+        try:
+            prepare_llvm()  # before Dr.Jit looks for one by itself
+        except CheckError as error:
+            without_llvm = error  # a GPU may do without
+    import mitsuba as mi
+
+    current = mi.variant()
+    if current in [f"{kind}_ad_mono_polarized" for kind in kinds]:
+        return str(current)
+    import drjit as dr
+
+    for kind in kinds:
+        if kind == "llvm" and without_llvm:
+            raise without_llvm
+        if dr.has_backend(dr.JitBackend.CUDA if kind == "cuda" else dr.JitBackend.LLVM):
+            mi.set_variant(f"{kind}_ad_mono_polarized")
+            return str(mi.variant())
+    raise UsageError(
+        f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
+    )
+
+
+def engine_versions() -> dict[str, str]:
+    """Versions of sionna-rt, mitsuba and drjit (from their metadata), the variant and the LLVM in use."""
+    versions = {name: metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")}
+    versions["variant"] = load_variant()
+    import drjit as dr
+
+    if versions["variant"].startswith("llvm"):
+        versions["llvm"] = ".".join(str(part) for part in dr.detail.llvm_version())
+    return versions
+
+
+@dataclass(frozen=True, slots=True)
+class _Scene:
+    """A Sionna scene with the way back from its triangles to faces."""
+
+    scene: Any
+    face_of: dict[int, IntArray]
+    """object id -> face of each triangle"""
+
+
+def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float) -> _Scene:
+    """Scene of the faces ``chosen``: one mesh per material."""
+    import mitsuba as mi
+    import sionna.rt as rt
+
+    scene = rt.load_scene()
+    scene.frequency = carrier_hz
+    vertices, triangle, owner = triangles(faces, reach_m)
+    objects = []
+    owners = []
+    for name in dict.fromkeys(faces.material[i] for i in chosen):
+        members = [i for i in chosen if faces.material[i] == name]
+        rows = np.flatnonzero(np.isin(owner, members))
+        corners, place = np.unique(triangle[rows], return_inverse=True)
+        mesh = mi.Mesh(f"faces-{name}", vertex_count=len(corners), face_count=len(rows))
+        parameters = mi.traverse(mesh)
+        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices[corners], np.float32).ravel())
+        parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
+        parameters.update()
+        objects.append(rt.SceneObject(mi_mesh=mesh, name=f"faces-{name}", radio_material=_material(name, carrier_hz)))
+        owners.append(owner[rows])
+    scene.add(objects)
+    return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
+
+
+def _material(name: str, carrier_hz: float) -> Any:
+    import sionna.rt as rt
+
+    what = material(name)
+    eta = what.relative_permittivity(carrier_hz)
+    thick = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m
+    conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
+    return rt.RadioMaterial(
+        f"m-{name}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
+    )
+
+
+def _points(values: FloatArray) -> Any:
+    import mitsuba as mi
+
+    columns = np.ascontiguousarray(values.T, dtype=np.float32)
+    return mi.Point3f(*(mi.Float(column) for column in columns))
+
+
+@dataclass(frozen=True, slots=True)
+class _Ends:
+    """Devices as PathSolver wants them: centres (devices, 3), turns (devices, 3, 3) and the array they carry."""
+
+    centres_m: FloatArray
+    turns: FloatArray
+    elements_m: FloatArray
+
+    @classmethod
+    def points(cls, centres_m: FloatArray) -> _Ends:
+        """Single elements, not turned."""
+        return cls(centres_m, np.tile(np.eye(3), (len(centres_m), 1, 1)), np.zeros((1, 3)))
+
+    def arguments(self, synthetic: bool) -> tuple[Any, Any, Any]:
+        """Positions, orientations and element offsets; with explicit arrays each element is an end."""
+        offsets = np.einsum("dij,ej->dei", self.turns, self.elements_m)
+        angles = _euler(self.turns)
+        if synthetic:
+            return _points(self.centres_m), _points(angles), _points(offsets.reshape(-1, 3))
+        places = (self.centres_m[:, None] + offsets).reshape(-1, 3)
+        return _points(places), _points(np.repeat(angles, len(self.elements_m), axis=0)), None
+
+    def padded(self, count: int) -> _Ends:
+        """The last device repeated until there are ``count``."""
+        rows = np.minimum(np.arange(count), len(self.centres_m) - 1)
+        return _Ends(self.centres_m[rows], self.turns[rows], self.elements_m)
+
+
+def _euler(turns: FloatArray) -> FloatArray:
+    """(yaw, pitch, roll) of rotations, TR 38.901 eq. (7.1-4)."""
+    yaw = np.arctan2(turns[:, 1, 0], turns[:, 0, 0])
+    pitch = -np.arcsin(np.clip(turns[:, 2, 0], -1.0, 1.0))
+    roll = np.arctan2(turns[:, 2, 1], turns[:, 2, 2])
+    return np.asarray(np.stack([yaw, pitch, roll], axis=1))
+
+
+class _Finder:
+    """PathSolver with fixed-size batches of targets.
+
+    Parameters
+    ----------
+    built : _Scene
+    sources : _Ends
+    elements_m : (elements, 3)
+        Array of the targets.
+    batch : int
+    synthetic : bool
+        Plane waves over the arrays, or each element its own end.
+    """
+
+    def __init__(
+        self, built: _Scene, sources: _Ends, elements_m: FloatArray, batch: int, *, synthetic: bool = True
+    ) -> None:
+        import sionna.rt as rt
+        from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = SPECULAR_TABLE_SLOTS
+        self.built, self.batch, self.synthetic = built, batch, synthetic
+        scene = built.scene
+        for name, elements in (("tx_array", sources.elements_m), ("rx_array", elements_m)):
+            pattern = rt.antenna_pattern.antenna_pattern_registry.get("iso")(polarization="VH")
+            wavelength = float(np.asarray(scene.wavelength).ravel()[0])
+            setattr(scene, name, rt.AntennaArray(pattern, _points(elements / wavelength)))
+        for i in range(len(sources.centres_m)):
+            scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
+        for i in range(batch):
+            scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
+        self.sources = sources.arguments(synthetic)
+        self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
+        self._replace_endpoints(len(sources.centres_m))
+        self.solver = rt.PathSolver()
+
+    def _replace_endpoints(self, towers: int) -> None:
+        """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""
+        import drjit as dr
+        import mitsuba as mi
+
+        # public methods with a documented result
+        def sources(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
+            return *self.sources, dr.zeros(mi.Vector3f, towers) if return_velocities else None
+
+        def targets(synthetic_array: bool, return_velocities: bool) -> tuple[Any, Any, Any, Any]:  # noqa: ARG001
+            return *self.targets, dr.zeros(mi.Vector3f, self.batch) if return_velocities else None
+
+        self.built.scene.sources, self.built.scene.targets = sources, targets
+
+    def __enter__(self) -> _Finder:
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        """Free the scene.
+
+        Dr.Jit compiles virtual calls for every material that is alive, those of dead scenes included, and may then
+        define a function twice and abort the process. Scene and finder refer to each other: collect them now.
+        """
+        scene = self.built.scene
+        del scene.sources, scene.targets
+        for name in (*scene.transmitters, *scene.receivers, *scene.objects):
+            scene.remove(name)
+        self.built, self.solver = None, None  # type: ignore[assignment]
+        del scene
+        gc.collect()
+
+    def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
+        """Sionna's paths of one batch, padded."""
+        self.targets = targets.padded(self.batch).arguments(self.synthetic)
+        return self.solver(
+            self.built.scene,
+            max_depth=max_depth,
+            max_num_paths_per_src=MAXIMUM_PATHS,
+            samples_per_src=samples,
+            synthetic_array=self.synthetic,
+            los=True,
+            specular_reflection=max_depth > 0,
+            diffuse_reflection=False,
+            refraction=False,
+            diffraction=False,
+        )
+
+    def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
+        """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
+        count = len(targets_m)
+        paths = self.trace(_Ends.points(targets_m), max_depth, samples)
+        real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
+        valid = paths.valid.numpy()
+        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * MAXIMUM_PATHS:
+            raise CheckError(
+                f"a tower has nearly {MAXIMUM_PATHS} paths in one batch, beyond which Sionna drops paths",
+                cause="take a smaller batch",
+            )
+        return {
+            "valid": valid[:count],
+            "kind": paths.interactions.numpy()[:, :count],
+            "shape": paths.objects.numpy()[:, :count],
+            "primitive": paths.primitives.numpy()[:, :count],
+            "gain": np.sqrt((real**2 + imaginary**2).sum(axis=(1, 3)))[:count],
+        }
+
+
+def find_paths(
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    carrier_hz: float,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    variant: str | None = None,
+    progress: Progress | None = None,
+) -> PathSet:
+    """Paths that Sionna's PathSolver finds, refined in float64.
+
+    Parameters
+    ----------
+    faces, sources_m, targets_m, max_depth, usable, excluded, progress
+        As in :func:`aerpaw_cmp.propagation.image.find_paths`.
+    carrier_hz : float
+        Sionna shoots by reflection power, so materials matter to what it finds.
+    samples : int
+        Rays per tower and batch.
+    batch : int
+        Poses per call, at most 100; bounds the memory.
+    variant : {"cuda", "llvm"}, optional
+
+    Returns
+    -------
+    PathSet
+    """
+    if not 1 <= batch <= LARGEST_BATCH:
+        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
+    load_variant(variant)
+    alive = np.isfinite(targets_m).all(axis=1)
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
+    pieces: list[PathSet] = []
+    groups = list(_groups(faces, sources_m, usable))
+    for number, (towers, chosen) in enumerate(groups):
+        wanted = alive if excluded is None else alive & ~excluded[towers].all(axis=0)
+        poses = np.flatnonzero(wanted)
+        if not len(poses):
+            continue
+        reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
+        built = _build(faces, chosen, reach, carrier_hz)
+        with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch) as finder:
+            for start in range(0, len(poses), batch):
+                some = poses[start : start + batch]
+                raw = finder.solve(targets_m[some], max_depth, samples)
+                _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
+                pose, tower, sequence = _sequences(raw, built.face_of, some, towers, max_depth)
+                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m))
+                if progress:
+                    progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
+        del built
+    found = merge(pieces, max_depth, faces)
+    return found if excluded is None else found.select(~excluded[found.tower, found.pose])
+
+
+def own_channels(
+    faces: Faces,
+    sources_m: FloatArray,
+    poses: Poses,
+    link: Link,
+    *,
+    explicit: bool,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    usable: BoolArray | None = None,
+) -> ComplexArray:
+    """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
+
+    Parameters
+    ----------
+    faces, sources_m, max_depth, samples, batch, usable
+        As in :func:`find_paths`.
+    poses : Poses
+    link : Link
+        Isotropic elements; all towers with the same element positions and slants.
+    explicit : bool
+        Spherical waves, each element pair traced; else plane waves over each array.
+
+    Returns
+    -------
+    (poses, towers, n_rx, n_tx) complex
+    """
+    load_variant()
+    arrays = list(link.tower_arrays.values())
+    for array in (*arrays, link.uav_array):
+        if any(pattern.name != "iso" for pattern in array.patterns):
+            raise UsageError("a pattern that is not isotropic", expected="isotropic elements in Sionna's own arrays")
+    h = np.zeros((len(poses), len(arrays), len(link.uav_array), len(arrays[0])), dtype=np.complex128)
+    reach = 4.0 * float(max(np.abs(poses.position_m).max(), np.abs(sources_m).max(), 100.0))
+    for towers, chosen in _groups(faces, sources_m, usable):
+        mounts = np.stack([arrays[t].mount for t in towers])
+        sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
+        built = _build(faces, chosen, reach, link.carrier_hz)
+        with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
+            for start in range(0, len(poses), batch):
+                rows = slice(start, start + batch)
+                targets = _Ends(
+                    poses.position_m[rows], poses.rotation[rows] @ link.uav_array.mount, link.uav_array.positions_m
+                )
+                a, _ = finder.trace(targets, max_depth, samples).cir(normalize_delays=False, out_type="numpy")
+                mixed = _slanted(a[: len(targets.centres_m), ..., 0].sum(axis=-1), link.uav_array, arrays[0])
+                h[rows, towers] = np.moveaxis(mixed, 2, 1)
+        del built
+    return np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
+
+
+def _slanted(a: AnyArray, uav: Array, tower: Array) -> ComplexArray:
+    """(rx, uav ports, tx, tower ports) from V and H halves (rx, 2 uav elements, tx, 2 tower elements)."""
+    n_uav, n_tower = len(uav), len(tower)
+    halves = a.reshape(len(a), 2, n_uav, a.shape[2], 2, n_tower).astype(np.complex128)
+    weights = [np.stack([np.cos(x.slant_rad), np.sin(x.slant_rad)]) for x in (uav, tower)]
+    return np.asarray(np.einsum("rautbv,au,bv->rutv", halves, *weights))
+
+
+def _groups(faces: Faces, sources_m: FloatArray, usable: BoolArray | None) -> Iterator[tuple[IntArray, IntArray]]:
+    """(towers, faces) that can share a scene: those that see the same ground."""
+    if usable is None:
+        yield np.arange(len(sources_m)), np.arange(len(faces))
+        return
+    patterns, which = np.unique(usable, axis=0, return_inverse=True)
+    for index, pattern in enumerate(patterns):
+        # walls and roofs left out as mirrors still hide; a ground that is not this tower's does not exist for it
+        yield np.flatnonzero(which.reshape(-1) == index), np.flatnonzero(pattern | (faces.solid >= 0))
+
+
+def _check_gain(raw: dict[str, Any], sources_m: FloatArray, targets_m: FloatArray, carrier_hz: float) -> None:
+    """Line of sight equals Friis, and no path gains."""
+    kind, valid = raw["kind"], raw["valid"]
+    direct = valid & (kind == 0).all(axis=0)
+    receiver, tower, _ = np.nonzero(direct)
+    distance = np.linalg.norm(targets_m[receiver] - sources_m[tower], axis=1)
+    expected = wavelength_m(carrier_hz) / (4.0 * np.pi * np.maximum(distance, MINIMUM_LENGTH_M))
+    # a V/H pair at both ends sees the wave twice: |a|^2 sums to 2 (lambda / 4 pi d)^2
+    ratio = raw["gain"][direct] / (np.sqrt(2.0) * expected)
+    if len(ratio) and (np.abs(ratio - 1.0) > 1e-2)[distance > 1.0].any():
+        raise CheckError("Sionna's line of sight departs from Friis by more than 1 %", cause="a damaged installation")
+    if (raw["gain"][valid] > 2.0).any():
+        raise CheckError("Sionna reports a path that gains power", cause="a damaged installation")
+
+
+def _sequences(
+    raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray, max_depth: int
+) -> tuple[IntArray, IntArray, IntArray]:
+    """(pose, tower, faces) of the valid paths made of reflections only."""
+    receiver, tower, path = np.nonzero(raw["valid"])
+    sequence = np.full((len(receiver), max_depth), -1, dtype=np.int64)
+    good = np.ones(len(receiver), dtype=np.bool_)
+    for step in range(min(max_depth, len(raw["kind"]))):
+        kind = raw["kind"][step, receiver, tower, path]
+        shape = raw["shape"][step, receiver, tower, path]
+        primitive = raw["primitive"][step, receiver, tower, path]
+        good &= (kind == 0) | (kind == 1)
+        for number, owner in face_of.items():
+            here = (kind == 1) & (shape == number)
+            sequence[here, step] = owner[primitive[here]]
+        good &= (kind != 1) | (sequence[:, step] >= 0)
+    return poses[receiver[good]], towers[tower[good]], sequence[good]
+
+
+def _refine(
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    pose: IntArray,
+    tower: IntArray,
+    sequence: IntArray,
+    tolerance_m: float,
+) -> PathSet:
+    """Reflection points in float64; paths whose points miss their faces are dropped."""
+    rows = np.column_stack([pose, tower, sequence])
+    rows = np.unique(rows, axis=0) if len(rows) else rows
+    pose, tower, sequence = rows[:, 0], rows[:, 1], rows[:, 2:]
+    depth = (sequence >= 0).sum(axis=1)
+    vertices = np.full((*sequence.shape, 3), np.nan)
+    good = np.linalg.norm(targets_m[pose] - sources_m[tower], axis=1) >= MINIMUM_LENGTH_M
+    for number in np.unique(depth[depth > 0]):
+        some = np.flatnonzero(depth == number)
+        part = _relocate(faces, sources_m[tower[some]], targets_m[pose[some]], sequence[some, :number], tolerance_m)
+        sequence[some, :number] = part
+        images = images_of(faces, part, sources_m[tower[some]])
+        vertices[some, :number], fits = trace_back(
+            faces, part, images, targets_m[pose[some]], tolerance_m, EDGE_TOLERANCE_M
+        )
+        good[some] &= fits
+    return PathSet(pose[good], tower[good], depth[good], sequence[good], vertices[good])
+
+
+def _relocate(
+    faces: Faces, sources_m: FloatArray, targets_m: FloatArray, sequence: IntArray, tolerance_m: float
+) -> IntArray:
+    """Each face replaced by the coplanar one that holds the reflection point: Sionna reports any of a plane."""
+    plane = planes_of(faces)
+    if len(np.unique(plane)) == len(plane) or not len(sequence):
+        return sequence
+    everywhere = trace_back(faces, sequence, images_of(faces, sequence, sources_m), targets_m, tolerance_m, np.inf)[0]
+    result = sequence.copy()
+    for step in range(sequence.shape[1]):
+        outside = np.flatnonzero(~inside(faces, sequence[:, step], everywhere[:, step], EDGE_TOLERANCE_M))
+        for row in outside:  # few: only scenes with disjoint coplanar faces
+            for other in np.flatnonzero(plane == plane[sequence[row, step]]):
+                if inside(faces, np.array([other]), everywhere[row, step][None], EDGE_TOLERANCE_M)[0]:
+                    result[row, step] = other
+    return np.asarray(result)
+
+
+__all__ = ["engine_versions", "find_paths", "load_variant", "own_channels"]

@@ -1,0 +1,401 @@
+"""The replay of a flight: paths by an engine, channel matrices and RSS from the paths."""
+
+from __future__ import annotations
+
+import os
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, ComplexArray, FloatArray
+from ..site.site import Site
+from . import image
+from .arrays import Link, Poses
+from .cache import PathCache
+from .channel import channel_matrices, mean_pair_power, rss_dbm
+from .crowns import Crowns
+from .faces import inside_solids, site_faces, smaller_than_fresnel_zone
+from .paths import Faces, PathSet
+from .relevance import Relevance
+
+Engine = Literal["sionna", "image"]
+Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
+"""``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
+
+
+@dataclass(frozen=True, slots=True)
+class Replay:
+    """What a replay found.
+
+    Parameters
+    ----------
+    rss_dbm : (poses, towers)
+        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.channel.rss_dbm`. NaN without a path.
+    rss_power_dbm : (poses, towers)
+        From the sum of the paths' powers.
+    h : (poses, towers, n_rx, n_tx) complex128
+        Zero without a path.
+    has_path : (poses, towers) bool
+    paths : PathSet
+    faces : Faces
+    seconds : float
+        Of this call: path search (or reading the cache) and fields.
+    search_seconds : float
+        Of the path search alone, when it was made: an entry of the cache remembers it.
+    engine : str
+    left_out : list of str
+        What was not modelled, for the report.
+    towers : tuple of str
+        Order of the tower axis.
+    from_cache : bool
+        Nothing was searched.
+    """
+
+    rss_dbm: FloatArray
+    rss_power_dbm: FloatArray
+    h: ComplexArray
+    has_path: BoolArray
+    paths: PathSet
+    faces: Faces
+    seconds: float
+    search_seconds: float
+    engine: str
+    towers: tuple[str, ...]
+    left_out: list[str] = field(default_factory=list)
+    from_cache: bool = False
+
+
+def replay(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    engine: Engine = "image",
+    *,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    loss: Loss | None = None,
+    crowns: Crowns | None = None,
+    cache_dir: str | Path | None = None,
+    relevance_db: float | None = None,
+    drop_small_faces: bool = False,
+    variant: str | None = None,
+    progress: Callable[[float], None] | None = None,
+) -> Replay:
+    """Replay a flight.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+        Its ``tower_arrays`` name towers of the site.
+    poses : Poses
+    engine : {"image", "sionna"}
+        Exhaustive image method, or Sionna's PathSolver as path finder.
+    max_depth : int
+        Largest number of reflections, 0 to 3.
+    samples, batch : int
+        ``sionna`` only: rays per tower, poses per call.
+    loss : callable, optional
+        Further loss per path [dB], such as foliage.
+    crowns : Crowns, optional
+        Crowns that reflect: their paths are added to those of the engine, whichever it is. What crowns stop is the
+        business of ``loss``.
+    cache_dir : path, optional
+        Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
+        ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
+    relevance_db : float, optional
+        ``image`` only: leave out face sequences that cannot change the RSS of any link by more than this
+        (:mod:`aerpaw_cmp.propagation.relevance`).
+    drop_small_faces : bool
+        Leave out faces smaller than the first Fresnel zone of every link.
+    variant : {"cuda", "llvm"}, optional
+        ``sionna`` only.
+    progress : callable, optional
+        Called with the share done.
+
+    Returns
+    -------
+    Replay
+
+    Raises
+    ------
+    UsageError
+        Unknown tower or engine, a scene too large for ``image``, ``relevance_db`` with ``sionna``.
+    """
+    if engine not in ("image", "sionna"):
+        raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
+    started = time.perf_counter()
+    scene = Scene.of(site, link, poses)
+    scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
+    left_out += _buried_towers(site, link)
+    settings = Settings(engine, max_depth, samples, batch, variant)
+    if relevance_db is not None:
+        paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
+        left_out += idle
+        search_seconds, from_cache = time.perf_counter() - started, False
+    else:
+        cache = _cache(engine, cache_dir)
+        paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+    paths, blocked = _above_terrain(site, scene, poses, paths)
+    left_out += blocked
+    if crowns is not None:
+        scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
+        paths = image.merge([paths, bounces], max_depth, None)
+        left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
+    result = _evaluate(scene, link, poses, paths, engine, loss)
+    return replace(
+        result,
+        seconds=time.perf_counter() - started,
+        search_seconds=search_seconds,
+        left_out=left_out,
+        from_cache=from_cache,
+    )
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides the paths besides the scene."""
+
+    engine: str
+    max_depth: int = 2
+    samples: int = 1_000_000
+    batch: int = 50
+    variant: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Geometry of a replay.
+
+    Parameters
+    ----------
+    faces : Faces
+    sources_m : (towers, 3)
+    usable : (towers, faces) bool
+        Faces that reflect for each tower.
+    excluded : (towers, poses) bool
+        Links without a path: an end inside a building or under the ground.
+    """
+
+    faces: Faces
+    sources_m: FloatArray
+    usable: BoolArray
+    excluded: BoolArray
+
+    @classmethod
+    def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
+        """Scene of a site as the towers of a link see it."""
+        names = tuple(link.tower_arrays)
+        unknown = [name for name in names if name not in site.towers]
+        if unknown:
+            raise UsageError(
+                f"the site has no tower {unknown[0]!r}",
+                expected="one of " + ", ".join(site.towers),
+                cause="a typing error",
+            )
+        faces = site_faces(site, names)
+        towers = [site.towers[name] for name in names]
+        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
+        ground = np.array([tower.ground_m for tower in towers])
+        is_ground = faces.solid < 0
+        usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
+        up = poses.position_m[:, 2]
+        # terrain is not traced: a pose below a tower's own plane but above the lowest ground is no buried pose
+        buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
+        excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
+        return cls(faces, sources, usable, excluded)
+
+    def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
+        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths."""
+        paths, faces = crowns.bounces(
+            self.faces,
+            self.sources_m,
+            poses.position_m,
+            max_depth=max_depth,
+            usable=self.usable,
+            excluded=self.excluded,
+            dem=site.dem,
+        )
+        more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
+        return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
+
+
+def _buried_towers(site: Site, link: Link) -> list[str]:
+    """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
+    lines = []
+    for name in link.tower_arrays:
+        for building in site.buildings:
+            if inside_solids(replace(site, buildings=(building,)), site.towers[name].position_m[None]).any():
+                lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
+    return lines
+
+
+def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
+    """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
+    good = np.isfinite(poses.position_m).all(axis=1)
+    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
+    left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
+    return replace(scene, usable=scene.usable & ~small), left_out
+
+
+def _search_relevant(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    relevance_db: float,
+    progress: Callable[[float], None] | None,
+) -> tuple[PathSet, list[str]]:
+    """Paths without the sequences that cannot matter; poses at which they might are searched with all."""
+    if settings.engine != "image":
+        raise UsageError(
+            "relevance_db with the sionna engine",
+            expected="engine 'image'",
+            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
+        )
+    if not relevance_db > 0.0:
+        raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
+
+    def field_of(paths: PathSet) -> FloatArray:
+        return np.sqrt(mean_pair_power(channel_matrices(paths, scene.faces, scene.sources_m, poses, link).h))
+
+    ground = replace(scene, usable=scene.usable & (scene.faces.solid < 0))
+    kept = field_of(_search(ground, link, poses, settings, None))
+    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
+    chooser = Relevance(scene.faces, poses.position_m[known], link, relevance_db, kept[known])
+    paths = image.find_paths(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        max_depth=settings.max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        select=chooser,
+        progress=progress,
+    )
+    again = np.zeros(len(poses), dtype=np.bool_)
+    again[known] = chooser.failing(field_of(paths)[known])
+    if again.any():
+        all_of_them = replace(scene, excluded=scene.excluded | ~again)
+        full = _search(all_of_them, link, poses, settings, None)
+        paths = image.merge([paths.select(~again[paths.pose]), full], settings.max_depth, None)
+    return paths, chooser.report(tuple(link.tower_arrays), int(again.sum()), len(known))
+
+
+def _search_or_read(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    cache: PathCache | None,
+    progress: Callable[[float], None] | None,
+) -> tuple[PathSet, float, bool]:
+    """Paths, the seconds of their search, and whether they were read from the cache."""
+    key = cache.key(scene, poses.position_m, link.carrier_hz, settings) if cache else ""
+    kept = cache.load(key) if cache else None
+    if kept:
+        return *kept, True
+    started = time.perf_counter()
+    paths = _search(scene, link, poses, settings, progress)
+    seconds = time.perf_counter() - started
+    if cache:
+        cache.save(key, paths, seconds)
+    return paths, seconds, False
+
+
+def _search(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    progress: Callable[[float], None] | None,
+) -> PathSet:
+    """Paths by the engine that the settings name."""
+    if settings.engine == "image":
+        return image.find_paths(
+            scene.faces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )
+    from . import sionna
+
+    return sionna.find_paths(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        carrier_hz=link.carrier_hz,
+        max_depth=settings.max_depth,
+        samples=settings.samples,
+        batch=settings.batch,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        variant=settings.variant,
+        progress=progress,
+    )
+
+
+def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
+    if cache_dir is None:
+        if engine != "sionna":
+            return None
+        cache_dir = os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp"
+    return PathCache(Path(cache_dir)) if str(cache_dir) else None
+
+
+def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tuple[PathSet, list[str]]:
+    """Paths that the site's elevation model lets through.
+
+    The traced ground is a plane per tower; the terrain only blocks. It is asked on the direct line between the ends,
+    whose shadow a ground reflection shares; a path over walls alone is asked on each of its segments.
+    """
+    if site.dem is None or len(paths) == 0:
+        return paths, []
+    source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
+    ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
+    over_ground = ground[paths.faces].any(axis=1)
+    straight = (paths.depth == 0) | over_ground
+    clear = np.ones(len(paths), dtype=np.bool_)
+    clear[straight] = site.dem.clear(source[straight], target[straight])
+    rows = np.flatnonzero(~straight)
+    start = source[rows]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        last = step == paths.vertices_m.shape[1]
+        corner = target[rows] if last else paths.vertices_m[rows, step]
+        end = np.where(np.isfinite(corner), corner, target[rows])
+        clear[rows] &= site.dem.clear(start, end)
+        start = end
+    lost = int((~clear).sum())
+    return paths.select(clear), [
+        f"{lost} of {len(paths)} paths end at the terrain of the elevation model"
+    ] if lost else []
+
+
+def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None) -> Replay:
+    """Fields of the paths; times are the caller's."""
+    loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
+    has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
+    open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
+    has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
+    return Replay(
+        rss_dbm=rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm),
+        rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm),
+        h=fields.h,
+        has_path=has_path,
+        paths=paths,
+        faces=scene.faces,
+        seconds=0.0,
+        search_seconds=0.0,
+        engine=engine,
+        towers=tuple(link.tower_arrays),
+    )

@@ -1,0 +1,83 @@
+"""From logs to the series of one flight."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+
+
+def _flight(folder: Path, *logs: str) -> FlightData:
+    (folder / "flight.yaml").write_text(
+        "flight: f\ntimezone: America/New_York\nlogs:\n"
+        f"  - {{path: {next(SAMPLE.glob('UAV/*vehicleOut.txt'))}}}\n" + "".join(f"  - {{{log}}}\n" for log in logs)
+    )
+    settings = load_flight(folder / "flight.yaml")
+    return gather(settings, folder, read_logs(settings, folder))
+
+
+def _halves(folder: Path, log: str) -> list[str]:
+    lines = (SAMPLE / log).read_text().splitlines(keepends=True)
+    head = [lines[0]] if log.endswith(".csv") else []
+    (folder / "a.txt").write_text("".join(lines[:300]))
+    (folder / "b.txt").write_text("".join(head + lines[300:]))
+    return ["b.txt", "a.txt"]  # the later half first
+
+
+def test_a_radio_started_anew_is_one_record(tmp_path: Path) -> None:
+    log = "LW1/USRP1_power_log.txt"
+    (whole,) = _flight(tmp_path, f"path: {SAMPLE / log}, node: LW1, channel: USRP1").rss
+    parts = _flight(tmp_path, *(f"path: {p}, node: LW1, channel: USRP1" for p in _halves(tmp_path, log)))
+    (joined,) = parts.rss
+    np.testing.assert_array_equal(joined.time, whole.time)
+    np.testing.assert_array_equal(joined.measured_db, whole.measured_db)
+    assert len(parts.files) == 3
+
+
+def test_a_rank_log_in_two_parts_is_one_record(tmp_path: Path) -> None:
+    log = "UAV/modem_ri.csv"
+    (whole,) = _flight(tmp_path, f"path: {SAMPLE / log}").rank
+    (joined,) = _flight(tmp_path, *(f"path: {p}" for p in _halves(tmp_path, log))).rank
+    np.testing.assert_array_equal(joined.rank, whole.rank)
+    np.testing.assert_array_equal(joined.position_m, whole.position_m)
+
+
+def test_two_records_of_one_channel_are_refused(tmp_path: Path) -> None:
+    logs = [f"path: {SAMPLE / 'LW1' / f'USRP{i}_power_log.txt'}, node: LW1" for i in (1, 2)]
+    with pytest.raises(UsageError, match=r"two logs hold RSS of LW1 power .*USRP1.*USRP2.*'channel'"):
+        _flight(tmp_path, *logs)
+    assert len(_flight(tmp_path, logs[0], f"{logs[1]}, channel: second").rss) == 2
+    with pytest.raises(UsageError, match="rank of LW1"):
+        _flight(tmp_path, *[f"path: {SAMPLE / 'UAV/modem_ri.csv'}"] * 2)
+
+
+def test_a_ratio_is_known_by_its_channel_and_the_report_warns(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "snr.csv").write_text(
+        "time,snr_lw1,snr_lw2\n" + "".join(f"2025-06-01T10:01:{s:02d},{20 + s % 3},{10 + s % 2}\n" for s in range(40))
+    )
+    (warning,) = _flight(tmp_path, "path: snr.csv, reader: aadm_snr").warnings
+    assert "'LW1', 'LW2' are ratios to the noise" in warning
+    assert "skip: [LW1, LW2]" in warning
+    assert main(["report", str(tmp_path / "flight.yaml"), "--audit", "none", "-o", str(tmp_path / "out")]) == 0
+    assert f"warning: {warning}" in capsys.readouterr().err
+
+
+def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> None:
+    log = f"path: {SAMPLE / 'LW1/USRP1_power_log.txt'}, node: LW1"
+    (warning,) = _flight(tmp_path, f"{log}, skip: [qualty]").warnings
+    assert "nothing is skipped by qualty: its streams are power" in warning
+    text = (tmp_path / "flight.yaml").read_text().replace(", skip: [qualty]", "")
+    (tmp_path / "flight.yaml").write_text(text + "link: {channels: {USRP1: {carrier_hz: 3.3e9}}}\n")
+    settings = load_flight(tmp_path / "flight.yaml")
+    (warning,) = gather(settings, tmp_path, read_logs(settings, tmp_path)).warnings
+    assert "link.channels names USRP1: no log is of such a channel" in warning

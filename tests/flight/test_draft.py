@@ -1,0 +1,197 @@
+"""A first flight.yaml from logs alone."""
+
+from __future__ import annotations
+
+import os
+import shutil
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.yamlfile import parse_yaml
+from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.draft import draft, write_draft
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.writers import format_nemo_csv
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+ZONE = "America/New_York"
+OPTIONS = ReadOptions(timezone=ZONE)
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    """The sample logs without their flight.yaml."""
+    shutil.copytree(SAMPLE, tmp_path / "logs", ignore=shutil.ignore_patterns("*.yaml", "*.json"))
+    return tmp_path / "logs"
+
+
+def _grow(path: Path) -> None:
+    """Other bytes, the same records."""
+    path.write_bytes(path.read_bytes() + b"\n")
+
+
+def test_the_draft_of_the_sample_logs_is_a_flight(logs: Path) -> None:
+    target = logs.parent / "plans" / "flight.yaml"
+    target.parent.mkdir()
+    remarks = write_draft(ingest(logs, options=OPTIONS), target, timezone=ZONE)
+    settings, given = load_flight(target), load_flight(SAMPLE / "flight.yaml")
+    named = {(Path(log.path).name, log.reader, log.node, log.channel) for log in settings.logs}
+    assert named == {(Path(log.path).name, log.reader, log.node, log.channel) for log in given.logs}
+    assert Path(settings.logs[0].path).name.endswith("vehicleOut.txt")
+    assert settings.timezone == ZONE
+    asked = [remark for remark in remarks if "which tower?" in remark]
+    assert len(asked) == 1  # the modem on the UAV cannot know
+    assert "modem_ri.csv" in asked[0]
+    data = gather(settings, target.parent, read_logs(settings, target.parent))
+    assert (len(data.rss), len(data.rank)) == (10, 1)
+
+
+def test_another_day_a_ratio_and_relative_times_are_left_out(logs: Path) -> None:
+    power = next(logs.glob("LW1/USRP1*"))
+    (logs / "LW1/x_quality_log.txt").write_bytes(power.read_bytes() + b"\n")
+    (logs / "LW2/USRP2_power_log.txt").write_text(
+        (logs / "LW2/USRP2_power_log.txt").read_text().replace("2025-06-01", "2025-06-02")
+    )
+    telemetry = next(logs.glob("UAV/*vehicleOut.txt"))
+    long = telemetry.read_text().replace("2025-06-01", "2025-05-01")
+    (logs / "UAV/old_vehicleOut.txt").write_text(long + long.replace("2025-05-01", "2025-05-02"))
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    left = {remark.split(": ")[1]: remark for remark in remarks if remark.startswith("left out: ")}
+    assert set(left) == {"LW1/x_quality_log.txt", "LW2/USRP2_power_log.txt", "UAV/old_vehicleOut.txt"}
+    assert "ratio" in left["LW1/x_quality_log.txt"]
+    assert "not at the time" in left["UAV/old_vehicleOut.txt"]  # longer, but no level goes with it
+    assert "flight: flight_2025-06-01_" in text
+
+
+def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
+    folder = logs / "LW1"
+    names = ["a b: 'c' \"d\" #e?", "\u00fc\u2603[x]", "line\nbreak\r\u2028", "back\\", "tab\t{a, b: c}", "-", "%@`"]
+    content = (folder / "USRP1_power_log.txt").read_bytes()
+    shutil.rmtree(folder)
+    for i, name in enumerate(names):
+        (logs / f"{name} LW{i % 5 + 1}").mkdir()
+        (logs / f"{name} LW{i % 5 + 1}" / f"usrp{10 + i}_power_log.txt").write_bytes(content + b"\n" * i)
+    (logs / "left\nout\r_quality_log.txt").write_bytes(content + b"\n" * 20)
+    target = logs / "it's a flight: 1.yaml"
+    remarks = write_draft(ingest(logs, options=OPTIONS), target, timezone=ZONE)
+    assert not any("\n" in remark or "\r" in remark for remark in remarks)
+    settings = load_flight(target)
+    data = gather(settings, target.parent, read_logs(settings, target.parent))
+    assert {s.channel for s in data.rss} >= {f"USRP{10 + i}" for i in range(len(names))}
+
+
+@pytest.mark.parametrize("name", ["1e6", "0o17", "0x1F", "no", "11:48:16", "~", "12", "=", "<<"])
+def test_a_log_may_be_called_like_a_number(logs: Path, name: str) -> None:
+    shutil.move(logs / "LW1/USRP1_power_log.txt", logs / name)
+    files = ingest([logs / name, *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
+    text, _ = draft(files, logs, timezone=ZONE)
+    assert parse_yaml(text, FlightFile).logs[1].path == name
+
+
+def test_a_name_that_is_no_text_is_left_out(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    bad = os.fsencode(logs / "LW1") + b"/\xff_power_log.txt"
+    try:
+        Path(os.fsdecode(bad)).write_bytes((logs / "LW1/USRP1_power_log.txt").read_bytes() + b"\n")
+    except OSError:
+        pytest.skip("this file system takes UTF-8 names only")
+    target = logs / "flight.yaml"
+    assert main(["ingest", str(logs), "--timezone", ZONE, "--draft", str(target)]) == 0
+    assert "rename it" in capsys.readouterr().err
+    load_flight(target)
+
+
+def test_one_record_of_each_channel_and_rank(logs: Path) -> None:
+    for name in ("copy_of_USRP1_power_log.txt", "USRP1_again_power_log.txt"):
+        shutil.copy(logs / "LW1/USRP1_power_log.txt", logs / "LW1" / name)
+    _grow(logs / "LW1/USRP1_again_power_log.txt")
+    shutil.copy(next(logs.glob("UAV/*vehicleOut.txt")), logs / "UAV/z_vehicleOut.txt")
+    _grow(logs / "UAV/z_vehicleOut.txt")
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    left = [remark for remark in remarks if remark.startswith("left out: ")]
+    assert len(left) == 3
+    assert any("the same bytes as LW1/USRP1_power_log.txt" in r or "the same bytes as LW1/copy" in r for r in left)
+    assert any("has USRP1 of that tower and time already" in r for r in left)
+    assert any("z_vehicleOut.txt: the track is that of other telemetry" in r for r in left)
+    (logs / "flight.yaml").write_text(text)
+    settings = load_flight(logs / "flight.yaml")
+    data = gather(settings, logs, read_logs(settings, logs))
+    assert (len(data.rss), len(data.rank)) == (10, 1)
+
+
+def test_of_two_logs_of_a_channel_the_fuller_one_is_taken(logs: Path) -> None:
+    full = logs / "LW1/USRP1_power_log.txt"
+    part = logs / "LW1/USRP1_a_power_log.txt"
+    part.write_text("".join(full.read_text().splitlines(keepends=True)[100:200]))
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    assert "LW1/USRP1_power_log.txt, reader" in text
+    left = "left out: LW1/USRP1_a_power_log.txt: LW1/USRP1_power_log.txt has USRP1 of that tower and time already"
+    assert left in remarks
+    assert text.index("path: LW1/") < text.index("path: LW2/")
+
+
+def test_relative_ranks_with_positions_need_no_origin(logs: Path) -> None:
+    nemo = logs / "nemo.csv"
+    (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
+    frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
+    nemo.write_bytes(format_nemo_csv(frame, "2025-06-01T14:00:00Z"))
+    text, remarks = draft(ingest(nemo), logs)
+    assert "time_origin" not in text
+    assert not any("telemetry" in remark for remark in remarks)  # its positions are its own
+    origin = "2025-06-01T14:00:00Z"
+    text, _ = draft(ingest(nemo, options=ReadOptions(time_origin=origin)), logs, time_origin=origin)
+    (logs / "flight.yaml").write_text(text)
+    settings = load_flight(logs / "flight.yaml")
+    (again,) = read_logs(settings, logs)
+    assert again.result.streams[0].frame["time"].min() == frame["time"].min()  # read as it was drafted
+
+
+def test_levels_without_telemetry_are_asked_about(logs: Path) -> None:
+    _, remarks = draft(ingest(logs / "LW1", options=OPTIONS), logs, timezone=ZONE)
+    assert [r for r in remarks if "no telemetry here" in r]
+
+
+def test_the_tower_is_told_by_the_folder_of_the_log(logs: Path) -> None:
+    far = logs / "LW4_campaign" / "first" / "run"
+    far.mkdir(parents=True)
+    shutil.move(logs / "LW2/USRP1_power_log.txt", far / "power_log.txt")
+    text, _ = draft(ingest([logs / "LW3", far], options=OPTIONS), logs / "LW3", timezone=ZONE)
+    assert "{path: USRP1_power_log.txt, reader: sounder_log, node: LW3, channel: USRP1}\n" in text
+    assert "node: LW4}  # which tower?" in text  # a guess
+
+
+def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
+    shutil.move(logs / "LW1/USRP1_power_log.txt", logs / "LW1/x_quality_log.txt")
+    files = ingest([logs / "LW1/x_quality_log.txt", *logs.glob("UAV/*vehicleOut.txt")], options=OPTIONS)
+    text, remarks = draft(files, logs, timezone=ZONE)
+    assert "LW1/x_quality_log.txt" in text
+    assert any(r.endswith("a ratio to the noise as a level?") for r in remarks)
+
+
+def test_nothing_to_compare_is_said(logs: Path) -> None:
+    with pytest.raises(UsageError, match="no log of RSS or rank"):
+        draft(ingest(logs.glob("UAV/*vehicleOut.txt"), options=OPTIONS), logs)
+
+
+def test_the_place_is_looked_at_before_the_logs(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main(["ingest", str(logs), "--draft", str(logs / "nowhere" / "flight.yaml")]) == 2  # and not: timezone
+    assert "no such folder" in capsys.readouterr().err
+    assert main(["ingest", str(logs), "--draft", str(logs)]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
+def test_the_command_does_not_overwrite(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    target = logs.parent / "flight.yaml"
+    call = ["ingest", str(logs), "--timezone", ZONE, "--draft", str(target)]
+    assert main(call) == 0
+    said = capsys.readouterr()
+    assert f"wrote {target}" in said.out
+    assert "check: " in said.err
+    target.write_text("mine")
+    assert main(call) == 2
+    assert target.read_text() == "mine"
+    assert "exists" in capsys.readouterr().err

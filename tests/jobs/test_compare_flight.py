@@ -1,0 +1,577 @@
+"""Hard flights through reading, replay and comparison: no number where there is none, no exception, no silence."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.track import body_rotation
+from aerpaw_cmp.jobs.compare_flight import (
+    Compared,
+    audit_replays,
+    compare_rank_series,
+    compare_rss_series,
+    metrics_beyond_panels,
+    pairs_of,
+    track_of,
+)
+from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.jobs.run import _paths_of_pose
+from aerpaw_cmp.jobs.what_if import foliage_notes
+
+ORIGIN = "2025-06-01T14:00:00Z"
+LW1 = (35.72750947, -78.69595819)
+FLOOR_DB = -758.6  # what the sounder writes without a signal
+
+HEADER = """
+flight: hard
+site: {{file: lake_wheeler, without_buildings: true{site}}}
+timezone: America/New_York
+logs:
+  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
+     columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt, roll_deg: roll, pitch_deg: pitch, yaw_deg: yaw}}}}
+{logs}
+rt: {{engine: image, max_depth: 1, audit_links: 0, attitude: logged{rt}}}
+rss: {{bootstrap: 50, span_db: [-100, 100], lag: "off"{rss_keys}}}
+rank: {{bootstrap: 50}}
+report: {{speed_table: false}}
+{more}
+"""
+
+
+def write_csv(path: Path, names: str, *columns: Any) -> None:
+    rows = "\n".join(",".join(f"{v:.9g}" if np.isfinite(v) else "" for v in row) for row in zip(*columns, strict=True))
+    path.write_text(names + "\n" + rows + "\n", encoding="utf-8")
+
+
+def flight(
+    folder: Path, seconds: int = 60, *, rss: dict[str, tuple[Any, Any]] | None = None,
+    rank: tuple[Any, Any] | None = None, **more: str,
+) -> Path:  # fmt: skip
+    """A flight eastwards past LW1 at 40 m; ``rss`` maps channels to (seconds, levels), ``rank`` is (seconds, RI)."""
+    t = np.arange(0.0, seconds + 1.0)
+    lon = LW1[1] + (t - 10) * 5 / 90_000.0
+    still = np.zeros(len(t))
+    write_csv(folder / "track.csv", "t,lat,lon,alt,roll,pitch,yaw", t, still + LW1[0] + 5e-4, lon, still + 40.0,
+              still, still, still + 120.0)  # fmt: skip
+    logs = ""
+    for channel, (at, level) in (rss or {}).items():
+        write_csv(folder / f"{channel}.csv", "t,level", np.asarray(at, float), np.asarray(level, float))
+        logs += (
+            f"  - {{path: {channel}.csv, reader: generic_csv, kind: rss, node: LW1, channel: {channel}, "
+            f'time_origin: "{ORIGIN}", columns: {{time: t, rss_db: level}}}}\n'
+        )
+    if rank is not None:
+        write_csv(folder / "ri.csv", "t,ri", np.asarray(rank[0], float), np.asarray(rank[1], float))
+        logs += (
+            f'  - {{path: ri.csv, reader: generic_csv, kind: rank, node: LW1, ri_base: one, time_origin: "{ORIGIN}", '
+            "columns: {time: t, ri_raw: ri}}\n"
+        )
+    path = folder / "flight.yaml"
+    keys = {"site": "", "rt": "", "rss_keys": "", "more": "", **more}
+    path.write_text(HEADER.format(origin=ORIGIN, logs=logs, **keys), encoding="utf-8")
+    return path
+
+
+def gathered(path: Path) -> FlightData:
+    settings = load_flight(path)
+    return gather(settings, path.parent, read_logs(settings, path.parent))
+
+
+def compared_rss(path: Path) -> list[Compared]:
+    data = gathered(path)
+    replays = replay_rss(data, str, estimate_clocks(data, str))
+    return [compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, replays, strict=True)]
+
+
+def free_space_db(at: Any) -> Any:
+    """About what is measured at 3.3 GHz, for a plausible course of levels."""
+    east = (np.asarray(at, float) - 10) * 5
+    return -40.0 - 10 * np.log10(east**2 + 55.0**2 + 30.0**2)
+
+
+def report_completes(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
+    assert main(["report", str(path), "-o", str(path.parent / "out"), "--json"]) == 0
+    metrics: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return metrics
+
+
+def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, np.full(len(at), FLOOR_DB))})
+    (one,) = compared_rss(path)
+    assert one.panel.n == 0
+    assert one.panel.n_out_of_coverage == len(at)
+    assert np.isnan(one.panel.rmse_db)
+    assert np.isnan(one.panel.offset_db)
+    assert any("no sample" in text for text in one.warnings)
+    found = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    assert found["rmse_db"] is None
+    assert found["n"] == 0
+    assert main(["report", str(path), "-o", str(tmp_path / "out"), "--strict"]) == 1
+
+
+def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flight(tmp_path, rss={"USRP1": ([20.0], [-70.0])})
+    (one,) = compared_rss(path)
+    assert one.panel.n == 1
+    assert one.panel.rmse_db <= 0.05 + 1e-9
+    assert np.isnan(one.panel.correlation)
+    assert not np.isfinite(one.panel.rmse_ci95_db).any()
+    assert report_completes(path, capsys)["rss"]["LW1"]["USRP1"]["correlation"] is None
+
+
+def test_a_constant_series_has_an_offset_and_no_correlation(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.full(len(at), -70.0))}))
+    assert one.panel.n == len(at)
+    assert np.isnan(one.panel.correlation)
+    assert one.panel.rmse_db == pytest.approx(np.nanstd(one.panel.simulated_dbm), abs=0.01)
+
+
+def test_duplicate_and_backward_stamps_give_the_numbers_of_the_sorted_log(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    at = np.round(np.arange(0, 60, 0.25), 3)
+    level = free_space_db(at) + rng.normal(0, 2, len(at))
+    shuffled = rng.permutation(len(at))
+    twice = np.concatenate([shuffled, shuffled[:20]])
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    in_order = np.sort(twice)
+    (one,) = compared_rss(flight(tmp_path / "a", rss={"USRP1": (at[in_order], level[in_order])}))
+    (two,) = compared_rss(flight(tmp_path / "b", rss={"USRP1": (at[twice], level[twice])}))
+    assert one.panel.n == two.panel.n == len(twice)
+    assert two.panel.rmse_db == pytest.approx(one.panel.rmse_db, abs=1e-9)
+    assert two.panel.offset_db == one.panel.offset_db
+    assert two.panel.rmse_ci95_db == pytest.approx(one.panel.rmse_ci95_db, abs=0.2)
+
+
+def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
+    rng = np.random.default_rng(2)
+    at = np.arange(0, 60, 0.25)
+    level = free_space_db(at) + rng.normal(0, 2, len(at))
+    deaf = level < np.quantile(level, 0.3)
+    (whole,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, level)}))
+    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, np.where(deaf, FLOOR_DB, level))}))
+    assert one.panel.n == (~deaf).sum()
+    assert one.panel.n_out_of_coverage == deaf.sum()
+    censored = one.panel.extra["censored"]
+    assert censored["n_measured_below"] == deaf.sum()
+    # losing the weak samples shifts the plain offset; the censored fit undoes most of that
+    assert abs(censored["offset_db"] - whole.panel.offset_db) < abs(one.panel.offset_db - whole.panel.offset_db)
+
+
+def test_an_optimum_at_the_edge_is_an_error_to_look_at(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 160)})
+    (one,) = compared_rss(path)
+    assert one.panel.at_search_edge
+    assert any("edge" in text for text in one.warnings)
+
+
+def test_radio_samples_outside_the_telemetry_have_no_pose_and_are_not_out_of_coverage(tmp_path: Path) -> None:
+    at = np.arange(40, 80, 0.5)
+    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
+    assert one.panel.extra["n_no_pose"] == (at > 60).sum()
+    assert one.panel.n == (at <= 60).sum()
+    assert one.panel.n_out_of_coverage == 0
+
+
+def test_too_low_samples_are_counted_apart(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}))
+    assert one.panel.extra["n_too_low"] == 0
+    (low,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, rss_keys=", minimum_height_m: 50"))
+    assert low.panel.extra["n_too_low"] == len(at)
+    assert low.panel.n == low.panel.n_out_of_coverage == 0
+
+
+def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rank=(at, np.full(len(at), 2.0)))
+    data = gathered(path)
+    (replayed,) = replay_rank(data, str)
+    panel = compare_rank_series(data, data.rank[0], replayed).panel
+    assert panel.histogram.share.tolist() == [0.0, 1.0, 0.0, 0.0]
+    for at_k in panel.simulated:
+        assert 0.0 <= at_k.agreement <= 1.0
+        assert np.isnan(at_k.kappa) or at_k.kappa <= 1e-9  # a constant modem agrees by chance alone
+        assert at_k.total_variation == pytest.approx(1.0 - at_k.histogram.share[1])
+    found = report_completes(path, capsys)["rank"]["LW1"]
+    assert found["measured"]["histogram"] == {"1": 0.0, "2": 1.0, "3": 0.0, "4": 0.0}
+
+
+def test_no_csi_is_never_a_rank(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    data = gathered(flight(tmp_path, rank=(at, np.zeros(len(at)))))
+    (replayed,) = replay_rank(data, str)
+    result = compare_rank_series(data, data.rank[0], replayed)
+    assert not np.isfinite(result.panel.measured).any()
+    assert any("no rank" in text for text in result.warnings)
+
+
+def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at = np.arange(0, 60, 0.25)
+    level = free_space_db(at)
+    pushed = np.where((at > 30) & (at < 36), level - 25, level)
+    path = flight(tmp_path, rss={"USRP1": (at, level), "USRP2": (at + 0.05, pushed)})
+    (pair,) = pairs_of([one.panel for one in compared_rss(path)])
+    assert (pair.panel.first, pair.panel.second) == ("USRP1", "USRP2")
+    assert len(pair.panel.time) == len(at)  # 0.05 s is less than half a sampling interval
+    assert abs(np.nanmedian(pair.panel.difference_db)) < 5.0  # each channel after its own offset
+    (span,) = pair.panel.apart
+    start = np.datetime64(ORIGIN.removesuffix("Z"), "ns")
+    assert (span.start - start) / np.timedelta64(1, "s") == pytest.approx(30.25, abs=0.6)
+    assert (span.end - start) / np.timedelta64(1, "s") == pytest.approx(35.75, abs=0.6)
+    assert span.mean_error_db > 15
+    assert metrics_beyond_panels([pair])["pairs"]["LW1"]["USRP1 - USRP2"]["share_parted"] == pytest.approx(
+        0.1, abs=0.03
+    )
+    assert "pairs" in report_completes(path, capsys)
+
+
+def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
+    early, late = np.arange(0, 20, 0.25), np.arange(30, 60, 0.25)
+    path = flight(tmp_path, rss={"USRP1": (early, free_space_db(early)), "USRP2": (late, free_space_db(late))})
+    assert pairs_of([one.panel for one in compared_rss(path)]) == []
+
+
+def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
+    at = np.arange(0, 120, 0.5)
+    path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))}, rank=(at, np.full(len(at), 2.0)),
+                  rt=", paired_foliage: true")  # fmt: skip
+    data = gathered(path)
+    # a wood on the line of sight: the track runs east of LW1 at 40 m, crowns reach 60 m here
+    trees = data.site.trees
+    rng = np.random.default_rng(3)
+    east = rng.uniform(20, 480, len(trees))
+    wood = dataclasses.replace(
+        trees, east_m=east, north_m=east * 0.13 + rng.uniform(-20, 20, len(trees)),
+        height_m=np.full(len(trees), 60.0), crown_base_m=np.full(len(trees), 1.0), ground_m=np.zeros(len(trees)),
+    )  # fmt: skip
+    data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
+    (replayed,) = replay_rss(data, str)
+    panel = compare_rss_series(data, data.rss[0], replayed).panel
+    names = [v.name for v in panel.variants]
+    assert names[-3:] == ["without trees", "trees in leaf", "trees out of leaf"]
+    assert panel.variants[-3].rmse_db == pytest.approx(panel.rmse_db, abs=1e-9)  # the flight itself has none
+    found = panel.extra["foliage"]
+    assert found["trees_in_leaf"]["mean_loss_db"] > found["trees_out_of_leaf"]["mean_loss_db"] > 0.0
+    assert found["trees_in_leaf"]["share_above_1_db"] > 0.1
+    (ranked,) = replay_rank(data, str)
+    per_pose = panel.per_sample
+    loss = per_pose["simulated_without_trees_dbm"] - per_pose["simulated_trees_in_leaf_dbm"]
+    assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"]["mean_loss_db"])
+    ranks = compare_rank_series(data, data.rank[0], ranked).panel
+    per_k = ranks.per_sample
+    changed = per_k["rank_trees_in_leaf_k10"] != per_k["rank_without_trees_k10"]
+    changes = ranks.extra["foliage"]
+    assert changed.mean() == pytest.approx(changes["trees_in_leaf"]["10"]["share_changed"])
+    assert set(changes) == {"trees_in_leaf", "trees_out_of_leaf"}
+    for by_k in changes.values():
+        for one in by_k.values():
+            assert one["share_changed"] == pytest.approx((one["n_lower"] + one["n_higher"]) / len(at))
+
+
+def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) -> None:
+    at = np.arange(0, 120, 0.5)
+
+    def replayed(rt: str) -> tuple[Any, Any]:
+        folder = tmp_path / f"case{len(list(tmp_path.iterdir()))}"
+        folder.mkdir()
+        path = flight(folder, 120, rss={"USRP1": (at, free_space_db(at))}, rt=rt)
+        data = gathered(path)
+        trees = data.site.trees  # a wood beside the track, which runs east of LW1 at 40 m
+        rng = np.random.default_rng(3)
+        wood = dataclasses.replace(
+            trees, east_m=rng.uniform(20, 480, len(trees)), north_m=rng.uniform(-250, 250, len(trees)),
+        )  # fmt: skip
+        data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
+        return data, replay_rss(data, str)[0]
+
+    bare_data, bare = replayed("")
+    data, found = replayed(", foliage: opaque, paired_foliage: true")
+    off_data, off = replayed(", foliage: opaque, crown_reflections: false")
+    bounced = int(found.replay.paths.off_crown.sum())
+    assert bounced > 20
+    assert (found.replay.rss_dbm != off.replay.rss_dbm).any()
+    assert not off.replay.paths.off_crown.any()
+    np.testing.assert_array_equal(off.replay.paths.faces, bare.replay.paths.faces)
+    # the picture of a pose has them, too, and no path that trees stop
+    pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
+    east, north, up = found.poses.position_m.T
+    track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
+    lines = [line.label for line in _paths_of_pose(data, data.site, track, pose) if line.label.startswith("LW1")]
+    here = found.replay.paths.select(found.replay.paths.pose == pose)
+    assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
+    assert len(lines) <= len(here)
+    # the run without trees has lost the paths over crowns as well
+    panel = compare_rss_series(data, data.rss[0], found).panel
+    columns = panel.per_sample
+    bare_dbm = bare.spread(bare.replay.rss_dbm[:, 0])
+    np.testing.assert_allclose(columns["simulated_without_trees_dbm"], bare_dbm, atol=1e-9)
+    np.testing.assert_allclose(columns["simulated_trees_in_leaf_dbm"], panel.simulated_dbm, atol=1e-9)
+    for some, one, expected in (
+        (data, found, {"crown_reflections": True, "paths_off_crowns": bounced}),
+        (off_data, off, {"crown_reflections": False, "paths_off_crowns": 0}),
+        (bare_data, bare, {}),
+    ):
+        rt = some.settings.rt.model_copy(update={"audit_links": 0})
+        quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
+        settings = audit_replays(quiet, [one], str).settings
+        assert {k: v for k, v in settings.items() if "crown" in k} == expected
+
+
+def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path: Path) -> None:
+    at = np.arange(0, 10, 0.5)
+    series = {"USRP1": (at, free_space_db(at))}
+
+    def notes(rt: str, *carriers_hz: float) -> str:
+        return " ".join(foliage_notes(gathered(flight(tmp_path, 20, rss=series, rt=rt)), carriers_hz))
+
+    assert notes("", 3.4e9) == ""
+    assert notes(", foliage: opaque", 3.4e9) == ""
+    stretched = notes(", foliage: attenuating", 3.4e9)
+    assert "extrapolation of ITU-R P.833, whose table of woodland covers 105.9 to 2117.5 MHz" in stretched
+    assert "gamma = 0.47 dB/m and A_m = 42 dB" in stretched
+    assert "out of leaf" not in stretched
+    assert notes(", foliage: attenuating", 2.0e9) == ""
+    assert "Trees at 2.6 GHz" in notes(", foliage: attenuating", 2.0e9, 2.6e9)
+    assert notes(", foliage: attenuating, gamma_db_per_m: 0.6, maximum_loss_db: 40", 3.4e9) == ""
+    assert "divided by 1.2. That is an assumption" in notes(", foliage: attenuating, leaves: out", 2e9)
+    assert "the loss in leaf divided by 1.2" in notes(", paired_foliage: true, foliage_model: weissberger", 2e9)
+
+
+def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
+    """A tower antenna tilted by 90 degrees sees what is overhead at its horizon, and what is level overhead or below."""
+    at = np.arange(0, 30, 0.5)
+    tilted = DIPOLES.replace(", installed_db: [2.0, 0.0]}", "}, pitch_deg: 90")
+    path = flight(tmp_path, 40, rss={"USRP1": (at, free_space_db(at))}, more=tilted)
+    data = gathered(path)
+    (replayed,) = replay_rss(data, str)
+    seen = compare_rss_series(data, data.rss[0], replayed).panel.geometry
+    mount = replayed.link.tower_arrays["LW1"].mount
+    ray = replayed.poses.position_m - data.site.towers["LW1"].position_m
+    upward = np.degrees(np.arcsin(ray @ mount[:, 2] / np.linalg.norm(ray, axis=1)))
+    good = np.isfinite(seen["tower_elevation_deg"])
+    np.testing.assert_allclose(seen["tower_elevation_deg"][good], upward, atol=1e-6)
+    assert np.abs(seen["tower_elevation_deg"] - seen["elevation_deg"])[good].max() > 20
+    assert {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen)
+
+
+DIPOLES = """
+link:
+  channels:
+    USRP1:
+      carrier_hz: 3.3e9
+      tower: {antenna: {model: dipole, installed_db: [2.0, 0.0]}}
+      uav: {antenna: {model: tr38901}, yaw_deg: 270}
+"""
+
+
+def test_alternatives_change_only_what_they_name(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))}, more=DIPOLES)
+    panel = compared_rss(path)[0].panel
+    rmse = {v.name: v.rmse_db for v in panel.variants}
+    assert set(rmse) == {
+        "antennas as measured, without added gain",
+        "isotropic antennas",
+        "heading only",
+        "attitude ignored",
+    }
+    assert rmse["heading only"] == pytest.approx(panel.rmse_db, abs=1e-9)  # this flight is level
+    assert abs(rmse["attitude ignored"] - panel.rmse_db) > 0.02  # but heads elsewhere than the site's east
+    (tmp_path / "iso").mkdir()
+    plain = compared_rss(flight(tmp_path / "iso", rss={"USRP1": (at, free_space_db(at))}))[0].panel
+    assert rmse["isotropic antennas"] == pytest.approx(plain.rmse_db, abs=1e-9)
+    assert not plain.variants
+    (tmp_path / "alone").mkdir()
+    alone = DIPOLES.replace(", installed_db: [2.0, 0.0]", "")
+    bare = compared_rss(flight(tmp_path / "alone", rss={"USRP1": (at, free_space_db(at))}, more=alone))[0].panel
+    assert rmse["antennas as measured, without added gain"] == pytest.approx(bare.rmse_db, abs=1e-9)
+    assert abs(bare.rmse_db - panel.rmse_db) > 0.1
+
+
+def test_reference_powers_give_the_expected_offset(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    (tmp_path / "powers.csv").write_text(
+        "Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz\nlw1,rx,ch0,0,30.0,-35.5\nuav,tx,ch0,1,70.0,12.0\n",
+        encoding="utf-8",
+    )
+    port = "{file: powers.csv, receivers: {USRP1: {node: LW1, gain_db: 30, extra_gain_db: 14}}, transmitter: {node: uav, gain_db: 70, amplifier: true}}"
+    level = free_space_db(at)
+    path = flight(tmp_path, rss={"USRP1": (at, level)}, rss_keys=f", reference_powers: {port}")
+    panel = compared_rss(path)[0].panel
+    found = panel.extra["expected_offset"]
+    # reading + 30 dB gain removed + reference - 14 dB of amplifiers; the simulation sends 40 dBm where 12 were sent
+    assert found["expected_db"] == pytest.approx(30.0 - 35.5 - 14.0 + 40.0 - 12.0)
+    assert found["fitted_minus_expected_db"] == pytest.approx(panel.offset_db - found["expected_db"])
+
+
+def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> None:
+    rng = np.random.default_rng(4)
+    at = np.arange(0, 60, 0.25)
+    (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}))
+    footing = one.panel.extra["same_footing"]
+    assert footing["coherent"]["0 s"]["rmse_db"] == pytest.approx(one.panel.rmse_db)
+    assert footing["power_sum"]["4 s"]["rmse_db"] < footing["power_sum"]["0 s"]["rmse_db"]
+    tables = metrics_beyond_panels([one])["rss"]["LW1"]["USRP1"]["residual_by"]
+    assert {"distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "heading_deg", "time_s"} <= set(tables)
+    assert sum(tables["distance_m"]["n"]) == one.panel.n
+
+
+def test_the_track_of_a_rank_log_with_positions_of_its_own_is_the_logs(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    data = gathered(flight(tmp_path, rank=(at, np.full(len(at), 2.0))))
+    bare = dataclasses.replace(data, track=None)
+    assert track_of(bare) is None
+    own = dataclasses.replace(bare.rank[0], position_m=np.column_stack([at, at, at]))
+    assert track_of(dataclasses.replace(bare, rank=(own,))).east_m == pytest.approx(at)
+
+
+def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    at = np.arange(0, 60, 0.25)
+    rss = {"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}
+    (as_logged,) = compared_rss(flight(tmp_path, rss=rss))
+    (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys=", field: local_mean, window_s: 4"))
+    footing = as_logged.panel.extra["same_footing"]["coherent"]["4 s"]
+    assert mean.panel.rmse_db == pytest.approx(footing["rmse_db"], abs=1e-9)
+    two_ray = {b.name: b for b in mean.panel.baselines}["two_ray"]
+    assert np.nanstd(np.diff(two_ray.level_dbm)) < np.nanstd(np.diff(as_logged.panel.baselines[1].level_dbm))
+
+
+def test_a_local_mean_without_a_window_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flight(tmp_path, rss={"USRP1": ([1.0], [-70.0])}, rss_keys=", field: local_mean")
+    assert main(["report", str(path)]) == 2
+    assert "window_s" in capsys.readouterr().err
+
+
+def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_path: Path) -> None:
+    at = np.arange(0, 120, 0.5)
+    path = flight(tmp_path, 120, rss={"USRP1": (at, free_space_db(at))})
+    levels = {}
+    for loss in (0.0, 3.0, 200.0):
+        data = gathered(path)
+        rt = data.settings.rt.model_copy(update={"reflection_loss_db": loss})
+        data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
+        (replayed,) = replay_rss(data, str)
+        levels[loss] = compare_rss_series(data, data.rss[0], replayed).panel
+    ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines[0].level_dbm) for loss, p in levels.items()}
+    assert ripple[0.0] > ripple[3.0] > 0.1
+    assert ripple[200.0] < 1e-6, "only the line of sight is left"
+
+
+def test_a_ratio_to_noise_is_not_taken_for_a_level_in_silence(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    level = free_space_db(at)
+    data = gathered(flight(tmp_path, rss={"power": (at, level), "quality": (at, level + 60)}))
+    said = [text for text in data.warnings if "ratio to the noise" in text]
+    assert len(said) == 1
+    assert said[0].startswith("quality.csv: 'quality'")
+
+
+@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308"])
+def test_one_absurd_level_changes_no_number_and_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], absurd: str
+) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))})
+    lines = (tmp_path / "USRP1.csv").read_text().splitlines()
+    kept = [line for i, line in enumerate(lines) if i != 30]
+    (tmp_path / "USRP1.csv").write_text("\n".join(kept) + "\n")
+    want = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    lines[30] = lines[30].split(",")[0] + "," + absurd
+    (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
+    metrics = report_completes(path, capsys)
+    found = metrics["rss"]["LW1"]["USRP1"]
+    if absurd in ("inf", "-inf"):  # no number for the reader of plain tables: no signal
+        assert found["n_out_of_coverage"] == 1
+    else:
+        assert found["n_flagged"] == {"level_out_of_range": 1}
+        assert any("level_out_of_range" in text for text in metrics["warnings"])
+        assert found["n_out_of_coverage"] == 0
+    for key in ("offset_db", "rmse_db", "n", "at_search_edge"):
+        assert found[key] == pytest.approx(want[key]), key
+
+
+def test_exchanged_or_mirrored_angles_are_told_before_anything_else(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))})
+    text = path.read_text()
+    path.write_text(text.replace("latitude_deg: lat, longitude_deg: lon", "latitude_deg: lon, longitude_deg: lat"))
+    with pytest.raises(InputError, match=r"no nearer than \d+ km to any tower.*latitude and longitude are exchanged"):
+        gathered(path)
+    path.write_text(text)
+    table = (tmp_path / "track.csv").read_text()
+    (tmp_path / "track.csv").write_text(table.replace(",-78.", ",78."))
+    with pytest.raises(InputError, match="the longitude lacks its sign"):
+        gathered(path)
+    (tmp_path / "track.csv").write_text(table.replace(",35.", ",36."))
+    with pytest.raises(InputError, match=r"no nearer than 11\d km to any tower.*another site"):
+        gathered(path)
+
+
+def rank_with_positions(folder: Path, *, rt: str, origin: str = ORIGIN) -> Path:
+    """A flight whose rank log carries positions of its own, beside telemetry with attitude."""
+    at = np.arange(1.0, 59.0)
+    path = flight(folder, rank=(at, np.where(at % 2, 1, 2)), rt=rt)
+    lon = LW1[1] + (at - 10) * 5 / 90_000.0
+    same = np.zeros(len(at))
+    write_csv(
+        folder / "ri.csv", "t,ri,lat,lon,alt", at, np.where(at % 2, 1.0, 2.0), same + LW1[0] + 5e-4, lon, same + 40.0
+    )
+    text = path.read_text().replace(
+        "columns: {time: t, ri_raw: ri}",
+        "columns: {time: t, ri_raw: ri, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}",
+    )
+    first, rest = text.split("{path: ri.csv")
+    path.write_text(first + "{path: ri.csv" + rest.replace(ORIGIN, origin))
+    return path
+
+
+def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:
+    found = {}
+    for mode in ("logged", "ignored"):
+        folder = tmp_path / mode
+        folder.mkdir()
+        data = gathered(rank_with_positions(folder, rt="").with_name("flight.yaml"))
+        rt = data.settings.rt.model_copy(update={"attitude": mode})
+        data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
+        assert data.rank[0].position_m is not None
+        (found[mode],) = replay_rank(data, str)
+    assert np.array_equal(found["logged"].poses.position_m, found["ignored"].poses.position_m), "of the log itself"
+    turned = found["logged"].poses.rotation
+    assert np.allclose(turned, body_rotation(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
+    assert np.allclose(found["ignored"].poses.rotation, np.eye(3))
+    assert not np.allclose(found["logged"].replay.h, found["ignored"].replay.h, rtol=1e-3, atol=0)
+
+
+def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
+    data = gathered(rank_with_positions(tmp_path, rt="", origin="2025-06-02T14:00:00Z"))
+    assert data.warnings[0].startswith("rt.attitude: logged has no effect on rank of LW1: the telemetry covers none")
+    data = gathered(rank_with_positions(tmp_path, rt=""))
+    assert not any("rt.attitude" in text for text in data.warnings)
+
+
+def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -> None:
+    path = rank_with_positions(tmp_path, rt="")
+    table = (tmp_path / "ri.csv").read_text().splitlines()
+    table[20] = ",".join(table[20].split(",")[:2]) + ",,,"
+    (tmp_path / "ri.csv").write_text("\n".join(table) + "\n")
+    data = gathered(path)
+    assert np.isnan(data.rank[0].position_m[19]).all()
+    (found,) = replay_rank(data, str)
+    assert found.valid.all()
+    assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)

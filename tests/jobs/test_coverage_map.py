@@ -1,0 +1,358 @@
+"""The map job: the engine behind it by physics and by the replay itself, the command by what it writes."""
+
+import json
+import os
+import runpy
+import types
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shapely.geometry import Polygon
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.jobs import coverage_map as mapping
+from aerpaw_cmp.maps.grid import Grid
+from aerpaw_cmp.maps.job import rank_of_singular_values
+from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.foliage import CrownIndex, Opaque, foliage_loss_db
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.dem import Dem
+from aerpaw_cmp.site.site import Building, Site, Tower, Trees
+
+CARRIER_HZ = 3.4e9
+
+
+def tower(name, east, north):
+    return Tower(name, 35.7, -78.7, east, north)
+
+
+def row_of_trees(east_m=100.0):
+    """A hedge without gaps, 20 m high, from north -200 to 200."""
+    north = np.arange(-200.0, 201.0, 4.0)
+    like = np.ones_like(north)
+    return Trees(east_m * like, north, 0 * like, 20 * like, 10 * like, 2 * like, 0.4 * like)
+
+
+@pytest.fixture
+def site():
+    barn = Building("barn", Polygon([(-60, 40), (-30, 40), (-30, 60), (-60, 60)]), 8.0)
+    towers = {"A": tower("A", 0.0, 0.0), "B": tower("B", 10.0, 250.0)}
+    area = (-200.0, 300.0, -200.0, 300.0)
+    return Site("field", SiteFrame(35.7, -78.7), towers, (barn,), trees=row_of_trees(), area_m=area)
+
+
+def settings(**change):
+    some = {"spacing_m": 50.0, "rss_altitudes_m": (30.0,), "rank_altitudes_m": (3.0, 30.0, 60.0)}
+    return mapping.MapSettings(**{**some, **change})
+
+
+def quiet(_text):
+    pass
+
+
+def test_every_mode_is_what_a_replay_with_its_loss_says(site):
+    chosen = settings()
+    channels = mapping.SiteChannels(site, chosen)
+    position = Grid.over_area(site.area_m, 50.0).positions_m(6.0)
+    poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
+    line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
+    crowns = CrownIndex(site.trees)
+    found = {}
+    for mode in mapping.FOLIAGE:
+        model = mapping.foliage_model(mode, CARRIER_HZ)
+
+        def loss(paths, source, target, model=model):
+            return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], crowns, model)
+
+        link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
+        one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
+        expected, siso = (replay(site, wanted, poses, loss=loss) for wanted in (link, one))
+        got = found[mode] = channels.of(mode)(position, ("A", "B"))
+        np.testing.assert_allclose(got.rss_siso_dbm, siso.rss_dbm, atol=1e-9)
+        for k in (10.0, 1000.0):
+            rank = channel_rank(expected.h, k)
+            np.testing.assert_array_equal(rank_of_singular_values(got.singular_values, [k])[..., 0], rank)
+        assert np.array_equal(np.isfinite(got.rss_siso_dbm), expected.has_path)
+        with np.errstate(divide="ignore"):
+            beam = 40 + 10 * np.log10((np.abs(expected.h.sum(axis=-1)) ** 2 / 4).mean(axis=-1))
+        np.testing.assert_allclose(got.rss_mimo_dbm, np.where(expected.has_path, beam, np.nan), atol=1e-9)
+    shaded = np.isnan(found["opaque"].rss_siso_dbm) & np.isfinite(found["none"].rss_siso_dbm)
+    assert 0.1 < shaded.mean() < 0.6
+    assert np.array_equal(np.isnan(found["attenuating"].rss_siso_dbm), np.isnan(found["none"].rss_siso_dbm))
+    assert (found["attenuating"].singular_values[shaded] > 0).any()
+
+
+def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
+    crowns = Crowns(site.trees)
+    position = Grid.over_area(site.area_m, 25.0).positions_m(60.0)
+    poses = Poses(position, np.broadcast_to(np.eye(3), (len(position), 3, 3)))
+
+    def loss(paths, source, target):
+        ends = source[paths.tower], paths.vertices_m, target[paths.pose]
+        return foliage_loss_db(*ends, crowns.index, Opaque(), paths.tree)
+
+    line = linear_array(4, wavelength_m(CARRIER_HZ) / 2, 0.0)
+    found = {}
+    for on in (True, False):
+        channels = mapping.SiteChannels(site, settings(crown_reflections=on))
+        found[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
+        link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
+        one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
+        many, siso = (replay(site, w, poses, loss=loss, crowns=crowns if on else None) for w in (link, one))
+        np.testing.assert_allclose(found[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
+        rank = rank_of_singular_values(found[on]["opaque"].singular_values, [100.0])[..., 0]
+        np.testing.assert_array_equal(rank, channel_rank(many.h, 100.0))
+        assert channels.paths_off_crowns == siso.paths.off_crown.sum()
+        assert (channels.paths_off_crowns > 20) == on
+    for mode in ("none", "attenuating"):  # bit by bit
+        np.testing.assert_array_equal(found[True][mode].rss_siso_dbm, found[False][mode].rss_siso_dbm)
+        np.testing.assert_array_equal(found[True][mode].singular_values, found[False][mode].singular_values)
+    assert (found[True]["opaque"].rss_siso_dbm != found[False]["opaque"].rss_siso_dbm).any()
+
+
+def test_paths_of_infinite_loss_are_no_paths(site):
+    behind = np.array([[180.0, 0.0, 3.0], [50.0, 0.0, 3.0]])  # behind the hedge; in front of it
+    poses = Poses(behind, np.broadcast_to(np.eye(3), (2, 3, 3)))
+    one = Link(CARRIER_HZ, {"A": single_element()}, single_element(), 40.0)
+
+    def loss(paths, source, target):
+        return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], site.trees, Opaque())
+
+    result = replay(site, one, poses, loss=loss)
+    assert result.has_path[:, 0].tolist() == [False, True]
+    assert np.isnan(result.rss_dbm[0, 0])
+    assert np.isnan(result.rss_power_dbm[0, 0])
+    assert (result.h[0] == 0).all()
+    assert np.isfinite(result.rss_dbm[1, 0])
+
+
+def test_a_broadside_beam_gains_the_number_of_elements():
+    # free space far away: 4 elements in phase, each with a quarter of the power, give 4 times the power broadside
+    # (east of a line along north) and next to nothing along the line
+    site = Site("air", SiteFrame(35.7, -78.7), {"A": tower("A", 0.0, 0.0)})
+    channels = mapping.SiteChannels(site, settings(max_depth=0, foliage=("none",)))
+    places = np.array([[3000.0, 0.0, 10.0], [0.0, 3000.0, 10.0]])
+    found = channels.of("none")(places, ("A",))
+    gain = found.rss_mimo_dbm[:, 0] - found.rss_siso_dbm[:, 0]
+    assert gain[0] == pytest.approx(10 * np.log10(4), abs=1e-3)
+    assert gain[1] < -40
+    np.testing.assert_allclose(found.rss_siso_dbm[0], 40 - 20 * np.log10(4 * np.pi * 3000 / wavelength_m(CARRIER_HZ)))
+
+
+def test_modes_share_one_search_and_nothing_is_kept(site):
+    outcome = mapping.make_maps(site, settings(), quiet)
+    alone = mapping.make_maps(site, settings(foliage=("opaque",)), quiet)
+    assert outcome.paths == alone.paths > 0
+    np.testing.assert_array_equal(outcome.maps["opaque"].rank, alone.maps["opaque"].rank)
+    np.testing.assert_array_equal(outcome.maps["opaque"].rss_mimo_dbm, alone.maps["opaque"].rss_mimo_dbm)
+    assert list(dict(outcome.ordered())) == ["opaque", "attenuating", "none"]
+    channels = mapping.SiteChannels(site, settings())
+    position = np.array([[20.0, 20.0, 30.0]])
+    for mode in mapping.FOLIAGE:
+        channels.of(mode)(position, ("A", "B"))
+    assert not channels._kept
+
+
+def test_heights_are_above_the_ground_of_the_elevation_model():
+    frame = SiteFrame(35.7, -78.7)
+    east = np.arange(-1000.0, 1001.0, 10.0)
+    slope = Dem(np.tile(0.01 * east, (201, 1)), -1000.0, -1000.0, 10.0, 10.0, "local", frame)
+    flat = Site("flat", frame, {"A": tower("A", 0.0, 0.0)})
+    hilly = replace(flat, dem=slope)
+    line_of_sight = settings(max_depth=0, foliage=("none",))
+    there = np.array([[500.0, 40.0, 30.0]])
+    raised = there + np.array([0.0, 0.0, 5.0])  # 1 % over 500 m
+    found = mapping.SiteChannels(hilly, line_of_sight).of("none")(there, ("A",))
+    expected = mapping.SiteChannels(flat, line_of_sight).of("none")(raised, ("A",))
+    assert found.rss_siso_dbm[0, 0] == pytest.approx(expected.rss_siso_dbm[0, 0], abs=1e-9)
+    level = mapping.SiteChannels(flat, line_of_sight).of("none")(there, ("A",))
+    assert abs(found.rss_siso_dbm[0, 0] - level.rss_siso_dbm[0, 0]) > 1e-4
+
+
+def test_a_threshold_puts_weak_positions_out_of_coverage(site):
+    free = mapping.make_maps(site, settings(foliage=("none",), study=False), quiet).maps["none"]
+    level = float(np.nanmedian(free.rss("siso")))
+    cut = mapping.make_maps(site, settings(foliage=("none",), threshold_dbm=level), quiet).maps["none"]
+    np.testing.assert_array_equal(np.isfinite(cut.rss("siso")), np.nan_to_num(free.rss("siso"), nan=-np.inf) >= level)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"foliage": ("leafy",)}, "leafy"),
+        ({"foliage": ()}, "none given"),
+        ({"rank_altitudes_m": (0.0,)}, "above 0"),
+        ({"ks": (1.0,)}, "K"),
+        ({"carrier_hz": 0.0}, "carrier"),
+    ],
+)
+def test_settings_that_make_no_map_are_refused(change, said):
+    with pytest.raises(UsageError, match=said):
+        mapping.MapSettings(**change)
+
+
+# --- the command ---------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory):
+    """One coarse map of the packaged site through the command line."""
+    import contextlib
+    import io
+
+    from aerpaw_cmp.cli import main
+
+    folder = tmp_path_factory.mktemp("map")
+    said = io.StringIO()
+    wish = ["--quick", "--foliage", "none", "--foliage", "opaque", "--spacing", "180", "-k", "10", "-k", "1000"]
+    wish += ["--rss-altitude", "30"]
+    with contextlib.redirect_stdout(said), contextlib.redirect_stderr(io.StringIO()):
+        code = main(["map", "lake_wheeler", "-o", str(folder), "--json", *wish])
+    assert code == 0
+    return folder, json.loads(said.getvalue())
+
+
+def test_the_command_prints_one_object_that_is_the_metrics(made):
+    folder, printed = made
+    assert printed == json.loads((folder / "metrics.json").read_text())
+    assert printed["grid"] == {"columns": 6, "rows": 11, "positions": 66}
+    assert {(m["antennas"], m["foliage"]) for m in printed["coverage"]} == {
+        (a, f) for a in ("SISO", "MIMO") for f in ("none", "opaque")
+    }
+    for one in printed["rank"]:
+        assert sum(one["share"].values()) == pytest.approx(1)
+    assert set(printed["stages"]) >= {"maps_s", "leave one out_s", "export_s"}
+
+
+def test_foliage_only_takes_coverage_away(made):
+    coverage = {(m["foliage"], m["antennas"], m["tower"], m["altitude_m"]): m["coverage"] for m in made[1]["coverage"]}
+    for (mode, *rest), share in coverage.items():
+        if mode == "opaque":
+            assert share <= coverage[("none", *rest)]
+    assert coverage[("opaque", "SISO", "LW5", 30.0)] < 0.9
+
+
+def test_files_agree_with_each_other_and_with_the_page(made):
+    import pandas as pd
+
+    folder, printed = made
+    table = pd.read_csv(folder / "layers.csv")
+    assert len(table) == 66
+    share = float((table["rank_k10_h003m_joint_opaque"] == 0).mean())
+    shown = next(m for m in printed["rank"] if (m["foliage"], m["k"], m["altitude_m"]) == ("opaque", 10.0, 3.0))
+    assert shown["share"]["Z"] == pytest.approx(share)
+    ratios = table[[name for name in table if name.startswith(("condition", "spread"))]].to_numpy()
+    assert np.nanmin(ratios) >= 0
+    assert np.nanmax(ratios) == mapping.RATIO_LIMIT_DB  # two collinear paths: what is below is rounding
+    content = json.loads((folder / "maps.json").read_text())
+    level = np.array(content["layers"]["rss_siso_h030m_joint_opaque"]["values"], dtype=float)
+    np.testing.assert_allclose(level, table["rss_siso_h030m_joint_opaque"], atol=0.006)
+    cells = json.loads((folder / "layers.geojson").read_text())["features"]
+    assert sum(f["geometry"]["type"] == "Polygon" for f in cells) == 66
+    assert sum(f["geometry"]["type"] == "Point" for f in cells) == 5
+    with zipfile.ZipFile(folder / "maps.kmz") as archive:
+        assert "maps/rank_k1000_h110m_joint_opaque.png" in archive.namelist()
+
+
+def test_the_page_shows_every_figure_of_the_paper_rows(made):
+    folder, printed = made
+    html = (folder / "map.html").read_text()
+    stems = {path.stem for path in (folder / "figures").glob("*.svg")}
+    table = (folder / "paper.md").read_text()
+    named = {part.removeprefix("figures/").removesuffix(".svg") for part in table.split("`") if ".svg" in part}
+    assert named
+    assert named <= stems
+    for name in named:
+        assert f'id="{name}"' in html
+    assert "illustrative" in html
+    what = {row["what"] for row in printed["paper"]}
+    assert {"out of coverage at 3 m", "c1 of the bi-exponential model"} <= what
+    states = next(row for row in printed["paper"] if row["what"] == "UAV locations")
+    assert (states["paper"], states["ours"]) == ("36 x 71 = 2556", "6 x 11 = 66")
+
+
+def test_the_paper_page_has_the_rows_that_a_run_prints(made):
+    page = (Path(__file__).parents[2] / "docs" / "paper.md").read_text()
+    rows = [[cell.strip() for cell in line.split("|")[1:-1]] for line in page.splitlines() if line.startswith("| ")]
+    numbers = {tuple(row[:3]) for row in rows if len(row) == 5}
+    printed = {(row["where"], row["what"], row["paper"]) for row in made[1]["paper"]}
+    assert printed <= numbers
+    figures = {row[0] for row in rows}
+    assert {"Table I", "Table II", "Fig. 1", "Fig. 2", "Fig. 3", "Fig. 4", "Fig. 5, 6"} <= figures
+    assert {f"Fig. {n}" for n in range(7, 16)} <= figures
+
+
+def test_netcdf_is_written_where_its_library_is(made):
+    xarray = pytest.importorskip("xarray")
+    pytest.importorskip("netCDF4")
+    with xarray.open_dataset(made[0] / "maps.nc") as data:
+        assert data["rank_k10_h030m_LW3_opaque"].shape == (11, 6)
+        assert data.attrs["Conventions"].startswith("CF-")
+
+
+def test_geotiff_is_written_where_its_library_is(made):
+    rasterio = pytest.importorskip("rasterio")
+    with rasterio.open(made[0] / "maps.tif") as data:
+        assert data.shape == (11, 6)
+        assert data.count > 10
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--foliage", "leafy"], "leafy"),
+        (["--spacing", "5000"], "no cell"),
+        (["--engine", "magic"], "magic"),
+        (["--quick", "--rank-altitude", "30"], "rank height"),
+    ],
+)
+def test_wrong_wishes_are_one_message(words, said, tmp_path):
+    from aerpaw_cmp.cli import main
+
+    with pytest.raises(UsageError, match=said):
+        main(["map", "lake_wheeler", "-o", str(tmp_path / "out"), *words])
+
+
+def test_an_unknown_site_is_one_message(tmp_path):
+    from aerpaw_cmp.cli import main
+
+    with pytest.raises(Exception, match="nowhere") as caught:
+        main(["map", "nowhere.yaml", "-o", str(tmp_path)])
+    assert isinstance(caught.value, UsageError) or type(caught.value).__name__ == "InputError"
+
+
+# --- real logs -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.field
+def test_kriging_bridges_blocks_of_a_real_flight():
+    """Held-out blocks of 100 m: Kriging beats nearest and the mean, and with the replay under it beats both alone."""
+    folder = os.environ.get("AERPAW_CMP_FIELD_DATA")
+    if not folder:
+        pytest.skip("AERPAW_CMP_FIELD_DATA does not name the folder of the real logs")
+    script = runpy.run_path(str(Path(__file__).parents[2] / "benchmarks" / "kriging_field.py"))
+    for one in script["flights"](Path(folder), ["dataset12_70m"]):
+        found = script["held_out"](one, 100.0, 25.0)
+        rmse = {name: row["rmse"] for name, row in found.items() if isinstance(row, dict)}
+        assert found["n"] > 500
+        assert rmse["Kriging"] < 0.9 * rmse["nearest"]
+        assert rmse["Kriging"] < 0.6 * rmse["mean"]
+        assert rmse["replay + Kriging"] < rmse["Kriging"]
+        assert rmse["replay + Kriging"] < 0.7 * rmse["replay + mean"]
+
+
+def test_the_notes_say_where_p833_is_continued():
+    def notes(**change):
+        bare = types.SimpleNamespace(trees=())
+        return " ".join(mapping._notes(types.SimpleNamespace(settings=settings(**change), site=bare)))
+
+    assert "Trees at 3.4 GHz: an extrapolation of ITU-R P.833" in notes(foliage=("opaque", "attenuating"))
+    assert "extrapolation" not in notes(foliage=("opaque", "none"))
+    assert "extrapolation" not in notes(foliage=("attenuating",), carrier_hz=1.8e9)

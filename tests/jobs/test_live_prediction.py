@@ -1,0 +1,83 @@
+"""The rank that the tap predicts at the present pose, from a telemetry log that still grows."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import yaml
+
+from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.flight.data import choose_site
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
+from aerpaw_cmp.jobs.run import live_prediction
+from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
+from aerpaw_cmp.logs.writers import format_vehicle_out
+from aerpaw_cmp.propagation.arrays import Poses
+from aerpaw_cmp.propagation.tracer import replay
+
+ROOT = Path(__file__).parents[2]
+FLIGHT = ROOT / "sample_logs" / "flight.yaml"
+
+
+def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
+    settings = load_flight(FLIGHT)
+    site = choose_site(settings.site, FLIGHT.parent)
+    trajectory = plan_trajectory(settings.flight.plan)
+    start = pd.Timestamp("2025-06-01T14:00:00")
+    log = tmp_path / "vehicleOut.txt"
+    lines = format_vehicle_out(telemetry_frame(trajectory, start, 1.0, site.frame), "America/New_York").splitlines(True)
+    predict = live_prediction(FLIGHT, log)
+    assert predict(start.value) is None, "no log yet"
+    link = settings.link.rank.build(["LW1"], FLIGHT.parent)
+    for second in (20, 60, 61, 150, 300):
+        log.write_bytes(b"".join(lines[: second + 1]) + lines[second + 1][:20])
+        position = np.maximum(trajectory.position_at(np.array([float(second)])), [-np.inf, -np.inf, 0.5])
+        expected = replay(site, link, Poses(position, np.eye(3)[None]), max_depth=2)
+        sigma = np.linalg.svd(expected.h[0, 0], compute_uv=False)
+        if np.min(np.abs(sigma / sigma[0] * 100 - 1)) < 0.05:
+            continue  # written positions are rounded to a centimetre: a singular value near the threshold may flip
+        assert predict(start.value + second * 10**9) == channel_rank(expected.h[0, 0], 100)
+        assert predict(start.value + (second + 30) * 10**9) is None, "the UAV's position is not known yet"
+
+
+def test_tap_writes_predictions_and_residuals(tmp_path: Path) -> None:
+    """The whole command: modem on a pseudo-terminal, telemetry written now, predictions in the log."""
+    content = yaml.safe_load(FLIGHT.read_text())
+    content["timezone"] = "UTC"
+    flight = tmp_path / "flight.yaml"
+    flight.write_text(yaml.safe_dump(content))
+    settings = load_flight(FLIGHT)
+    site = choose_site(settings.site, FLIGHT.parent)
+    now = pd.Timestamp(time.time_ns() - 25 * 10**9)
+    frame = telemetry_frame(plan_trajectory(settings.flight.plan), now, 1.0, site.frame)
+    telemetry = tmp_path / "now_vehicleOut.txt"
+    telemetry.write_bytes(format_vehicle_out(frame.iloc[:120], "UTC"))
+    with ModemSimulator(ModemSimSettings()) as modem:
+        done = subprocess.run(
+            [
+                *(sys.executable, "-m", "aerpaw_cmp", "tap", str(modem.port), "-o", str(tmp_path / "log")),
+                *("--duration", "4", "--flight", str(flight), "--telemetry", str(telemetry)),
+            ],
+            capture_output=True,
+            text=True,
+            timeout=60,
+            check=False,
+            cwd=ROOT,
+        )
+    assert done.returncode == 0, done.stderr
+    records = [
+        json.loads(line) for path in (tmp_path / "log").glob("*.jsonl") for line in path.read_text().splitlines()
+    ]
+    predictions = [record for record in records if record.get("kind") == "prediction"]
+    assert any(record.get("predicted") for record in predictions), done.stderr
+    for record in predictions:
+        if record.get("predicted") is not None and record.get("measured") is not None:
+            assert record["residual"] == record["measured"] - record["predicted"]
+    assert "predicted" in done.stderr

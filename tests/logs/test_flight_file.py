@@ -1,0 +1,239 @@
+"""The flight file: what goes in comes out, whole or not at all."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import stat
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
+from tests.parsers.samples import OPTIONS, SAMPLES
+
+TEXT = st.text(st.characters(exclude_categories=("Cs",)), max_size=12)  # NUL included: torn logs have it
+FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)
+
+
+@st.composite
+def streams(draw: st.DrawFn) -> Stream:
+    kind = draw(st.sampled_from(sorted(COLUMNS)))
+    rows = draw(st.integers(0, 12))
+    column = lambda values: draw(st.lists(values, min_size=rows, max_size=rows))  # noqa: E731
+    frame: dict[str, object] = {
+        "time": np.array(column(st.integers(-(2**60), 2**60)), dtype="datetime64[ns]"),
+        "line": np.array(column(st.integers(1, 2**40)), dtype=np.int64),
+        "flag": pd.Series(column(TEXT), dtype=object),
+    }
+    for name in COLUMNS[kind]:
+        frame[name] = np.array(column(FLOAT), dtype=np.float64)
+    if draw(st.booleans()):
+        frame["valid"] = np.array(column(st.booleans()), dtype=bool)
+    attribute = TEXT | st.integers(-(2**53), 2**53) | st.booleans() | st.floats(allow_nan=False)
+    return Stream(kind, draw(TEXT), pd.DataFrame(frame), draw(st.dictionaries(TEXT, attribute, max_size=4)))
+
+
+@st.composite
+def files(draw: st.DrawFn) -> IngestedFile:
+    rejected = draw(st.lists(st.builds(RejectedLine, st.integers(1, 2**40), TEXT, TEXT), max_size=4))
+    accepted, blank = draw(st.integers(0, 2**40)), draw(st.integers(0, 2**40))
+    result = ReadResult(
+        draw(TEXT),
+        tuple(draw(st.lists(streams(), max_size=3))),
+        accepted + blank + len(rejected),
+        accepted,
+        blank,
+        tuple(rejected),
+        tuple(draw(st.lists(TEXT, max_size=3))),
+    )
+    return IngestedFile(draw(TEXT), draw(TEXT), result)
+
+
+def assert_same(one: list[IngestedFile], other: list[IngestedFile]) -> None:
+    assert len(one) == len(other)
+    for a, b in zip(one, other, strict=True):
+        assert (a.path, a.sha256) == (b.path, b.sha256)
+        for name in ("reader", "lines", "accepted", "blank", "rejected", "warnings"):
+            assert getattr(a.result, name) == getattr(b.result, name)
+        assert len(a.result.streams) == len(b.result.streams)
+        for s, t in zip(a.result.streams, b.result.streams, strict=True):
+            assert (s.kind, s.name, dict(s.attributes)) == (t.kind, t.name, dict(t.attributes))
+            pd.testing.assert_frame_equal(s.frame, t.frame, check_exact=True)
+
+
+@given(st.lists(files(), max_size=3))
+@settings(max_examples=60, deadline=None)
+def test_round_trip(tmp_path_factory: pytest.TempPathFactory, content: list[IngestedFile]) -> None:
+    path = tmp_path_factory.mktemp("store") / "flight.h5"
+    write_flight(path, content)
+    assert_same(content, read_flight(path))
+
+
+def all_samples(folder: Path) -> list[IngestedFile]:
+    made = []
+    for reader, samples in SAMPLES.items():
+        for name, (data, _, _) in samples.items():
+            path = folder / f"{reader}_{name}"
+            path.write_bytes(data)
+            made += ingest(path, options=OPTIONS, reader=reader)
+    return made
+
+
+def test_round_trip_of_every_format(tmp_path: Path) -> None:
+    content = all_samples(tmp_path)
+    write_flight(tmp_path / "flight.h5", content)
+    assert_same(content, read_flight(tmp_path / "flight.h5"))
+
+
+def test_long_columns_are_compressed_and_equal(tmp_path: Path) -> None:
+    rows = 20_000
+    frame = pd.DataFrame(
+        {
+            "time": np.arange(rows).astype("datetime64[s]").astype("datetime64[ns]"),
+            "line": np.arange(1, rows + 1),
+            "flag": pd.Series(["", "repeated"] * (rows // 2), dtype=object),
+            "rss_db": np.linspace(-80, -20, rows).round(1),
+        }
+    )
+    content = [IngestedFile("a", "b", ReadResult("r", (Stream("rss", "s", frame),), rows, rows, 0))]
+    write_flight(tmp_path / "f.h5", content)
+    assert_same(content, read_flight(tmp_path / "f.h5"))
+    assert (tmp_path / "f.h5").stat().st_size < rows * 28 / 4
+
+
+def test_a_failure_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, [])
+    before = path.read_bytes()
+    content = all_samples_of_one(tmp_path)
+
+    def fail(*_: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("aerpaw_cmp.logs.flight_file._write_stream", fail)
+    with pytest.raises(UsageError, match="No space left"):
+        write_flight(path, content)
+    assert path.read_bytes() == before
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["flight.h5", "log"]
+
+
+def test_the_old_file_stands_until_the_new_one_takes_its_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, [])
+    before = path.read_bytes()
+    seen = []
+
+    def refuse(self: Path, target: Path) -> Path:
+        seen.append((self.parent, h5py.File(self).attrs["format"], path.read_bytes() == before))
+        raise OSError(5, "Input/output error")
+
+    monkeypatch.setattr(Path, "replace", refuse)
+    with pytest.raises(UsageError, match="Input/output"):
+        write_flight(path, all_samples_of_one(tmp_path))
+    assert seen == [(tmp_path, "aerpaw-cmp flight", True)]
+    assert path.read_bytes() == before
+
+
+def all_samples_of_one(folder: Path) -> list[IngestedFile]:
+    (folder / "log").write_bytes(SAMPLES["vehicle_out"]["nine_fields"][0])
+    return list(ingest(folder / "log", options=OPTIONS))
+
+
+def test_the_file_has_ordinary_permissions(tmp_path: Path) -> None:
+    old = os.umask(0o022)
+    try:
+        write_flight(tmp_path / "flight.h5", [])
+    finally:
+        os.umask(old)
+    assert stat.S_IMODE((tmp_path / "flight.h5").stat().st_mode) == 0o644
+
+
+def test_no_folder_to_write_to(tmp_path: Path) -> None:
+    with pytest.raises(UsageError, match="missing folder"):
+        write_flight(tmp_path / "no" / "flight.h5", [])
+
+
+def test_files_that_are_no_flight_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    with pytest.raises(InputError, match="cannot be read"):
+        read_flight(path)
+    path.write_bytes(b"")
+    with pytest.raises(InputError, match="no HDF5 file"):
+        read_flight(path)
+    with h5py.File(path, "w") as book:
+        book["a"] = 1
+    with pytest.raises(InputError, match="another kind"):
+        read_flight(path)
+    write_flight(path, [])
+    with h5py.File(path, "a") as book:
+        book.attrs["version"] = 99
+    with pytest.raises(InputError, match="version 99"):
+        read_flight(path)
+
+
+def test_cut_at_many_bytes(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, all_samples_of_one(tmp_path))
+    data = path.read_bytes()[:-40]  # behind it the seal: without it the content is whole
+    for end in range(0, len(data) - 1, max(1, len(data) // 150)):
+        path.write_bytes(data[:end])
+        with pytest.raises(InputError):
+            read_flight(path)
+
+
+@given(st.data())
+@settings(max_examples=80, deadline=None)
+def test_damaged_bytes_are_told_from_the_content(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
+    folder = tmp_path_factory.mktemp("damage")
+    path = folder / "flight.h5"
+    write_flight(path, all_samples_of_one(folder))
+    raw = bytearray(path.read_bytes())
+    end = len(raw) - 40  # the seal itself may be lost without loss of content
+    for _ in range(data.draw(st.integers(1, 8))):
+        raw[data.draw(st.integers(0, end - 1))] ^= data.draw(st.integers(1, 255))
+    if bytes(raw) == path.read_bytes():  # two changes of one byte that cancel
+        return
+    path.write_bytes(bytes(raw))
+    with pytest.raises(InputError):
+        read_flight(path)
+
+
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_damage_without_a_seal_gives_a_clear_error_or_the_content(
+    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+) -> None:
+    folder = tmp_path_factory.mktemp("unsealed")
+    path = folder / "flight.h5"
+    write_flight(path, all_samples_of_one(folder))
+    raw = bytearray(path.read_bytes()[:-40])
+    raw[data.draw(st.integers(4096, len(raw) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(bytes(raw))
+    with contextlib.suppress(InputError):  # any other exception fails the test
+        read_flight(path)
+
+
+def test_a_file_without_its_seal_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    files = all_samples_of_one(tmp_path)
+    write_flight(path, files)
+    whole = read_flight(path)
+    path.write_bytes(path.read_bytes()[:-40])
+    assert [f.sha256 for f in read_flight(path)] == [f.sha256 for f in whole]
+
+
+def test_other_programs_read_a_sealed_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.h5"
+    write_flight(path, all_samples_of_one(tmp_path))
+    with h5py.File(path, "r") as book:
+        assert book.attrs["version"] == 1
+        assert len(book["files"]) == len(read_flight(path))

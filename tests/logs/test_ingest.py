@@ -1,0 +1,262 @@
+"""Finding and naming logs, and what bad input says."""
+
+from __future__ import annotations
+
+import gzip
+import json
+import os
+from dataclasses import replace
+from pathlib import Path
+
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.logs import ingest as room
+from aerpaw_cmp.logs.flight_file import write_flight
+from aerpaw_cmp.logs.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, summary
+from aerpaw_cmp.logs.readers import ReadOptions
+from tests.parsers.samples import OPTIONS, SAMPLES
+
+VEHICLE = SAMPLES["vehicle_out"]["ten_fields"][0]
+SOUNDER = SAMPLES["sounder_log"]["runs_and_foot"][0]
+
+
+@pytest.fixture
+def folder(tmp_path: Path) -> Path:
+    (tmp_path / "b" / "c").mkdir(parents=True)
+    (tmp_path / "b" / "c" / "vehicle.txt").write_bytes(VEHICLE)
+    (tmp_path / "a_power.txt").write_bytes(SOUNDER)
+    (tmp_path / "notes.md").write_text("we flew\n")
+    (tmp_path / "empty.txt").write_bytes(b"")
+    (tmp_path / ".hidden").write_bytes(VEHICLE)
+    return tmp_path
+
+
+def test_a_folder_gives_its_logs_in_order_and_reports_the_rest(folder: Path) -> None:
+    found = ingest(folder, options=OPTIONS)
+    assert [(Path(file.path).name, file.result.reader) for file in found] == [
+        ("a_power.txt", "sounder_log"), ("vehicle.txt", "vehicle_out"),
+    ]  # fmt: skip
+    assert [Path(skipped.path).name for skipped in found.skipped] == ["empty.txt", "notes.md"]
+    assert "empty" in found.skipped[0].reason
+
+
+def test_files_and_folders_together(folder: Path) -> None:
+    found = ingest([folder / "b", str(folder / "a_power.txt")], options=OPTIONS)
+    assert [file.result.reader for file in found] == ["vehicle_out", "sounder_log"]
+
+
+def test_options_per_path(folder: Path) -> None:
+    def options(path: Path) -> ReadOptions:
+        return replace(OPTIONS, node="LW1" if path.name.startswith("a_") else None)
+
+    nodes = {
+        file.result.reader: file.result.streams[0].attributes.get("node") for file in ingest(folder, options=options)
+    }
+    assert nodes == {"sounder_log": "LW1", "vehicle_out": None}
+
+
+def test_summary_is_the_contract(folder: Path) -> None:
+    found = ingest(folder, options=OPTIONS)
+    answer = json.loads(json.dumps(summary(found), allow_nan=False))
+    assert set(answer) == {"files", "skipped", "warnings"}
+    entry = answer["files"][1]
+    assert {"path", "reader", "lines", "accepted", "rejected", "blank", "streams"} <= set(entry)
+    assert (entry["lines"], entry["accepted"], entry["rejected"], entry["blank"]) == (3, 3, 0, 0)
+    (one,) = entry["streams"]
+    assert list(one) == ["kind", "name", "rows", "start", "end", "rate_hz"]
+    assert (one["kind"], one["name"], one["rows"]) == ("telemetry", "vehicle", 3)
+    assert pd.Timestamp(one["start"]) == pd.Timestamp("2025-03-02T15:00:00.25Z")
+    assert one["rate_hz"] == pytest.approx(1.0)
+    assert any("no_fix" in text and "vehicle.txt" in text for text in answer["warnings"])
+
+
+def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
+    (tmp_path / "a").mkdir()
+    (tmp_path / "b").mkdir()
+    lines = VEHICLE.splitlines(keepends=True)
+    (tmp_path / "a/vehicle.txt").write_bytes(lines[0] + b"torn,\n" + lines[1])
+    (tmp_path / "b/vehicle.txt").write_bytes(VEHICLE)
+    (tmp_path / "b/notes.md").write_text("words")
+    account = summary(ingest(tmp_path, options=OPTIONS))
+    folder, (first, second) = account_rows(account)
+    assert folder == str(tmp_path)
+    assert [first[0], second[0]] == ["a/vehicle.txt", "b/vehicle.txt"]
+    one = dict(zip(ACCOUNT, first, strict=True))
+    assert (one["lines"], one["accepted"], one["rejected"], one["blank"]) == ("3", "2", "1", "0")
+    assert (one["streams (rows)"], one["start UTC"], one["s"]) == ("telemetry: vehicle 2", "2025-03-02 15:00:00", "1.0")
+    notes = account_notes(account)
+    assert any("a/vehicle.txt:2: rejected: " in note and "torn," in note for note in notes)
+    assert any("notes.md: skipped: " in note for note in notes)
+    assert account_rows(summary(Ingested())) == ("", [])
+
+
+def test_relative_times_are_called_relative(tmp_path: Path) -> None:
+    account = {"files": [{"path": "x", "reader": "r", "lines": 1, "accepted": 1, "rejected": 9, "blank": 0,
+                          "warnings": [], "first_rejected": [{"number": 1, "reason": "torn", "text": "t"}],
+                          "streams": [{"kind": "rank", "name": "a", "rows": 1, "start": "1969-12-31T23:59:59Z",
+                                       "end": "1970-01-01T00:00:01.5Z", "rate_hz": None}]}], "skipped": []}  # fmt: skip
+    assert account_rows(account)[1][0][-3:] == ["-", "relative", "2.5"]
+    assert account_notes(account)[-1].startswith("x: and 8 more rejected lines")
+
+
+def test_summary_of_a_single_sample_has_no_rate(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(VEHICLE.splitlines(keepends=True)[0])
+    (stream,) = summary(ingest(tmp_path / "a", options=OPTIONS))["files"][0]["streams"]
+    assert stream["rate_hz"] is None
+
+
+def test_sha256_is_of_the_file_on_disk(tmp_path: Path) -> None:
+    import hashlib
+
+    packed = gzip.compress(VEHICLE)
+    (tmp_path / "a.gz").write_bytes(packed)
+    (one,) = ingest(tmp_path / "a.gz", options=OPTIONS)
+    assert one.sha256 == hashlib.sha256(packed).hexdigest()
+    assert one.result.accepted == 3
+
+
+def test_gzip_members_are_joined(tmp_path: Path) -> None:
+    lines = VEHICLE.splitlines(keepends=True)
+    (tmp_path / "a.gz").write_bytes(b"".join(gzip.compress(line) for line in lines))
+    assert ingest(tmp_path / "a.gz", options=OPTIONS)[0].result.accepted == 3
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty"),
+        (b" \r\n\n\t\n", "empty"),
+        (b"\0\1\2\3" * 500, "binary content"),
+        (bytes(range(256)) * 20, "binary content"),
+        (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "Git-LFS pointer"),
+        (b"hello, world\n", "no reader knows this content: 'hello, world'"),
+        (gzip.compress(b"hello")[:-6], "gzip file ends too early"),
+        (b"\x1f\x8b\x08\x00rubbish", "gzip"),
+        (gzip.compress(b""), "empty"),
+    ],
+)
+def test_a_named_file_that_is_no_log(tmp_path: Path, content: bytes, message: str) -> None:
+    path = tmp_path / "log.txt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=message) as caught:
+        ingest(path, options=OPTIONS)
+    assert str(path) in str(caught.value)
+    with pytest.raises(InputError):
+        ingest(path, options=OPTIONS, reader="vehicle_out")
+
+
+def test_missing_file(tmp_path: Path) -> None:
+    with pytest.raises(InputError, match="does not exist"):
+        ingest(tmp_path / "nothing.txt", options=OPTIONS)
+    with pytest.raises(InputError):
+        ingest("a\0b", options=OPTIONS)
+    with pytest.raises(InputError):
+        ingest("x" * 5000, options=OPTIONS)
+
+
+def test_a_folder_without_logs(tmp_path: Path) -> None:
+    (tmp_path / "notes.md").write_text("we flew\n")
+    with pytest.raises(InputError, match="no log that a reader knows"):
+        ingest(tmp_path, options=OPTIONS)
+
+
+def test_not_a_regular_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(InputError, match="not a regular file"):
+        ingest(tmp_path / "pipe", options=OPTIONS)
+
+
+def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = tmp_path / "log.txt"
+    path.write_bytes(VEHICLE)
+    path.chmod(0)
+    if os.access(path, os.R_OK):  # root reads everything: raise what an ordinary user would get
+
+        def refuse(self: Path) -> bytes:
+            raise PermissionError(13, "Permission denied", str(self))
+
+        monkeypatch.setattr(Path, "read_bytes", refuse)
+    with pytest.raises(InputError, match="no permission"):
+        ingest(path, options=OPTIONS)
+
+
+def test_size_caps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(room, "MAX_BYTES", 1000)
+    (tmp_path / "big.txt").write_bytes(VEHICLE * 4)
+    (tmp_path / "bomb.gz").write_bytes(gzip.compress(b"1" * 100_000))
+    with pytest.raises(InputError, match="at most 1000"):
+        ingest(tmp_path / "big.txt", options=OPTIONS)
+    with pytest.raises(InputError, match="unpacks to more than 1000"):
+        ingest(tmp_path / "bomb.gz", options=OPTIONS)
+
+
+def test_wrong_reader_named(tmp_path: Path) -> None:
+    (tmp_path / "log.txt").write_bytes(SOUNDER)
+    with pytest.raises(InputError, match="found no record") as caught:
+        ingest(tmp_path / "log.txt", options=OPTIONS, reader="vehicle_out")
+    assert "another kind" in str(caught.value)
+    with pytest.raises(UsageError, match="did you mean 'vehicle_out'"):
+        ingest(tmp_path / "log.txt", options=OPTIONS, reader="vehicle_ot")
+
+
+def test_missing_zone_is_a_usage_error_even_in_a_folder(folder: Path) -> None:
+    with pytest.raises(UsageError, match="timezone:") as caught:
+        ingest(folder)
+    assert str(folder / "a_power.txt") in str(caught.value)
+
+
+def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "samples.iq").write_bytes(b"\x01\x00" * 500_000)
+    (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
+    whole = Path.read_bytes
+
+    def watch(self: Path) -> bytes:
+        assert self.name != "samples.iq"
+        return whole(self)
+
+    monkeypatch.setattr(Path, "read_bytes", watch)
+    assert [skipped.reason for skipped in ingest(tmp_path, options=OPTIONS).skipped] == [
+        "binary content that no reader knows"
+    ]
+
+
+def test_reader_errors_name_the_file(tmp_path: Path) -> None:
+    path = tmp_path / "flight.mat"
+    path.write_bytes(SAMPLES["flight_mat"]["two_channels"][0][:-40])
+    with pytest.raises(InputError, match="damaged") as caught:
+        ingest(path, options=OPTIONS)
+    assert str(path) in str(caught.value)
+
+
+def test_symlink_loops_end(tmp_path: Path) -> None:
+    (tmp_path / "vehicle.txt").write_bytes(VEHICLE)
+    (tmp_path / "loop").symlink_to(tmp_path)
+    assert len(ingest(tmp_path, options=OPTIONS)) == 1
+
+
+def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
+    write_flight(tmp_path / "flight.h5", [])
+    with pytest.raises(InputError, match="read_flight"):
+        ingest(tmp_path / "flight.h5")
+    with pytest.raises(InputError, match=r"no log that a reader knows \(1 file looked at\); flight.h5: an HDF5 file"):
+        ingest(tmp_path)
+    with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):
+        ingest(tmp_path, reader="vehicle_out")
+
+
+def test_links_in_a_folder_are_told(tmp_path: Path) -> None:
+    logs, far = tmp_path / "logs", tmp_path / "far"
+    for folder in (logs, far):
+        folder.mkdir()
+        (folder / "a.txt").write_bytes(VEHICLE)
+    (logs / "b.txt").symlink_to(far / "a.txt")
+    (logs / "gone.txt").symlink_to(far / "nowhere")
+    (logs / "far").symlink_to(far)
+    (logs / "round").symlink_to(logs)
+    found = ingest(logs, options=OPTIONS)
+    assert [Path(f.path).name for f in found] == ["a.txt", "b.txt"]
+    told = {Path(s.path).name: s.reason for s in found.skipped}
+    assert told.keys() == {"far", "gone.txt", "round"}
+    assert "link to a folder" in told["far"]

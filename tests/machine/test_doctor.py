@@ -1,0 +1,159 @@
+"""The checks of the machine, each seen well and unwell."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.machine import doctor, llvm
+
+
+def test_every_unwell_check_has_a_remedy_and_the_whole_is_json(monkeypatch: pytest.MonkeyPatch) -> None:
+    library = llvm.Library(Path("/x/libLLVM.so.19.1"), (19, 1))
+    monkeypatch.setattr(llvm, "candidates", lambda: [library])
+    monkeypatch.setattr(llvm, "try_library", lambda one: llvm.Trial(one, True))
+    found = doctor.checks()
+    names = [check.name for check in found]
+    for name in (
+        "Python",
+        "Sionna RT",
+        "Mitsuba",
+        "Dr.Jit",
+        "LLVM",
+        "GPU",
+        "CPU",
+        "Memory",
+        "Disk",
+        "Cache",
+        "Readers",
+        "Serial",
+    ):
+        assert name in names
+    for check in found:
+        assert check.status in ("ok", "warn", "fail")
+        assert bool(check.remedy) == (check.status != "ok"), check
+    assert json.loads(json.dumps(doctor.as_dict(found)))["checks"][0]["name"] == "Python"
+
+
+def test_python_too_old() -> None:
+    assert doctor.python_check((3, 9, 18)).status == "fail"
+    assert doctor.python_check((3, 10, 0)).status == "ok"
+
+
+def with_trials(monkeypatch: pytest.MonkeyPatch, *trials: llvm.Trial) -> list[doctor.Check]:
+    monkeypatch.setattr(llvm, "candidates", list)
+    monkeypatch.setattr(llvm, "first_that_works", lambda _: list(trials))
+    monkeypatch.setattr(llvm, "install_line", lambda: "the line")
+    return list(doctor.llvm_checks())
+
+
+def test_llvm_found_and_tried(monkeypatch: pytest.MonkeyPatch) -> None:
+    old = llvm.Trial(llvm.Library(Path("a"), (22,)), False, "aborted")
+    good = llvm.Trial(llvm.Library(Path("b"), (19,)), True)
+    lost = llvm.Trial(llvm.Library(Path("b"), (19,)), False, "No module named 'sionna'", blames_library=False)
+    assert [check.status for check in with_trials(monkeypatch, good)] == ["ok"]
+    assert [check.status for check in with_trials(monkeypatch, old, good)] == ["warn", "ok"]
+    assert [(check.status, check.remedy) for check in with_trials(monkeypatch, old)] == [("fail", "the line")]
+    assert [(check.status, check.remedy) for check in with_trials(monkeypatch, lost)] == [("fail", "make setup")]
+    assert [(check.status, check.remedy) for check in with_trials(monkeypatch)] == [("fail", "the line")]
+
+
+def test_a_gpu_that_works_needs_no_llvm(monkeypatch: pytest.MonkeyPatch) -> None:
+    with_trials(monkeypatch)
+    monkeypatch.setattr(doctor.shutil, "which", lambda name: f"/usr/bin/{name}")
+    for works, status in ((True, "warn"), (False, "fail")):
+        trial = llvm.Trial(None, works, "" if works else "the trial ended with 1: no CUDA device")
+        monkeypatch.setattr(llvm, "try_variant", lambda _, trial=trial: trial)
+        found = {check.name: check for check in doctor.checks()}
+        assert found["LLVM"].status == status
+        assert found["GPU"].status == ("ok" if works else "warn")
+        assert ("cuda_ad_mono_polarized" in found["GPU"].found) == works
+
+
+def test_a_child_that_aborts_is_a_row_not_a_crash(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "libLLVM.so.19.1").touch()
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    attempt = llvm.try_library
+    abort = lambda library: attempt(library, program="import os; os.abort()")  # noqa: E731
+    monkeypatch.setattr(llvm, "try_library", abort)
+    (check,) = [check for check in doctor.llvm_checks() if check.name == "LLVM"]
+    assert check.status == "fail"
+    assert "ended by signal 6" in check.found
+
+
+def test_a_library_variable_that_names_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "/no/such/libLLVM.so")
+    (check,) = list(doctor.llvm_checks())
+    assert (check.status, check.remedy) == ("fail", "unset DRJIT_LIBLLVM_PATH")
+
+
+def test_versions_that_do_not_belong_together(monkeypatch: pytest.MonkeyPatch) -> None:
+    installed = {"sionna-rt": "2.2.0", "mitsuba": "3.8.0"}
+    monkeypatch.setattr(doctor, "_version", installed.get)
+    monkeypatch.setattr(doctor.metadata, "requires", lambda _: ["mitsuba==3.9.1", "drjit==1.5.0", "numpy>=1.26"])
+    found = {check.name: check for check in doctor.package_checks()}
+    assert found["Sionna RT"].status == "ok"
+    assert found["Mitsuba"].remedy == "pip install 'mitsuba==3.9.1'"
+    assert found["Dr.Jit"].found == "not installed"
+
+
+def test_memory_is_the_lower_of_machine_and_control_group(tmp_path: Path) -> None:
+    (tmp_path / "proc").mkdir()
+    (tmp_path / "proc/meminfo").write_text("MemTotal: 9 kB\nMemAvailable:    4194304 kB\n")
+    assert doctor.available_memory_bytes(tmp_path) == 4 * 1024**3
+    group = tmp_path / "sys/fs/cgroup"
+    group.mkdir(parents=True)
+    (group / "memory.current").write_text("1073741824\n")
+    (group / "memory.max").write_text("max\n")
+    assert doctor.available_memory_bytes(tmp_path) == 4 * 1024**3
+    (group / "memory.max").write_text("2147483648\n")
+    assert doctor.available_memory_bytes(tmp_path) == 1024**3
+    assert doctor.available_memory_bytes(tmp_path / "nothing") is None
+    assert doctor.memory_check(1024**3).status == "warn"
+    assert doctor.memory_check(3 * 1024**3).status == "ok"
+
+
+def test_cache_folder_that_cannot_be(tmp_path: Path) -> None:
+    assert doctor.cache_check(tmp_path / "new/deep").status == "ok"
+    (tmp_path / "file").touch()
+    assert doctor.cache_check(tmp_path / "file/cache").status == "warn"
+
+
+def test_readers_that_raise_are_reported(monkeypatch: pytest.MonkeyPatch) -> None:
+    def broken() -> None:
+        raise RuntimeError("a bad plug-in")
+
+    monkeypatch.setattr("aerpaw_cmp.logs.readers.catalogue", broken)
+    check = doctor.readers_check()
+    assert check.status == "fail"
+    assert "a bad plug-in" in check.found
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
+def test_the_holder_of_a_port_is_named() -> None:
+    controller, terminal = os.openpty()
+    try:
+        device = os.ttyname(terminal)
+        assert any(f"({os.getpid()})" in name for name in doctor.holders(device))
+        check = doctor.serial_check(device)
+        assert (check.status, check.remedy) == ("warn", "stop it")
+        os.close(terminal)
+        terminal = -1
+        assert doctor.holders(device) == []
+        assert doctor.serial_check(device).status == "ok"
+    finally:
+        os.close(controller)
+        if terminal >= 0:
+            os.close(terminal)
+
+
+def test_a_port_that_is_not_ours_names_the_group(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(doctor.os, "access", lambda *_: False)
+    check = doctor.serial_check("/dev/ttyUSB77")
+    assert check.status == "warn"
+    assert check.remedy == "sudo usermod -aG dialout $USER, then log in anew"

@@ -1,0 +1,282 @@
+"""Choosing an LLVM: names, order, refusals, and trials that end badly. The libraries are empty files, the children real."""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.common.errors import CheckError
+from aerpaw_cmp.machine import llvm
+
+ABORTS = (
+    "import os, sys; sys.stderr.write('x\\nLLVM ERROR: Cannot select: fmaximum\\ny\\n'); sys.stderr.flush(); os.abort()"
+)
+ANSWERS = "print('noise'); print('{\"right\": true, \"llvm\": [%d, 1, 7]}')"
+
+
+def put(folder: Path, *names: str) -> None:
+    for name in names:
+        (folder / name).write_bytes(b"\x7fELF")
+
+
+@pytest.fixture
+def folders(tmp_path: Path) -> tuple[Path, dict[str, str]]:
+    return tmp_path, {llvm.FOLDERS_VARIABLE: str(tmp_path)}
+
+
+@pytest.mark.parametrize(
+    ("name", "version"),
+    [
+        ("libLLVM-14.so.1", (14,)),
+        ("libLLVM-14.0.6.so.1", (14, 0, 6)),
+        ("libLLVM-17.so", (17,)),
+        ("libLLVM.so.19.1", (19, 1)),
+        ("libLLVM.dylib", ()),
+        ("libLLVM.so", ()),
+        ("libLLVM-C.so.19", None),
+        ("libLLVM-15-rust-1.70.so", None),
+        ("libclang.so.19", None),
+    ],
+)
+def test_version_in_name(name: str, version: tuple[int, ...] | None) -> None:
+    assert llvm.version_in_name(name) == version
+
+
+def test_newest_first_and_each_file_once(folders: tuple[Path, dict[str, str]]) -> None:
+    folder, environ = folders
+    put(folder, "libLLVM-14.so.1", "libLLVM.so.19.1", "libLLVM-9.so.1", "libLLVM-C.so.19", "libLLVM-22.so")
+    (folder / "libLLVM-19.so").symlink_to("libLLVM.so.19.1")
+    (folder / "libLLVM.so").symlink_to("libLLVM-14.so.1")
+    (folder / "libLLVM-21.so").symlink_to("gone.so")
+    found = llvm.candidates(environ)
+    assert [library.version for library in found] == [(22,), (19, 1), (14,), (9,)]
+
+
+def test_none_found(folders: tuple[Path, dict[str, str]]) -> None:
+    assert llvm.candidates(folders[1]) == []
+
+
+def test_the_users_choice_stands_alone(folders: tuple[Path, dict[str, str]]) -> None:
+    folder, environ = folders
+    put(folder, "libLLVM.so.19.1", "libLLVM-17.so.1", "mine.so")
+    for name, version in (("libLLVM-17.so.1", (17,)), ("mine.so", ())):
+        chosen = folder / name
+        assert llvm.candidates({**environ, llvm.LIBRARY_VARIABLE: str(chosen)}) == [llvm.Library(chosen, version)]
+
+
+def test_the_users_choice_must_exist(folders: tuple[Path, dict[str, str]]) -> None:
+    folder, environ = folders
+    put(folder, "libLLVM.so.19.1")
+    with pytest.raises(CheckError, match=r"not a file.*unset DRJIT_LIBLLVM_PATH"):
+        llvm.candidates({**environ, llvm.LIBRARY_VARIABLE: str(folder)})
+
+
+@pytest.mark.parametrize("major", [14, 15, 16])
+def test_old_versions_are_refused_without_a_trial(major: int) -> None:
+    trial = llvm.try_library(llvm.Library(Path("libLLVM.so"), (major,)), program="raise SystemExit('ran')")
+    assert not trial.ok
+    assert trial.reason == f"LLVM {major} is too old; 17 or newer is needed"
+
+
+def test_an_unnamed_version_is_refused_by_what_the_child_says() -> None:
+    library = llvm.Library(Path("libLLVM.so"), ())
+    assert "LLVM 16 is too old" in llvm.try_library(library, program=ANSWERS % 16).reason
+    good = llvm.try_library(library, program=ANSWERS % 19)
+    assert good.ok
+    assert good.library is not None
+    assert good.library.version == (19, 1, 7)
+
+
+@pytest.mark.parametrize(
+    ("program", "reason"),
+    [
+        (ABORTS, "ended by signal 6: LLVM ERROR: Cannot select: fmaximum"),
+        ("raise OSError('no such thing')", "ended with 1: OSError: no such thing"),
+        ("print('{}')", "path lengths are wrong"),
+        ('print(\'{"right": false, "found_m": [1.0]}\')', r"path lengths are wrong: \[1.0\]"),
+        ("print('[1')", "answer is unreadable"),
+        ("", "answer is unreadable"),
+        ("import time; time.sleep(60)", "no answer within 1 s"),
+    ],
+)
+def test_a_bad_end_is_reported_and_blames_the_library(program: str, reason: str) -> None:
+    timeout_s = 1.0 if "sleep" in program else 30.0
+    trial = llvm.try_library(llvm.Library(Path("libLLVM.so"), (19,)), program=program, timeout_s=timeout_s)
+    assert not trial.ok
+    assert trial.blames_library
+    assert re.search(reason, trial.reason), trial.reason
+
+
+def test_missing_sionna_is_not_the_librarys_fault() -> None:
+    trial = llvm.try_library(llvm.Library(Path("libLLVM.so"), (19,)), program="import no_such_engine")
+    assert not trial.ok
+    assert not trial.blames_library
+
+
+def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """As on a minimal Debian: the loader's message comes first, an unrelated NameError last."""
+    program = (
+        "try: raise ImportError('libatomic.so.1: cannot open shared object file: No such file or directory')\n"
+        "except ImportError: _drjit_ext"
+    )
+    (tmp_path / "libLLVM.so.19").touch()
+    trial = llvm.try_library(llvm.Library(tmp_path / "libLLVM.so.19", (19,)), program=program)
+    assert not trial.blames_library
+    assert trial.missing == "libatomic.so.1"
+    assert trial.reason == "Dr.Jit cannot be loaded, the system has no libatomic.so.1"
+    fake_tool(tmp_path, "apt-get", f'[ "$1" = install ] && touch "{tmp_path}/installed"; exit 0')
+    monkeypatch.setenv("PATH", f"{tmp_path}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
+    monkeypatch.setattr(llvm, "root_prefix", list)
+    said: list[str] = []
+    again = llvm.install(said.append, lambda library: llvm.Trial(library, (tmp_path / "installed").exists()))
+    assert again is not None
+    assert again.ok
+    assert [line.split()[-1] for line in said] == ["-qq", "libatomic1"]
+
+
+def test_the_child_gets_the_library_and_an_empty_kernel_cache() -> None:
+    program = (
+        "import json, os; assert os.listdir(os.environ['DRJIT_CACHE_DIR']) == [];"
+        "print(json.dumps({'right': os.environ['DRJIT_LIBLLVM_PATH'] == '/here/libLLVM.so', 'llvm': [19]}))"
+    )
+    assert llvm.try_library(llvm.Library(Path("/here/libLLVM.so"), ()), program=program).ok
+
+
+def test_the_next_library_is_tried_after_a_failure() -> None:
+    libraries = [llvm.Library(Path(f"libLLVM.so.{major}"), (major,)) for major in (22, 19, 17)]
+    trials = llvm.first_that_works(
+        libraries,
+        lambda library: llvm.try_library(library, program=ABORTS if library.version == (22,) else ANSWERS % 19),
+    )
+    assert [trial.ok for trial in trials] == [False, True]
+
+
+def test_prepare_points_drjit_to_what_works(
+    folders: tuple[Path, dict[str, str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    folder, environ = folders
+    put(folder, "libLLVM.so.19.1", "libLLVM-15.so.1")
+    monkeypatch.setenv("AERPAW_CMP_CACHE", str(folder / "cache"))
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, environ[llvm.FOLDERS_VARIABLE])
+    monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
+    made: list[Path] = []
+
+    def attempt(library: llvm.Library) -> llvm.Trial:
+        made.append(library.path)
+        return llvm.Trial(library, True)
+
+    monkeypatch.setattr(llvm, "try_library", attempt)
+    for _ in range(2):
+        llvm._trials.cache_clear()
+        assert llvm.prepare_llvm() == folder / "libLLVM.so.19.1"
+        assert os.environ[llvm.LIBRARY_VARIABLE] == str(folder / "libLLVM.so.19.1")
+        monkeypatch.setenv(llvm.LIBRARY_VARIABLE, "")
+    assert len(made) == 1, "a good trial is remembered"
+    put(folder, "libLLVM.so.19.1")
+    os.utime(folder / "libLLVM.so.19.1", ns=(1, 1))
+    llvm._trials.cache_clear()
+    llvm.prepare_llvm()
+    assert len(made) == 2, "a new file is tried anew"
+    llvm._trials.cache_clear()
+
+
+def test_prepare_without_any_gives_the_line_that_mends_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
+    monkeypatch.setattr(llvm, "_offered_by_apt", lambda: ["libllvm19"])
+    llvm._trials.cache_clear()
+    with pytest.raises(CheckError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
+        llvm.prepare_llvm()
+    assert caught.value.exit_code == 1
+    llvm._trials.cache_clear()
+
+
+def fake_tool(folder: Path, name: str, script: str) -> None:
+    (folder / name).write_text(f"#!/bin/sh\n{script}\n")
+    (folder / name).chmod(0o755)
+
+
+def test_install_takes_the_newest_and_falls_back_when_its_trial_fails(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """apt is a shell script that puts libraries down; version 22 fails its trial, 19 passes."""
+    tools, libraries = tmp_path / "bin", tmp_path / "lib"
+    tools.mkdir()
+    libraries.mkdir()
+    fake_tool(tools, "apt-cache", "echo 'libllvm14 - x'; echo 'libllvm22 - x'; echo 'libllvm19 - x'")
+    fake_tool(
+        tools,
+        "apt-get",
+        f'for p in "$@"; do case $p in libllvm*) touch "{libraries}/libLLVM.so.${{p#libllvm}}";; esac; done',
+    )
+    monkeypatch.setenv("PATH", f"{tools}{os.pathsep}{os.environ['PATH']}")
+    monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(libraries))
+    monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
+    monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
+    monkeypatch.setattr(llvm, "root_prefix", list)
+    said: list[str] = []
+
+    def attempt(library: llvm.Library) -> llvm.Trial:
+        return llvm.Trial(library, library.version == (19,), "" if library.version == (19,) else "aborted")
+
+    trial = llvm.install(said.append, attempt)
+    assert trial is not None
+    assert trial.ok
+    assert trial.library == llvm.Library(libraries / "libLLVM.so.19", (19,))
+    assert [line.rpartition(" -")[2].partition(" ")[2] for line in said] == [
+        "",
+        "libllvm22 libatomic1",
+        "libllvm19 libatomic1",
+    ]
+
+
+def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llvm, "root_prefix", lambda: None)
+    said: list[str] = []
+    assert llvm.install(said.append) is None
+    assert said == []
+
+
+@pytest.mark.parametrize(
+    ("family", "line"),
+    [("fedora", "dnf install"), ("arch", "pacman"), ("darwin", "brew"), ("other", "DRJIT_LIBLLVM_PATH=")],
+)
+def test_every_system_gets_a_line(family: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llvm, "_os_families", lambda: {family})
+    assert line in llvm.install_line()
+
+
+@pytest.mark.sionna
+def test_this_machines_llvm_traces_two_paths() -> None:
+    pytest.importorskip("sionna", reason="Sionna RT is not installed")
+    trials = llvm.first_that_works(llvm.candidates())
+    assert trials, llvm.install_line()
+    assert trials[-1].ok, trials
+
+
+@pytest.mark.sionna
+def test_setup_script_prints_the_one_line_when_nothing_can_be_installed(tmp_path: Path) -> None:
+    """The real script, told that there is no library anywhere and no way to become root."""
+    import subprocess
+
+    script = Path(__file__).resolve().parents[2] / "tools/setup_llvm.py"
+    program = (
+        "import runpy, sys; from aerpaw_cmp import llvm; llvm.root_prefix = lambda: None;"
+        f"runpy.run_path({str(script)!r}, run_name='__main__')"
+    )
+    environ = {**os.environ, llvm.FOLDERS_VARIABLE: str(tmp_path)}
+    environ.pop(llvm.LIBRARY_VARIABLE, None)
+    done = subprocess.run(
+        [sys.executable, "-c", program], cwd=script.parents[1], env=environ, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 1
+    assert done.stderr.splitlines()[-1].strip() == llvm.install_line()
+    assert "Traceback" not in done.stderr

@@ -1,0 +1,225 @@
+"""Chords against sampling of the solids themselves, models against tabulated values."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.propagation import foliage
+from aerpaw_cmp.propagation.foliage import (
+    P833,
+    P833_TABLE,
+    CrownIndex,
+    NoFoliage,
+    Opaque,
+    Weissberger,
+    foliage_depth_m,
+    foliage_loss_db,
+    foliage_model,
+)
+from aerpaw_cmp.site.site import Trees
+
+NO_VERTEX = np.zeros((1, 0, 3))
+
+
+def trees(*rows: tuple[float, ...]) -> Trees:
+    """Rows of east, north, ground, height, diameter, base."""
+    columns = np.array(rows, dtype=float).reshape(-1, 6).T
+    return Trees(*columns, np.full(columns.shape[1], 0.4))
+
+
+def grove(count: int, seed: int) -> Trees:
+    random = np.random.default_rng(seed)
+    height = random.uniform(8, 25, count)
+    return Trees(
+        random.uniform(-60, 60, count),
+        random.uniform(-60, 60, count),
+        random.uniform(-3, 3, count),
+        height,
+        random.uniform(2, 14, count),
+        height * random.uniform(0, 0.6, count),
+        random.uniform(0.2, 1.0, count),
+    )
+
+
+def depth(start: object, end: object, stand: Trees, shape: str = "cone") -> float:
+    one = np.atleast_2d(np.asarray(start, dtype=float)), np.atleast_2d(np.asarray(end, dtype=float))
+    return float(foliage_depth_m(one[0], NO_VERTEX, one[1], CrownIndex(stand, shape))[0])  # type: ignore[arg-type]
+
+
+def sampled(start: np.ndarray, end: np.ndarray, stand: Trees, shape: str, count: int, seed: int) -> float:
+    """Stratified Monte Carlo of the length inside the solids."""
+    share = (np.arange(count) + np.random.default_rng(seed).random(count)) / count
+    point = start + share[:, None] * (end - start)
+    base, top = stand.ground_m + stand.crown_base_m, stand.ground_m + stand.height_m
+    total = 0
+    for i in range(len(stand)):
+        r = np.hypot(point[:, 0] - stand.east_m[i], point[:, 1] - stand.north_m[i]) / (stand.crown_diameter_m[i] / 2)
+        h = (point[:, 2] - base[i]) / (top[i] - base[i])
+        limit = {"cone": 1 - h, "cylinder": np.ones_like(h), "ellipsoid": 2 * np.sqrt(np.clip(h * (1 - h), 0, None))}
+        total += np.count_nonzero((h >= 0) & (h <= 1) & (r <= limit[shape]))
+    return total / count * float(np.linalg.norm(end - start))
+
+
+@pytest.mark.parametrize("shape", ["cone", "ellipsoid", "cylinder"])
+def test_chords_equal_monte_carlo(shape: str) -> None:
+    stand = grove(50, seed=3)
+    random = np.random.default_rng(4)
+    start = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(0, 9, 24)])
+    end = np.column_stack([random.uniform(-80, 80, (24, 2)), random.uniform(0, 9, 24)])
+    found = foliage_depth_m(start, np.zeros((24, 0, 3)), end, CrownIndex(stand, shape))  # type: ignore[arg-type]
+    expected = [sampled(a, b, stand, shape, 100_000, n) for n, (a, b) in enumerate(zip(start, end, strict=True))]
+    assert np.count_nonzero(found > 1) > 8  # the case is not empty
+    # a stratified sample is off by about one stratum (< 2.3 mm here) per surface crossed, half of them either way
+    np.testing.assert_allclose(found, expected, rtol=1e-3, atol=5e-3)
+
+
+def test_hand_computed_cone_chords() -> None:
+    tree = trees((10, 0, 0, 20, 10, 5))  # cone from 5 m to 20 m, radius 5 m
+    assert depth([-50, 0, 5], [50, 0, 5], tree) == pytest.approx(10)  # along the base
+    assert depth([-50, 0, 12.5], [50, 0, 12.5], tree) == pytest.approx(5)  # half-way up
+    assert depth([-50, 3, 5], [50, 3, 5], tree) == pytest.approx(8)  # 3-4-5 triangle
+    assert depth([10, 0, 0], [10, 0, 30], tree) == pytest.approx(15)  # up the axis
+    assert depth([12.5, 0, 0], [12.5, 0, 30], tree) == pytest.approx(7.5)  # parallel to the axis
+    assert depth([15, 0, 5], [10, 0, 20], tree) == pytest.approx(math.hypot(5, 15), rel=1e-6)  # along the side
+    assert depth([13, 0, 5], [8, 0, 20], tree) == pytest.approx(math.hypot(4, 12), abs=1e-6)  # parallel to the side
+    assert depth([-50, 0, 20.1], [50, 0, 20.1], tree) == 0  # above: the mirrored upper cone is not a crown
+    assert depth([10, 0, 25], [10, 0, 100], tree) == 0
+    assert depth([-50, 0, 4.9], [50, 0, 4.9], tree) == 0
+    assert depth([10, 0, 6], [10, 0, 8], tree) == pytest.approx(2)  # both ends inside
+    assert depth([10, 0, 6], [10, 0, 6], tree) == 0  # no length
+
+
+def test_ground_height_lifts_the_tree() -> None:
+    low, high = trees((0, 0, 0, 20, 10, 5)), trees((0, 0, -7, 20, 10, 5))
+    assert depth([-9, 1, 8], [9, 2, 11], low) == pytest.approx(depth([-9, 1, 1], [9, 2, 4], high), rel=1e-12)
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.integers(0, 10_000),
+    st.sampled_from(["cone", "ellipsoid", "cylinder"]),
+    st.floats(0.05, 0.95),
+    st.floats(-math.pi, math.pi),
+)
+def test_reversal_splitting_and_turning_change_nothing(seed: int, shape: str, cut: float, angle: float) -> None:
+    stand = grove(40, seed)
+    random = np.random.default_rng(seed)
+    start, end = (np.append(random.uniform(-70, 70, 2), random.uniform(0, 30)) for _ in range(2))
+    whole = depth(start, end, stand, shape)
+    middle = start + cut * (end - start)
+    turn = np.array([[math.cos(angle), -math.sin(angle), 0], [math.sin(angle), math.cos(angle), 0], [0, 0, 1]])
+    turned = turn @ np.stack([stand.east_m, stand.north_m, np.zeros(40)])
+    other = Trees(
+        turned[0], turned[1], stand.ground_m, stand.height_m, stand.crown_diameter_m, stand.crown_base_m, stand.ground_m
+    )
+    assert depth(end, start, stand, shape) == pytest.approx(whole, abs=1e-6)
+    assert depth(start, middle, stand, shape) + depth(middle, end, stand, shape) == pytest.approx(whole, abs=1e-6)
+    assert depth(turn @ start, turn @ end, other, shape) == pytest.approx(whole, abs=1e-6)
+
+
+def test_grid_finds_every_crown(monkeypatch: pytest.MonkeyPatch) -> None:
+    stand = grove(300, seed=8)
+    random = np.random.default_rng(9)
+    start = np.column_stack([random.uniform(-90, 90, (500, 2)), random.uniform(0, 30, 500)])
+    end = np.column_stack([random.uniform(-90, 90, (500, 2)), random.uniform(0, 30, 500)])
+    end[:20, :2] = start[:20, :2]  # vertical ones too
+    found = CrownIndex(stand).chords_m(start, end)
+    one_by_one = np.zeros(500)
+    bodies = CrownIndex(stand)._bodies
+    for body in bodies:
+        share = foliage._chord_share(start, end - start, np.broadcast_to(body, (500, 5)), "cone")
+        one_by_one += share * np.linalg.norm(end - start, axis=1)
+    np.testing.assert_allclose(found, one_by_one, rtol=1e-9, atol=1e-9)
+    monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 70)  # small batches give the same sums
+    np.testing.assert_allclose(CrownIndex(stand).chords_m(start, end), found, rtol=1e-12, atol=1e-12)
+
+
+def test_reflected_path_adds_its_segments() -> None:
+    stand = trees((0, 0, 0, 20, 10, 5), (100, 0, 0, 20, 10, 5))
+    source, target = np.array([[-20.0, 0, 21], [-20, 0, 21]]), np.array([[120.0, 0, 21], [120, 0, 21]])
+    vertex = np.array([[[50.0, 0, 0], [np.nan] * 3], [[np.nan] * 3, [np.nan] * 3]])
+    found = foliage_depth_m(source, vertex, target, stand)
+    assert found[0] == pytest.approx(depth(source[0], vertex[0, 0], stand) + depth(vertex[0, 0], target[0], stand))
+    assert found[0] > 0
+    assert found[1] == 0  # straight above both
+
+
+def test_unknown_positions_have_unknown_depth() -> None:
+    found = foliage_depth_m(np.full((1, 3), np.nan), NO_VERTEX, np.zeros((1, 3)), trees((0, 0, 0, 20, 10, 5)))
+    assert np.isnan(found).all()
+
+
+def test_no_trees_and_a_tree_that_is_not_a_number() -> None:
+    assert depth([0, 0, 0], [9, 9, 9], Trees.none()) == 0
+    with pytest.raises(UsageError, match="not a number"):
+        CrownIndex(trees((math.nan, 0, 0, 20, 10, 5)))
+
+
+# ---------------------------------------------------------------- models
+
+
+@pytest.mark.parametrize(
+    ("metres", "p48", "p68", "weissberger"),
+    [(2, 0.9, 1.3, 1.3), (5, 2.3, 3.3, 3.2), (10, 4.5, 6.2, 6.4), (20, 8.5, 11.4, 11.0), (50, 17.8, 22.5, 18.8)],
+)
+def test_tabulated_losses_at_3400_mhz(metres: float, p48: float, p68: float, weissberger: float) -> None:
+    at = np.array(float(metres))
+    assert P833(0.48, 38.0).loss_db(at) == pytest.approx(p48, abs=0.06)
+    assert P833(0.68, 38.0).loss_db(at) == pytest.approx(p68, abs=0.06)
+    assert Weissberger(3.4e9).loss_db(at) == pytest.approx(weissberger, abs=0.06)
+
+
+def test_p833_table_is_met_and_continued_smoothly() -> None:
+    for mhz, gamma, maximum in P833_TABLE:
+        assert P833.at(mhz * 1e6).gamma_db_per_m == pytest.approx(gamma, rel=1e-9)
+        assert P833.at(mhz * 1e6).maximum_db == pytest.approx(maximum, rel=1e-9)
+    assert P833.at(3.4e9).gamma_db_per_m == pytest.approx(0.47, abs=0.01)
+    assert P833.at(3.4e9).maximum_db == pytest.approx(41.8, abs=0.1)
+    ladder = [P833.at(f) for f in np.geomspace(30e6, 100e9, 50)]
+    assert all(a.gamma_db_per_m < b.gamma_db_per_m for a, b in itertools.pairwise(ladder))
+    assert P833.at(3.4e9).gamma_db_per_m == pytest.approx(1.2 * P833.at(3.4e9, in_leaf=False).gamma_db_per_m)
+
+
+@pytest.mark.parametrize("model", [P833(), Weissberger()])
+def test_loss_starts_at_zero_and_never_falls(model: foliage.FoliageModel) -> None:
+    loss = model.loss_db(np.linspace(0, 400, 4001))
+    assert loss[0] == 0
+    assert (np.diff(loss) > -0.03).all()  # Weissberger's two pieces differ by 0.02 dB at 14 m
+    small = model.loss_db(np.array([1e-6, 2e-6]))
+    assert small[1] == pytest.approx(2 * small[0], rel=1e-5)
+
+
+def test_p833_saturates() -> None:
+    assert P833(0.5, 38.0).loss_db(np.array(1e4)) == pytest.approx(38.0)
+
+
+def test_opaque_blocks_by_crown_and_trunk_and_none_does_not() -> None:
+    stand = trees((0, 0, 0, 20, 10, 5))
+    source = np.array([[-50.0, 0, 12], [-50, 0, 2], [-50, 3, 2]])
+    target = source * [-1, 1, 1]
+    args = (source, np.zeros((3, 0, 3)), target, stand)
+    assert foliage_loss_db(*args, Opaque()).tolist() == [np.inf, np.inf, 0.0]  # crown, trunk, beside the trunk
+    assert foliage_loss_db(*args, NoFoliage()).tolist() == [0, 0, 0]
+    attenuated = foliage_loss_db(*args, P833(0.5, 38.0))
+    chord = 2 * 5 * (20 - 12) / 15
+    np.testing.assert_allclose(attenuated, [38 * (1 - math.exp(-0.5 * chord / 38)), 0, 0])
+
+
+def test_models_by_name() -> None:
+    assert foliage_model("attenuating", 3.4e9, gamma_db_per_m=0.6, maximum_db=30) == P833(0.6, 30)
+    assert foliage_model("p833", 3.4e9, in_leaf=False) == P833.at(3.4e9, in_leaf=False)
+    assert foliage_model("weissberger", 3.4e9) == Weissberger(3.4e9)
+    assert foliage_model("none", 3.4e9) == NoFoliage()
+    with pytest.raises(UsageError, match="expected none, opaque, attenuating"):
+        foliage_model("opake", 3.4e9)
+    with pytest.raises(UsageError, match="neither gamma nor A_m"):
+        foliage_model("opaque", 3.4e9, gamma_db_per_m=1)
+    with pytest.raises(UsageError, match="gamma is -1"):
+        foliage_model("attenuating", 3.4e9, gamma_db_per_m=-1)
+    with pytest.raises(UsageError, match="30 MHz"):
+        P833.at(3.4)

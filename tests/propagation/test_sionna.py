@@ -1,0 +1,251 @@
+"""The sionna engine against the image engine, and Sionna's own arrays at short range."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.audit import audit
+from aerpaw_cmp.propagation.channel import mean_pair_power, rss_dbm
+from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.tracer import Scene, replay
+from aerpaw_cmp.site.site import Building, Trees
+
+pytestmark = pytest.mark.sionna
+
+SAMPLES = 100_000
+BATCH = 25
+
+
+@pytest.fixture(scope="module")
+def sionna():
+    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
+    from aerpaw_cmp.propagation import sionna
+
+    try:
+        sionna.load_variant()
+    except (CheckError, UsageError) as error:
+        pytest.skip(f"no device for Dr.Jit: {error}")
+    return sionna
+
+
+@pytest.fixture(scope="module")
+def case(scenes):
+    rng = np.random.default_rng(41)
+    court = Building("court", box(60, -90, 100, -50).difference(box(70, -80, 90, -60)), 7.0, material="metal")
+    site = scenes.site(
+        (*scenes.buildings(rng, 7, spread_m=100.0, holes=True)[:6], court),
+        ((0.0, 0.0, 10.0), (3.0, -5.0, 20.0), (-4.0, 2.0, 9.0, 1.5)),
+    )
+    position = rng.uniform([-120, -120, 14], [120, 120, 50], (45, 3))
+    angles = rng.uniform(-15, 15, (3, 45))
+    return site, scenes.poses(position, rotation_from_aircraft(angles[0], angles[1], 12 * angles[2]))
+
+
+@pytest.fixture(scope="module")
+def lone(case):
+    """The same with one tower: every test that can shares one set of kernels."""
+    site, poses = case
+    return replace(site, towers={"LW1": site.towers["LW1"]}), poses
+
+
+def test_both_engines_find_the_same_paths_and_fields(sionna, scenes, case):
+    site, poses = case
+    link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
+    exact = replay(site, link, poses)
+    seen = []
+    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="", progress=seen.append)
+    assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
+    assert np.nanmax(np.abs(traced.rss_dbm - exact.rss_dbm)) < 0.01
+    assert traced.paths.vertices_m == pytest.approx(exact.paths.vertices_m, abs=1e-9, nan_ok=True)
+    assert exact.paths.depth.max() == 2
+    assert seen[-1] == 1.0
+    report = audit(site, link, poses, exact, links=75, samples=SAMPLES, batch=BATCH, cache_dir="")
+    assert (report.reference, report.missing_paths, report.extra_paths) == ("sionna", 0, 0)
+
+
+def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
+    site, poses = lone
+    link = scenes.link(site)
+    few = replay(site, link, poses, "sionna", samples=100, batch=BATCH, cache_dir="")
+    report = audit(site, link, poses, few, links=None)
+    assert report.reference == "image"
+    assert report.missing_paths > 0
+    assert report.extra_paths == 0
+
+
+def test_paths_over_crowns_join_those_that_sionna_finds(sionna, scenes, lone):
+    site, poses = lone
+    rng = np.random.default_rng(6)
+    near = rng.uniform(-100, 100, (2, 60))
+    like = np.ones(60)
+    stand = Trees(*near, 0 * like, 18 * like, 9 * like, 5 * like, 0.4 * like)
+    link, crowns = scenes.link(site), Crowns(stand)
+    exact = replay(site, link, poses, crowns=crowns)
+    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="", crowns=crowns)
+    assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
+    assert exact.paths.off_crown.sum() == traced.paths.off_crown.sum() > 3
+
+
+def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatch):
+    site, poses = lone
+    link = scenes.link(site)
+    monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))  # the sionna engine caches unless told not to
+    first = replay(site, link, poses, "sionna", samples=1000, batch=BATCH)
+
+    def fail(*args, **settings):
+        raise AssertionError("traced again")
+
+    monkeypatch.setattr(sionna, "find_paths", fail)
+    second = replay(site, link, poses, "sionna", samples=1000, batch=BATCH)
+    assert (second.h == first.h).all()
+    with pytest.raises(AssertionError, match="traced again"):
+        replay(site, link, poses, "sionna", samples=1001, batch=BATCH)
+
+
+def test_h_equals_sionnas_explicit_arrays_at_short_range(sionna, scenes, lone):
+    """Slants, attitude, Fresnel coefficients, polarisation through reflections: all of it, to float32's phases."""
+    site, poses = lone
+    near = scenes.poses(poses.position_m[:BATCH] * [0.6, 0.6, 1.0], poses.rotation[:BATCH])
+    link = scenes.link(
+        site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)), uav_transmits=False
+    )
+    ours = replay(site, link, near)
+    scene = Scene.of(site, link, near)
+    theirs = sionna.own_channels(
+        scene.faces, scene.sources_m, near, link, explicit=True, samples=SAMPLES, batch=BATCH, usable=scene.usable
+    )
+    size = np.abs(ours.h).max(axis=(2, 3))
+    error = np.abs(theirs - ours.h).max(axis=(2, 3))[size > 0] / size[size > 0]
+    # an element near the edge of a face may see it where the array's centre does not
+    assert np.median(error) < 1e-3
+    assert (error < 5e-3).mean() > 0.9
+    assert np.unique(ours.paths.depth).tolist() == [0, 1, 2]
+
+
+def test_rss_equals_sionnas_own_to_a_hundredth_of_a_decibel(sionna, scenes, lone):
+    """Isotropic elements, whole attenuation and reflection chain of Sionna on the paths that both have."""
+    site, poses = lone
+    near = scenes.poses(poses.position_m * [0.5, 0.5, 1.0])
+    link = scenes.link(site)
+    ours = replay(site, link, near)
+    scene = Scene.of(site, link, near)
+    h = sionna.own_channels(
+        scene.faces, scene.sources_m, near, link, explicit=False, samples=SAMPLES, batch=BATCH, usable=scene.usable
+    )
+    theirs = rss_dbm(mean_pair_power(h), link.transmit_power_dbm)
+    both = np.isfinite(ours.rss_dbm)
+    assert (np.isfinite(theirs) == both).all()
+    assert np.abs(theirs - ours.rss_dbm)[both].max() < 0.01
+    assert both.sum() > 30
+    assert (np.bincount(ours.paths.pose)[both[:, 0]] > 2).any()
+
+
+def test_plane_waves_make_every_line_of_sight_rank_1(sionna, scenes):
+    from aerpaw_cmp.compare.rank import channel_rank
+
+    site = scenes.site()
+    distance = np.geomspace(20, 1500, BATCH)
+    poses = scenes.poses(np.column_stack([distance, 0.1 * distance, np.full(BATCH, 30.0)]))
+    vertical = (0.0, 0.0, 0.0, 0.0)
+    link = scenes.link(
+        site,
+        tower_comparison_array(0.0, vertical),
+        uav_comparison_array(wavelength_m(scenes.carrier_hz), 0.0, 0.0, vertical),
+        uav_transmits=False,
+    )
+    scene = Scene.of(site, link, poses)
+    exact = channel_rank(replay(site, link, poses, max_depth=0).h[:, 0], 1000)
+    ranks = {}
+    for explicit in (False, True):
+        h = sionna.own_channels(
+            scene.faces, scene.sources_m, poses, link, explicit=explicit, max_depth=0, samples=1000, batch=BATCH
+        )
+        ranks[explicit] = channel_rank(h[:, 0], 1000)
+    assert (ranks[False] == 1).all()
+    assert (exact[:10] == 2).all()
+    assert (ranks[True][distance < 200] == exact[distance < 200]).all()
+    assert (ranks[True] != exact).any()  # float32 phases at long range
+
+
+def test_positions_without_a_path(sionna, scenes):
+    site = scenes.site([Building("barn", box(30, -10, 50, 10), 8.0)])
+    poses = scenes.poses(
+        [[40.0, 0, 4], [40.0, 0, -1], [np.nan, 0, 5], [0.0, 0, 10], [52.0, 0, 1.0], [0.0, 0, 30.0], [20.0, 0.0, 0.0]]
+    )
+    link = scenes.link(site)
+    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="")
+    exact = replay(site, link, poses)
+    assert traced.has_path[:, 0].tolist() == exact.has_path[:, 0].tolist()
+    assert traced.has_path[:, 0].tolist() == [False, False, False, False, False, True, True]
+
+
+def test_batch_beyond_the_hash_table_is_refused(sionna, scenes):
+    site = scenes.site()
+    with pytest.raises(UsageError, match="batch 500"):
+        replay(site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), "sionna", batch=500, cache_dir="")
+
+
+def test_versions_name_the_device(sionna):
+    versions = sionna.engine_versions()
+    assert {"sionna-rt", "mitsuba", "drjit", "variant"} <= set(versions)
+    assert versions["variant"].startswith(("llvm", "cuda"))
+
+
+def test_cuda_and_llvm_agree(sionna, scenes, lone):
+    import drjit as dr
+    import mitsuba as mi
+
+    if not dr.has_backend(dr.JitBackend.CUDA):
+        pytest.skip("no CUDA device on this machine")
+    import subprocess
+    import sys
+
+    code = (
+        "import sys; from aerpaw_cmp.propagation import sionna; from pathlib import Path; import numpy as np, pickle;"
+        "case = pickle.load(open(sys.argv[1], 'rb')); sionna.load_variant(sys.argv[2]);"
+        "p = sionna.find_paths(*case, carrier_hz=3.4e9, samples=100000, batch=25, variant=sys.argv[2]);"
+        "np.savetxt(sys.argv[3], np.column_stack([p.pose, p.tower, p.faces]), fmt='%d')"
+    )
+    import pickle
+    import tempfile
+    from pathlib import Path
+
+    site, poses = lone
+    scene = Scene.of(site, scenes.link(site), poses)
+    with tempfile.TemporaryDirectory() as folder:
+        entry = Path(folder) / "case"
+        entry.write_bytes(pickle.dumps((scene.faces, scene.sources_m, poses.position_m)))
+        found = []
+        for variant in ("cuda", "llvm"):
+            out = Path(folder) / variant
+            subprocess.run([sys.executable, "-c", code, entry, variant, out], check=True)
+            found.append(out.read_text())
+    assert found[0] == found[1]
+    assert mi.variant()
+
+
+def test_scenes_are_freed(sionna, scenes, lone):
+    """Dr.Jit compiles the materials of living scenes into every kernel, and can abort the process over it."""
+    import gc
+
+    from sionna.rt import Scene
+
+    site, poses = lone
+    for height in (8.0, 9.0):
+        barn = Building("barn", box(30, -10, 50, 10), height)
+        replay(
+            replace(site, buildings=(barn,)),
+            scenes.link(site),
+            poses,
+            "sionna",
+            samples=1000,
+            batch=BATCH,
+            cache_dir="",
+        )
+    gc.collect()
+    assert not [item for item in gc.get_objects() if isinstance(item, Scene)]

@@ -1,0 +1,147 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+import aerpaw_cmp.propagation
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.propagation.arrays import Link, single_element
+from aerpaw_cmp.propagation.audit import audit
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.site import Building
+
+
+@pytest.fixture
+def case(scenes):
+    rng = np.random.default_rng(3)
+    site = scenes.site(scenes.buildings(rng, 6, spread_m=80.0), ((0.0, 0.0, 10.0), (4.0, -3.0, 12.0, -2.0)))
+    poses = scenes.poses(rng.uniform([-90, -90, 15], [90, 90, 40], (40, 3)))
+    return site, scenes.link(site), poses
+
+
+def test_the_function_is_where_the_contract_says(case):
+    from aerpaw_cmp.propagation.tracer import Replay  # the module of the same name stays importable
+
+    result = aerpaw_cmp.propagation.tracer(*case, engine="image")
+    assert isinstance(result, Replay)
+    assert result.h.dtype == np.complex128
+    assert result.h.shape == (40, 2, 1, 1)
+    assert result.rss_dbm.shape == (40, 2)
+    assert result.towers == ("LW1", "LW2")
+
+
+def test_importing_the_room_does_not_load_sionna():
+    code = "import sys, aerpaw_cmp.propagation; sys.exit(bool({'sionna', 'mitsuba', 'drjit', 'matplotlib', 'pandas'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+def test_unknown_tower_and_engine(case, scenes):
+    site, link, poses = case
+    with pytest.raises(UsageError, match="no tower 'LW9'"):
+        replay(site, Link(3.4e9, {"LW9": single_element()}, single_element()), poses)
+    with pytest.raises(UsageError, match="unknown engine 'magic'"):
+        replay(site, link, poses, engine="magic")
+
+
+def test_each_tower_reflects_on_its_own_ground(case):
+    result = replay(*case)
+    for tower, label in ((0, "ground at 0 m"), (1, "ground at -2 m")):
+        faces = result.paths.faces[result.paths.tower == tower].ravel()
+        assert {result.faces.label[f] for f in faces[faces >= 0] if result.faces.solid[f] < 0} == {label}
+
+
+def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
+    first = replay(*case, cache_dir=tmp_path)
+    assert len(list(tmp_path.glob("*.npz"))) == 1
+
+    def fail(*args, **settings):
+        raise AssertionError("searched again")
+
+    monkeypatch.setattr("aerpaw_cmp.propagation.image.find_paths", fail)
+    second = replay(*case, cache_dir=tmp_path)
+    assert second.from_cache
+    assert not first.from_cache
+    assert second.search_seconds == first.search_seconds > 0
+    assert (second.h == first.h).all()
+    assert (second.paths.faces == first.paths.faces).all()
+    # other arrays and attitudes use the same paths
+    site, link, poses = case
+    replay(site, Link(3.5e9, link.tower_arrays, link.uav_array, 10.0), poses, cache_dir=tmp_path)
+    with pytest.raises(AssertionError, match="searched again"):
+        replay(*case, cache_dir=tmp_path, max_depth=1)
+
+
+def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
+    site, link, poses = case
+    replay(site, link, poses, cache_dir=tmp_path)
+    moved = scenes.poses(poses.position_m + np.array([0.0, 0.0, 1e-9]))
+    replay(site, link, moved, cache_dir=tmp_path)
+    from dataclasses import replace
+
+    taller = replace(site, buildings=(replace(site.buildings[0], height_m=99.0), *site.buildings[1:]))
+    replay(taller, link, poses, cache_dir=tmp_path)
+    replay(site, link, poses, cache_dir=tmp_path, drop_small_faces=True)
+    assert len(list(tmp_path.glob("*.npz"))) >= 3
+
+
+def test_damaged_entry_is_searched_again(case, tmp_path):
+    first = replay(*case, cache_dir=tmp_path)
+    entry = next(tmp_path.glob("*.npz"))
+    entry.write_bytes(entry.read_bytes()[:100])
+    again = replay(*case, cache_dir=tmp_path)
+    assert (again.h == first.h).all()
+    assert entry.stat().st_size > 100
+    assert not list(tmp_path.glob("*.part"))
+
+
+def test_unwritable_cache_is_no_error(case, tmp_path):
+    blocked = tmp_path / "file"
+    blocked.write_text("not a folder")
+    assert len(replay(*case, cache_dir=blocked).paths)
+
+
+def test_small_faces_are_left_out_by_name_but_still_hide(scenes):
+    shed = Building("shed", box(100, -1, 101, 1), 40.0)
+    kiosk = Building("kiosk", box(60, 20, 60.6, 20.6), 1.0)
+    site = scenes.site([shed, kiosk])
+    poses = scenes.poses([[200.0, 0.0, 20.0], [150.0, 60.0, 50.0]])
+    whole = replay(site, scenes.link(site), poses)
+    reduced = replay(site, scenes.link(site), poses, drop_small_faces=True)
+    assert any(line.startswith("kiosk roof") for line in reduced.left_out)
+    assert not any(line.startswith("ground") for line in reduced.left_out)
+    assert not whole.left_out
+    direct = (reduced.paths.pose == 0) & (reduced.paths.depth == 0)
+    assert not direct.any()  # the shed hides although it does not reflect
+
+
+def test_progress_reaches_one(case):
+    seen = []
+    replay(*case, progress=seen.append)
+    assert seen == sorted(seen)
+    assert seen[-1] == 1.0
+
+
+def test_audit_by_the_same_engine_sees_no_difference(case):
+    site, link, poses = case
+    result = replay(site, link, poses)
+    report = audit(site, link, poses, result, reference="image", links=20)
+    assert report.links == 20
+    assert (report.missing_paths, report.extra_paths) == (0, 0)
+    assert report.rss_max_error_db == 0.0
+    assert set(report.rank_disagreement) == {10.0, 100.0, 1000.0}
+    assert report.as_dict()["rank_disagreement"] == {"10": 0.0, "100": 0.0, "1000": 0.0}
+
+
+def test_audit_sees_what_a_shallow_replay_lacks(case):
+    site, link, poses = case
+    shallow = replay(site, link, poses, max_depth=0)
+    deep = replay(site, link, poses, max_depth=2)
+    report = audit(site, link, poses, shallow, reference="image", links=None)
+    assert report.links == 80
+    assert report.missing_paths == (deep.paths.depth > 0).sum()
+    assert report.extra_paths == 0
+    assert report.rss_max_error_db > 0.5
+    turned = audit(site, link, poses, deep, reference="image", links=None, max_depth=0)
+    assert turned.extra_paths == report.missing_paths

@@ -29,7 +29,7 @@ REFERENCE = Path(__file__).parents[1] / "tests" / "propagation" / "reference.py"
 
 
 def brute_force(poses: int) -> dict[str, int]:
-    """Paths of the image engine against one-by-one enumeration (tests/propagation/conftest.py), on the same 12 buildings."""
+    """Paths of the image engine against one-by-one enumeration (tests/propagation/conftest.py), 12 buildings."""
     spec = importlib.util.spec_from_file_location("replay_conftest", REFERENCE.with_name("conftest.py"))
     helpers = importlib.util.module_from_spec(spec)
     sys.modules[spec.name] = helpers

@@ -171,7 +171,7 @@ def grid_offset(
         return OffsetFit(float("nan"), float("nan"), 0, False)
     mean, variance = _mean_and_variance(difference)
     best = nearest_offset(grid, mean, step_db)
-    rmse = float(np.sqrt(variance + (mean - grid[best]) ** 2))
+    rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))
     return OffsetFit(float(grid[best]), rmse, len(difference), best in (0, len(grid) - 1))
 
 
@@ -194,7 +194,7 @@ def offset_curve(
     if not len(difference):
         return grid, np.full(len(grid), np.nan)
     mean, variance = _mean_and_variance(difference)
-    return grid, np.sqrt(variance + (mean - grid) ** 2)
+    return grid, np.hypot(np.sqrt(variance), mean - grid)
 
 
 def identifiable_range(offsets_db: FloatArray, rmse_db: FloatArray, *, excess_db: float = 0.1) -> tuple[float, float]:

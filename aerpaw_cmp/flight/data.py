@@ -165,7 +165,7 @@ def gather(
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss":
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
-            else:
+            elif stream.kind == "rank":
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:
@@ -353,7 +353,7 @@ def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: S
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        up = np.fmax(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)
+        up = np.maximum(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)  # NaN stays NaN
         position = np.stack([east, north, up], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(

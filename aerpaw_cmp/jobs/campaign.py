@@ -93,8 +93,8 @@ def load_campaign(path: Path) -> CampaignFile:
     Raises
     ------
     UsageError
-        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`; also an override that names no flight key, and values to try that
-        do not increase.
+        As :func:`aerpaw_cmp.common.yamlfile.load_yaml`; also an override that names no flight key, and values to
+        try that do not increase.
     """
     campaign = load_yaml(path, CampaignFile)
     fit = campaign.held_out

@@ -1,10 +1,4 @@
 """From a site, a link and poses to paths and channel matrices.
 
-``aerpaw_cmp.propagation.tracer(site, link, poses, engine=...)`` is the whole of it; Sionna is loaded only by its engine.
+``tracer.replay(site, link, poses, engine=...)`` is the whole of it; only ``sionna.py`` loads Sionna.
 """
-
-from .audit import Audit, audit
-from .tracer import Replay, replay
-
-# the functions hide the modules of the same name on purpose: the modules stay importable by their dotted names
-__all__ = ["Audit", "Replay", "audit", "replay"]

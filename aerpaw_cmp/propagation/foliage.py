@@ -203,8 +203,8 @@ def foliage_loss_db(
     model : FoliageModel
         Depth to loss.
     bounced : (paths, depth) int, optional
-        Tree whose crown reflects at each vertex, -1 for none (:attr:`aerpaw_cmp.propagation.paths.PathSet.tree`); at most
-        one per path. Only for :class:`Opaque` do crowns reflect: to any other model such a path does not exist.
+        Tree whose crown reflects at each vertex, -1 for none (:attr:`~aerpaw_cmp.propagation.paths.PathSet.tree`); at
+        most one per path. Only for :class:`Opaque` do crowns reflect: to any other model such a path does not exist.
 
     Returns
     -------

@@ -14,6 +14,7 @@ from aerpaw_cmp.compare.statistics import (
     error_intervals,
     interval,
     memory,
+    paired_difference,
     plain,
     repeatability,
     same_places,
@@ -144,6 +145,60 @@ def test_correlation_from_moments_of_the_residual_is_the_correlation():
     assert found[0] == pytest.approx(np.corrcoef(m, s)[0, 1])
     low, high = error_intervals(m, s).correlation
     assert 0.5 < low < found[0] < high < 0.95
+
+
+def test_a_paired_difference_sees_what_two_intervals_of_their_own_hide():
+    """Errors that share most of their shadowing: 4.0 and 4.2 dB, intervals that overlap widely, yet one is worse."""
+    rng = np.random.default_rng(12)
+    common = shadowing(rng, 4000, 15, 4.0)
+    one, two = common + rng.normal(0, 1.5, 4000), common
+    zeros = np.zeros(4000)
+    first, second = (error_intervals(zeros, -error).rmse_db for error in (one, two))
+    assert first[0] < second[1]  # their own intervals overlap
+    found = paired_difference(one, two)
+    assert found.verdict == "worse"
+    truth = np.sqrt(16 + 1.5**2) - 4
+    assert found.difference_ci95_db[0] < truth < found.difference_ci95_db[1]
+    assert found.in_words("free space").startswith("worse than free space by 0.3 dB [0.")
+    back = paired_difference(two, one)
+    assert back.verdict == "better"
+    assert back.difference_ci95_db == pytest.approx((-found.difference_ci95_db[1], -found.difference_ci95_db[0]))
+    assert back.in_words("b").startswith("better than b by 0.3 dB")
+
+
+def test_models_of_equal_error_are_called_different_at_most_as_often_as_stated():
+    rng = np.random.default_rng(13)
+    wrong, truth_held = 0, 0
+    for _ in range(150):
+        common = shadowing(rng, 1500, 8, 3.0)
+        one, two = (common + shadowing(rng, 1500, 8, 2.0) + level for level in (5.0, -3.0))
+        found = paired_difference(one, two, replicates=200)
+        wrong += found.verdict in ("better", "worse")
+        low, high = found.difference_ci95_db
+        truth_held += low <= 0 <= high
+    assert wrong <= 15  # 5 % of 150 is 7.5
+    assert truth_held + wrong == 150
+
+
+def test_errors_kept_out_of_a_fit_count_with_their_offset():
+    one, two = np.full(200, 3.0) + np.tile([1.0, -1.0], 100), np.tile([2.0, -2.0], 100)
+    assert paired_difference(one, two).difference_db == pytest.approx(-1.0)
+    kept_out = paired_difference(one, two, free_offset=False)
+    assert kept_out.rmse_db == pytest.approx(np.sqrt(10.0))
+    assert kept_out.verdict == "worse"
+    assert kept_out.mean_square_difference_db2 == pytest.approx(6.0)
+
+
+def test_pairs_that_cannot_be_compared():
+    none = paired_difference([np.nan, 1.0], [1.0, np.nan])
+    assert (none.n, none.verdict) == (0, "none given")
+    assert none.as_dict()["difference_ci95_db"] == [None, None]
+    assert none.in_words("two-ray") == "no sample in common with two-ray"
+    with pytest.raises(ValueError, match="one length"):
+        paired_difference([1.0], [1.0, 2.0])
+    same = paired_difference(np.arange(100.0), np.arange(100.0))
+    assert same.verdict == "no difference shown"
+    assert same.difference_db == 0.0
 
 
 def test_repeatability_floor_of_two_passes():

@@ -519,7 +519,7 @@ def test_exchanged_or_mirrored_angles_are_told_before_anything_else(tmp_path: Pa
     with pytest.raises(InputError, match="the longitude lacks its sign"):
         gathered(path)
     (tmp_path / "track.csv").write_text(table.replace(",35.", ",36."))
-    with pytest.raises(InputError, match=r"no nearer than 11\d km to any tower.*another site"):
+    with pytest.raises(InputError, match=r"no nearer than 1\d\d km to any tower.*another site"):
         gathered(path)
 
 

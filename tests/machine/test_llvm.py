@@ -269,7 +269,7 @@ def test_setup_script_prints_the_one_line_when_nothing_can_be_installed(tmp_path
 
     script = Path(__file__).resolve().parents[2] / "tools/setup_llvm.py"
     program = (
-        "import runpy, sys; from aerpaw_cmp import llvm; llvm.root_prefix = lambda: None;"
+        "import runpy, sys; from aerpaw_cmp.machine import llvm; llvm.root_prefix = lambda: None;"
         f"runpy.run_path({str(script)!r}, run_name='__main__')"
     )
     environ = {**os.environ, llvm.FOLDERS_VARIABLE: str(tmp_path)}

@@ -159,7 +159,7 @@ def gather(
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss":
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
-            else:
+            elif stream.kind == "rank":
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:

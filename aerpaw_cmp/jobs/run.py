@@ -137,7 +137,7 @@ def run_report(
             speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
     with stages("report"):
         from ..report.export import metrics as metrics_of
-        from ..report.export import write_report
+        from ..report.write import write_report
 
         notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
         record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
@@ -411,7 +411,7 @@ def run_map(
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
     from .compare_flight import versions
-    from .paper_table import paper_markdown
+    from .paper_table import paper_markdown, paper_rows
 
     given = {name: value for name, value in options.items() if value is not None}
     settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
@@ -427,7 +427,9 @@ def run_map(
     with outcome.stage("export", progress):
         files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
     progress("page")
-    record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
+    record = mapping.maps_record(
+        outcome, name=name, generated=generated, versions=versions(), paper=paper_rows(outcome)
+    )
     written = write_maps(record, folder)
     written.append(folder / "paper.md")
     written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")

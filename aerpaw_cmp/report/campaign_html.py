@@ -12,11 +12,13 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from . import campaign_figures, figures
+from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
-from .export import json_safe, k_key, remove_stale, write_atomic
-from .figures import Picture
+from .canvas import Picture
+from .export import json_safe, write_atomic
 from .html import CONTENT_POLICY, by_section, environment
+from .names import k_key
+from .write import remove_stale
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
@@ -253,7 +255,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=rss_flights(data),
-        pretty=figures.pretty,
+        pretty=canvas.pretty,
         files=files,
         content_policy=CONTENT_POLICY,
     )
@@ -266,7 +268,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
     written = [write_atomic(folder / "campaign.json", numbers), write_atomic(folder / "campaign.csv", table)]
-    drawn, pictures = figures.write_plates(campaign_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
     remove_stale(folder / "figures", {path.name for path in written}, OWN_FIGURES)
     page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))

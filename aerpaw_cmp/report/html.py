@@ -16,9 +16,9 @@ import numpy as np
 
 from ..logs.records import has_wall_clock
 from . import words
+from .canvas import Picture, start_of
 from .data import RANKS, ReportData
-from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
-from .figures import Picture, start_of
+from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 REJECTED_SHOWN = 20
 """Rejected lines shown per file; the flight file holds all."""

@@ -8,20 +8,19 @@ from __future__ import annotations
 
 import re
 
-import numpy as np
-
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.records import ReadResult
 
-from . import _frames, _lines, _time
+from . import _rows, _time
 
-_N = rb" +(-?\d{1,6}(?:\.\d{1,6})?|n/a)"
+_N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
-    rb"^\[(" + _time.TIME + rb")\] *(?:lte|nr) +[0-9a-fA-F]{1,5}" + _N * 3 + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2}"
-    rb" +\d{1,3}% \|[^\n]{0,160}$",
+    rb"^\[(?P<time>" + _time.TIME + rb")\] *(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +[0-9a-fA-F]{1,5}"
+    + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
+    + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% \|[^\n]{0,160}$",
     re.MULTILINE,
-)
-_TITLE = re.compile(rb"^\[[^\]\n]{19,40}\] *rat rnti +cqi +ri +mcs", re.MULTILINE)
+)  # fmt: skip
+_TITLE = re.compile(rb"^\[[^\]\n]{19,40}\] *rat +(?:pci +)?rnti +cqi +ri +mcs", re.MULTILINE)
 _TORN = re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} ")
 
 
@@ -30,44 +29,13 @@ def sniff(head: bytes) -> bool:
     return head.startswith(b"[") and _TITLE.search(head) is not None
 
 
-def _reason(line: bytes) -> str | None:
-    return "an incomplete line of the trace (torn line?)" if _TORN.match(line) else None
-
-
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``srsenb``.
-
-    Raises
-    ------
-    UsageError
-        If no time zone is given.
-    """
-    lines = _lines.split(data)
-    rows, groups = _lines.match(lines, _ROW)
-    column = _lines.columns(groups, 4)
-    instants, valid = _time.texts_to_utc(column[0], options, needed_by="srsenb_log")
-    blank, rejected = _lines.remainder(lines, rows, _reason)
-    rejected += lines.reject_all(rows[~valid], "the time stamp is no date of the calendar")
-    cqi, ri, mcs = (_lines.numbers(np.where(cells == b"n/a", b"", cells)) for cells in column[1:])
-    flag = _lines.flags(len(rows))
-    instants.flag(flag)
-    good = (ri >= 0) & (ri <= 7) & (ri == np.round(ri))
-    _lines.add_flag(flag, np.isnan(ri), "no_csi")
-    _lines.add_flag(flag, ~good & ~np.isnan(ri), "ri_out_of_range")
-    if lines.unterminated:
-        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
-    values = {"rank": np.where(good, ri + 1, np.nan), "ri_raw": ri, "cqi": cqi, "mcs": mcs}
-    frame = _frames.frame("rank", instants.time, rows + 1, flag, values)[valid].reset_index(drop=True)
-    attributes = _frames.attributes(options, ri_base="zero", source="CSI report")
-    return ReadResult(
-        "srsenb_log",
-        (Stream("rank", options.channel or "srsenb", frame, attributes),) if len(frame) else (),
-        len(lines),
-        len(frame),
-        blank,
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        instants.warnings,
-    )
+    """Rank stream ``srsenb``; UsageError if no time zone is given."""
+    torn = _rows.torn(_TORN, "an incomplete line of the trace (torn line?)")
+    rows = _rows.matched(data, _ROW, options, reader="srsenb_log", reason=torn)
+    values = rows.rank(rows.number("ri"), base=0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs")}
+    stream = rows.stream("rank", options.channel or "srsenb", values, ri_base="zero", source="CSI report")
+    return rows.result([stream])
 
 
 READER = Reader(

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -29,7 +29,7 @@ Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 """``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Replay:
     """What a replay found.
 
@@ -69,6 +69,47 @@ class Replay:
     towers: tuple[str, ...]
     left_out: list[str] = field(default_factory=list)
     from_cache: bool = False
+
+    def __repr__(self) -> str:
+        """One line: the arrays are too large to be shown."""
+        return (
+            f"Replay({len(self.has_path)} poses, towers {', '.join(self.towers)}, engine {self.engine!r}, "
+            f"{len(self.paths)} paths, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
+        )
+
+    def to_xarray(self) -> Any:
+        """The replay as an ``xarray.Dataset`` with dimensions pose, tower, n_rx, n_tx.
+
+        Returns
+        -------
+        xarray.Dataset
+            ``rss_dbm``, ``rss_power_dbm``, ``has_path``, ``h_real`` and ``h_imag`` with units as attributes.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise UsageError(
+                "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
+            ) from None
+        level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
+        power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
+        ports = ("pose", "tower", "n_rx", "n_tx")
+        return xarray.Dataset(
+            {
+                "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
+                "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
+                "has_path": (("pose", "tower"), self.has_path),
+                "h_real": (ports, self.h.real, {"units": "1"}),
+                "h_imag": (ports, self.h.imag, {"units": "1"}),
+            },
+            coords={"tower": list(self.towers)},
+            attrs={"engine": self.engine, "seconds": self.seconds},
+        )
 
 
 def replay(

@@ -109,7 +109,7 @@ class RssFurther:
     """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
 
     A field without a default is always written; one whose default is None only where the flight has it.
-    ``same_footing`` is by simulation and window; ``trimmed``, ``identifiable_db``, ``block_length`` and the counts are
+    ``n_flagged`` is by reason; ``same_footing`` by simulation and window; ``trimmed``, ``identifiable_db``, ``block_length`` and the counts are
     those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
@@ -120,6 +120,7 @@ class RssFurther:
     trimmed: Fit
     n_too_low: int
     n_no_pose: int
+    n_flagged: Mapping[str, int]
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
     same_footing: Mapping[str, Mapping[str, Fit]]
@@ -209,9 +210,10 @@ class PairResult:
 class RankFurther:
     """Numbers of a tower's rank beside those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
-    ``foliage`` by run and K.
+    ``n_flagged`` is by reason, ``foliage`` by run and K.
     """
 
+    n_flagged: Mapping[str, int]
     kappa_ci95: Mapping[str, Interval]
     foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 

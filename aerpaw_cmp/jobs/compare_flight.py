@@ -131,6 +131,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
             n_too_low=int((replayed.valid & ~levels.posed).sum()),
             n_no_pose=int((~replayed.valid).sum()),
+            n_flagged=dict(series.flagged),
             clock=None if clock is None else clock.found,
             baseline_rmse_ci95_db=score.baseline_intervals,
             same_footing=_same_footing(series, replayed, levels, position, settings),
@@ -406,6 +407,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         foliage_rank=paired,
         score=score,
         further=RankFurther(
+            n_flagged=dict(series.flagged),
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             foliage=foliage_rank_difference(paired) or None,
         ),

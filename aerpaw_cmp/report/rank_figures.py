@@ -241,7 +241,7 @@ def agreement_curve(panel: RankPanel) -> Figure:
             curve.k, curve.total_variation, color="#D55E00", linestyle=(0, (5, 2)), linewidth=1.3,
             label="total variation of the histograms (lower is better)",
         )  # fmt: skip
-    if panel.best_k_ci95 is not None:
+    if panel.best_k_ci95 is not None and np.isfinite(panel.best_k_ci95).all():
         ax.axvspan(*panel.best_k_ci95, color="#DDDDDD", hatch="///", alpha=0.6, label="95 % interval of the best K")
     if np.isfinite(panel.best_k):
         ax.axvline(panel.best_k, color=TOWER, linewidth=1.2, label=f"best K = {panel.best_k:.3g}")

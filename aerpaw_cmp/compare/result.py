@@ -109,8 +109,8 @@ class RssFurther:
     """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
 
     A field without a default is always written; one whose default is None only where the flight has it.
-    ``n_flagged`` is by reason; ``same_footing`` by simulation and window; ``trimmed``, ``identifiable_db``, ``block_length`` and the counts are
-    those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
+    ``n_flagged`` is by reason; ``same_footing`` by simulation and window; ``trimmed``, ``identifiable_db``,
+    ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
     n_measured_out: int

@@ -12,11 +12,15 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from . import campaign_figures, figures
+from ..common.jsonable import json_safe
+from ..compare.result import Repeated
+from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
-from .export import json_safe, k_key, remove_stale, write_atomic
-from .figures import Picture
+from .canvas import Picture
+from .export import write_atomic
 from .html import CONTENT_POLICY, by_section, environment
+from .names import k_key
+from .write import remove_stale
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
@@ -155,13 +159,13 @@ def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
     ]
 
 
-def halves(data: CampaignData) -> list[tuple[RssRow, Any, Any]]:
+def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
     """Rows whose first and second half pass the same places: with like headings, and with any."""
     found = []
     for row in data.reference_rows:
-        same, every = (row.within.get(name) or {} for name in ("same_heading", "any_heading"))
-        if every.get("n"):
-            found.append((row, same, every))
+        every = row.within.get("any_heading")
+        if every is not None and every.n:
+            found.append((row, row.within.get("same_heading"), every))
     return found
 
 
@@ -253,7 +257,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=rss_flights(data),
-        pretty=figures.pretty,
+        pretty=canvas.pretty,
         files=files,
         content_policy=CONTENT_POLICY,
     )
@@ -266,7 +270,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
     written = [write_atomic(folder / "campaign.json", numbers), write_atomic(folder / "campaign.csv", table)]
-    drawn, pictures = figures.write_plates(campaign_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
     remove_stale(folder / "figures", {path.name for path in written}, OWN_FIGURES)
     page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))

@@ -1,89 +1,21 @@
-"""metrics.json, rss.csv, rank.csv and the whole folder, each file written beside its place and moved there."""
+"""metrics.json, rss.csv and rank.csv: finished numbers to JSON and tables."""
 
 from __future__ import annotations
 
-import json
-import math
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from ..common.errors import UsageError
 from ..common.files import write_whole
+from ..common.jsonable import json_safe
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
-
-if TYPE_CHECKING:
-    import pandas as pd
-
-RSS_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first sample of this tower and channel",
-    "tower": "name of the tower",
-    "channel": "name of the channel",
-    "unit": "unit of measured_db",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_db": "as logged; empty: no signal",
-    "calibrated_db": "measured_db plus the offset of this tower and channel",
-    "simulated_dbm": "ray tracing; empty: no path",
-    "residual_db": "calibrated_db minus simulated_dbm",
-    "measured_out_of_coverage": "1: the log has no signal here",
-    "simulated_out_of_coverage": "1: the ray tracing has no path here",
-}
-"""Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline."""
-
-RANK_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the report, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first report of this tower",
-    "tower": "name of the tower",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_rank": "reported rank 1 to 4; empty: no CSI",
-}
-"""Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path)."""
+from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 _DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
-
-
-def k_key(k: float) -> str:
-    """K as a key of metrics.json and of rank.csv.
-
-    Examples
-    --------
-    >>> k_key(1000.0), k_key(12.5)
-    ('1000', '12.5')
-    """
-    return f"{k:.10g}"
-
-
-def json_safe(value: Any) -> Any:
-    """A copy that JSON can hold: NaN and infinity become None, arrays become lists, keys become strings.
-
-    Examples
-    --------
-    >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
-    {'rmse_db': None, '10': [1, 2]}
-    """
-    if isinstance(value, Mapping):
-        return {k_key(key) if isinstance(key, float) else str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_safe(value.tolist() if value.dtype.kind != "M" else value.astype(str).tolist())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        number = float(value)
-        return number if math.isfinite(number) else None
-    return value if value is None else str(value)
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
@@ -231,7 +163,7 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
+def rss_frame(panels: Iterable[RssPanel]) -> Any:
     """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
     import pandas as pd
 
@@ -264,7 +196,7 @@ def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
     return _stacked(frames, RSS_COLUMNS)
 
 
-def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
+def rank_frame(panels: Iterable[RankPanel]) -> Any:
     """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
     import pandas as pd
 
@@ -293,21 +225,12 @@ def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
     return _stacked(frames, RANK_COLUMNS)
 
 
-def _stacked(frames: list[pd.DataFrame], columns: Iterable[str]) -> pd.DataFrame:
+def _stacked(frames: list[Any], columns: Iterable[str]) -> Any:
     """Frames below each other, rounded; without any, the bare columns."""
     import pandas as pd
 
-    table: pd.DataFrame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
-    rounded: pd.DataFrame = table.round(_DECIMALS)
-    return rounded
-
-
-def iso_time(time: Any) -> Any:
-    """Instants as ISO 8601 text with milliseconds and ``Z``; empty where not a time."""
-    instants = np.asarray(time, dtype="datetime64[ns]")
-    # half a unit added: numpy truncates, and a stored 0.9999999 s must not lose a millisecond
-    text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
-    return np.where(np.isnat(instants), "", text)
+    table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+    return table.round(_DECIMALS)
 
 
 def _times(time: Any) -> dict[str, Any]:
@@ -319,17 +242,6 @@ def _times(time: Any) -> dict[str, Any]:
     first = known.min()
     seconds = (instants - first) / np.timedelta64(1, "s")
     return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
-
-
-def safe_name(text: str) -> str:
-    """A part of a file name from any text.
-
-    Examples
-    --------
-    >>> safe_name("LW1 USRP1"), safe_name("../a b"), safe_name("")
-    ('LW1_USRP1', 'a_b', '_')
-    """
-    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
 
 
 def make_folder(folder: Path) -> Path:
@@ -347,52 +259,3 @@ def write_atomic(path: Path, content: str | bytes) -> Path:
     make_folder(path.parent)
     write_whole(path, content)
     return path
-
-
-_OWN_FIGURES = re.compile(
-    r"(trajectory|altitude|speed_against_error"
-    r"|(rss|rss_check|rss_residual|rss_angles|pair|rank_(map|histogram|time|confusion|k))_[A-Za-z0-9._-]+)\.(svg|png)"
-)
-
-
-def remove_stale(folder: Path, kept: set[str], own: re.Pattern[str] = _OWN_FIGURES) -> None:
-    """Remove figures of an earlier report that this one no longer has; other files are left alone."""
-    for path in folder.glob("*"):
-        if path.name not in kept and own.fullmatch(path.name):
-            path.unlink()
-
-
-def write_report(data: ReportData, folder: str | Path) -> list[Path]:
-    """Write the whole report.
-
-    Parameters
-    ----------
-    data : ReportData
-    folder : path
-        Made when missing. Files of an earlier report with the same names are replaced.
-
-    Returns
-    -------
-    list of Path
-        ``report.html`` first, then ``metrics.json``, the CSVs (header only when they have no rows), the figures.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written.
-    """
-    from . import figures, html
-
-    folder = Path(folder)
-    make_folder(folder)
-    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    written = [write_atomic(folder / "metrics.json", numbers)]
-    for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
-        # written even without rows, so that the table of an earlier report never stands beside this one
-        written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))
-    drawn, pictures = figures.write_plates(figures.plates(data), folder / "figures")
-    written += pictures
-    remove_stale(folder / "figures", {path.name for path in written})
-    files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
-    page = write_atomic(folder / "report.html", html.page(data, drawn, files))
-    return [page, *written]

@@ -5,7 +5,7 @@ import json
 import subprocess
 import sys
 
-from aerpaw_cmp.report import export
+from aerpaw_cmp.report import names, write
 
 
 def test_whole_report(small_report, tmp_path):
@@ -14,7 +14,7 @@ def test_whole_report(small_report, tmp_path):
     (figures / "rss_LW9_gone.svg").write_text("of an earlier report")
     (figures / "notes.txt").write_text("mine")
     (figures / "rss.svg.bak").write_text("mine")
-    files = export.write_report(small_report, tmp_path)
+    files = write.write_report(small_report, tmp_path)
     assert files[0] == tmp_path / "report.html"
     assert all(f.stat().st_size > 0 for f in files)
     assert json.loads((tmp_path / "metrics.json").read_text())["rss"]["LW4"]["USRP1"]["n"] == small_report.rss[0].n
@@ -26,8 +26,8 @@ def test_whole_report(small_report, tmp_path):
 def test_no_rss_leaves_no_rss_of_an_earlier_report(small_report, tmp_path):
     (tmp_path / "rss.csv").write_text("old")
     bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), speed=(), track=None, waypoints=())
-    export.write_report(bare, tmp_path)
-    assert (tmp_path / "rss.csv").read_text() == ",".join(export.RSS_COLUMNS) + "\n"
+    write.write_report(bare, tmp_path)
+    assert (tmp_path / "rss.csv").read_text() == ",".join(names.RSS_COLUMNS) + "\n"
 
 
 def test_importing_the_room_draws_nothing():

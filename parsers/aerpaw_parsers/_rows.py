@@ -22,7 +22,7 @@ from . import _frames, _lines, _time
 NO_DATE = "the time stamp is no date of the calendar"
 NO_TIME = "the time is beyond any flight"
 _DECIMAL = re.compile(_lines.NUMBER)
-_SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9}
+_SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
 Reason = Callable[[bytes], "str | None"]
 
 

@@ -16,7 +16,7 @@ from aerpaw_cmp.logs.records import ReadResult
 
 from . import _cells, _rows, _time
 
-_N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMG]?|n/a|-?inf|nan)"
+_N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
     + _N % b"pci" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"

@@ -378,6 +378,19 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
 }
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]
 
+WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
+    "nemo_csv",
+    "nemo_kml",
+    "tap_jsonl",
+    "pawprints",
+    ("vehicle_out", "utc_offset"),
+    ("flight_mat", "lte"),
+    ("flight_mat", "processed"),
+    ("gpx", "track"),
+    ("pose_csv", "airdata"),
+)
+"""Readers and samples whose clock is UTC or relative."""
+
 NO_LOGS: dict[str, bytes] = {
     "antenna_pattern": b"2\r\nFrequency=3300(MHz)\r\n\r\nphi theta total\r\n0 0 -1.5\r\n",
     "power_references": b"Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz\nlw1,tx,ch0,0,0.0,-57.5\n",

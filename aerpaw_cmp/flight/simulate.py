@@ -162,10 +162,15 @@ def correlated_noise(
 def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
     """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
     try:
-        local = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(timezone, ambiguous="NaT", nonexistent="NaT")
-        if local is not pd.NaT:
+        local: pd.Timestamp = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(
+            timezone, ambiguous="NaT", nonexistent="NaT"
+        )
+        if not 1980 <= start.year <= 2200:
+            why = "a clock that nothing flew by"
+        elif local is not pd.NaT:
             return local
-        why = "the clocks changed then: it never was, or it was twice"
+        else:
+            why = "the clocks changed then: it never was, or it was twice"
     except (ValueError, OverflowError) as error:
         why = str(error)
     raise UsageError(f"flight.plan.start {start} in {timezone}", expected="a wall time", cause=why)

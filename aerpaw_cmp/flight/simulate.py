@@ -167,7 +167,7 @@ def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
         )
         if not 1980 <= start.year <= 2200:
             why = "a clock that nothing flew by"
-        elif local is not pd.NaT:
+        elif not pd.isna(local):
             return local
         else:
             why = "the clocks changed then: it never was, or it was twice"

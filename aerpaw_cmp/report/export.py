@@ -1,4 +1,4 @@
-"""metrics.json, rss.csv, rank.csv and the whole folder, each file written beside its place and moved there."""
+"""metrics.json, rss.csv, rank.csv and the whole folder of a report."""
 
 from __future__ import annotations
 
@@ -11,8 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.files import write_whole
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 
@@ -332,44 +330,24 @@ def safe_name(text: str) -> str:
     return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
 
 
-def make_folder(folder: Path) -> Path:
-    """The folder, made when missing; UsageError where it cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        cause = "a file is in the way, or there is no right to write here"
-        raise UsageError(f"the folder cannot be made ({error.strerror})", cause=cause, path=folder) from None
-    return folder
+def write_file(path: Path, content: str | bytes) -> Path:
+    """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
 
-
-def write_atomic(path: Path, content: str | bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
-    make_folder(path.parent)
-    write_whole(path, content)
+    The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
+    """
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     return path
 
 
-_OWN_FIGURES = re.compile(
-    r"(trajectory|altitude|speed_against_error"
-    r"|(rss|rss_check|rss_residual|rss_angles|pair|rank_(map|histogram|time|confusion|k))_[A-Za-z0-9._-]+)\.(svg|png)"
-)
-
-
-def remove_stale(folder: Path, kept: set[str], own: re.Pattern[str] = _OWN_FIGURES) -> None:
-    """Remove figures of an earlier report that this one no longer has; other files are left alone."""
-    for path in folder.glob("*"):
-        if path.name not in kept and own.fullmatch(path.name):
-            path.unlink()
-
-
 def write_report(data: ReportData, folder: str | Path) -> list[Path]:
-    """Write the whole report.
+    """Write the files of a report.
 
     Parameters
     ----------
     data : ReportData
     folder : path
-        Made when missing. Files of an earlier report with the same names are replaced.
+        Empty; that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`, say.
 
     Returns
     -------
@@ -384,15 +362,13 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     from . import figures, html
 
     folder = Path(folder)
-    make_folder(folder)
     numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    written = [write_atomic(folder / "metrics.json", numbers)]
+    written = [write_file(folder / "metrics.json", numbers)]
     for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
-        # written even without rows, so that the table of an earlier report never stands beside this one
-        written.append(write_atomic(folder / name, frame.to_csv(index=False, lineterminator="\n")))
+        # written even without rows: a reader finds the same files in every report
+        written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
     drawn, pictures = figures.write_plates(figures.plates(data), folder / "figures")
     written += pictures
-    remove_stale(folder / "figures", {path.name for path in written})
     files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
-    page = write_atomic(folder / "report.html", html.page(data, drawn, files))
+    page = write_file(folder / "report.html", html.page(data, drawn, files))
     return [page, *written]

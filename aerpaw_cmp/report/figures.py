@@ -20,7 +20,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import GEOMETRY, RANKS, ChannelPair, Histogram, RankAtK, RankPanel, ReportData, RssPanel, SpeedRow, Track
-from .export import k_key, safe_name, write_atomic
+from .export import k_key, safe_name, write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -149,8 +149,8 @@ def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], 
     for plate in plates:
         picture = render(plate)
         drawn.append(picture)
-        written.append(write_atomic(folder / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / f"{picture.name}.png", picture.png))
+        written.append(write_file(folder / f"{picture.name}.svg", picture.svg))
+        written.append(write_file(folder / f"{picture.name}.png", picture.png))
     return drawn, written
 
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from . import figures, maps_figures
 from .data import RANKS
-from .export import json_safe, k_key, merge, write_atomic
+from .export import json_safe, k_key, merge, write_file
 from .figures import Picture
 from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData
@@ -90,10 +90,8 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
 def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
     folder = Path(folder)
-    written = [
-        write_atomic(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")
-    ]
+    written = [write_file(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")]
     drawn, pictures = figures.write_plates(maps_figures.plates(data), folder / "figures")
     written += pictures
-    page = write_atomic(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
+    page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
     return [page, *written]

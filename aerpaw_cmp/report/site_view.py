@@ -20,7 +20,7 @@ from ..common.units import FloatArray
 from ..site.site import Building, Site, Trees
 from . import figures
 from .data import Track
-from .export import safe_name, write_atomic
+from .export import safe_name, write_file
 from .html import environment
 
 if TYPE_CHECKING:
@@ -307,9 +307,9 @@ def write_site_view(
         The page first.
     """
     folder, stem = Path(folder), safe_name(site.name)
-    written = [write_atomic(folder / f"{stem}.html", viewer(site, track, paths))]
+    written = [write_file(folder / f"{stem}.html", viewer(site, track, paths))]
     for name, draw in (("plan", plan), ("3d", solid)):
         with figures.style():
             svg, png = figures.save(draw(site, track, paths))
-        written += [write_atomic(folder / f"{stem}_{name}.svg", svg), write_atomic(folder / f"{stem}_{name}.png", png)]
+        written += [write_file(folder / f"{stem}_{name}.svg", svg), write_file(folder / f"{stem}_{name}.png", png)]
     return written

@@ -470,7 +470,8 @@ class OutputSet:
     -----
     A folder with other files in it cannot be exchanged. The new files are written beside their places and synced;
     then a journal is written, the old list and the old files are removed, and the new ones take their names, the list
-    last. A run killed on the way leaves old files or new ones, never both, and no list before the set is whole; the
+    last. Files of the old list that the new set has not (another flight's logs) stay in folder and list. A run killed
+    on the way leaves old files or new ones, never both, and no list before the set is whole; the
     next run finishes what the journal says.
     """
 
@@ -535,14 +536,15 @@ class OutputSet:
     def write(self, contents: Mapping[str, bytes], listing: Mapping[str, Any]) -> list[Path]:
         """Write the set; gives its paths, the list last. ``listing`` gets the key ``files``."""
         digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        text = json.dumps({**listing, "files": digests}, indent=1) + "\n"
+        others = {name: file_digest(self.folder / name) for name in self._known if self._own(name)}
+        text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
         everything = {**contents, self._listing: text.encode("utf-8")}
         with told(self.named):
             try:
                 for name, content in everything.items():
                     _write_synced(self._new(name), content)
                 self._refuse()  # what came there meanwhile
-                old = {name: digest for name, known in self._known.items() for digest in known if self._own(name)}
+                old = {name: file_digest(self.folder / name) for name in contents if self._own(name)}
                 digests[self._listing] = hashlib.sha256(everything[self._listing]).hexdigest()
                 _write_synced(self._journal, json.dumps({"old": old, "new": digests}).encode("ascii"))
             except BaseException:

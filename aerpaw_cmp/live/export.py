@@ -127,8 +127,8 @@ def export_csv(source: Path, out: Path, *, force: bool = False) -> ExportSummary
     """
     bad: list[BadLine] = []
     rows = 0
-    segments(source)  # raises before anything is written
-    with OutputFile(out, own=_is_export, inputs=[source], force=force) as output:
+    logs = segments(source)  # raises before anything is written
+    with OutputFile(out, own=_is_export, inputs=logs, force=force) as output:
         table = io.StringIO(newline="")
         writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore")
         writer.writeheader()

@@ -276,7 +276,8 @@ def write_set(folder: Path, files: dict[str, str], **keys: object) -> None:
 def test_a_set_replaces_what_its_list_names(tmp_path: Path) -> None:
     write_set(tmp_path / "logs", {"LW1/a.txt": "1", "b.txt": "1"})
     write_set(tmp_path / "logs", {"LW1/a.txt": "2"})
-    assert set(content(tmp_path / "logs")) == {"LW1/a.txt", "truth.json"}
+    assert set(content(tmp_path / "logs")) == {"LW1/a.txt", "b.txt", "truth.json"}  # b.txt: another flight's
+    write_set(tmp_path / "logs", {"b.txt": "2"})
     (tmp_path / "logs" / "c.txt").write_text("raw")
     for name in ("c.txt", "LW1/a.txt"):
         (tmp_path / "logs" / name).write_text("raw")
@@ -306,7 +307,7 @@ def dies_after(step: int, do: Callable[..., object]) -> Callable[..., object]:
 
 def test_a_set_killed_at_every_step_is_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder, step = tmp_path / "logs", 0
-    old, new = {"a": "old a", "b": "old b", "c": "old c"}, {"a": "new a", "b": "new b", "d": "new d"}
+    old, new = {"a": "old a", "b": "old b", "c": "old c"}, {"a": "new a", "b": "new b", "c": "new c", "d": "new d"}
     while True:
         shutil.rmtree(folder, ignore_errors=True)
         write_set(folder, old)

@@ -1,6 +1,62 @@
 """Ingest AERPAW field logs, replay the flight by ray tracing, compare the two.
 
-Importing this package loads nothing heavy: no Sionna, no matplotlib, no pandas.
+The names below are the public face (docs/api.md); everything else may change. Importing this package loads nothing
+heavy: each name is imported when it is first used.
 """
 
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
 __version__ = "0.1.0"
+
+_HOME = {
+    "Array": "propagation.arrays",
+    "BiExponential": "maps.biexponential",
+    "Link": "propagation.arrays",
+    "Logs": "logs.frames",
+    "OrdinaryKriging": "maps.kriging",
+    "Poses": "propagation.arrays",
+    "Replay": "propagation.tracer",
+    "Site": "site.site",
+    "Variogram": "maps.variogram",
+    "channel_rank": "compare.rank",
+    "grid_offset": "compare.offset",
+    "load_site": "site.siteyaml",
+    "read": "logs.frames",
+    "trace": "propagation.trace",
+}
+"""Where each public name lives."""
+
+__all__ = [
+    "Array",
+    "BiExponential",
+    "Link",
+    "Logs",
+    "OrdinaryKriging",
+    "Poses",
+    "Replay",
+    "Site",
+    "Variogram",
+    "__version__",
+    "channel_rank",
+    "grid_offset",
+    "load_site",
+    "read",
+    "trace",
+]
+
+
+def __getattr__(name: str) -> Any:
+    """Import a public name when it is first used."""
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    value = getattr(importlib.import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    """Public names first of all."""
+    return sorted({*globals(), *__all__})

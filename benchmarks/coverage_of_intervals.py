@@ -1,10 +1,14 @@
 """How often the stated 95 % intervals hold the truth, over simulated flights whose truth is known.
 
-Each flight has a fixed route (the simulated level varies with it), shadowing that remembers for a given time and
-white measurement noise; ranks come from thresholds on two shadowing processes. "Truth" is the value of the process,
-not of the sample. Columns: flights whose interval contains it.
+Each flight has a fixed route (the simulated level varies with it) and shadowing whose neighbouring samples correlate
+as stated, with or without white measurement noise; ranks come from thresholds on two shadowing processes; a pair is two
+models of equal true error that share half of their shadowing. "Truth" is the value of the process, not of the sample.
 
-    python benchmarks/coverage_of_intervals.py [--quick] [--json]
+Per cell of (samples, correlation of neighbours): the share of flights that are given an interval, the share of those
+whose interval holds the truth, and the share of all flights with a wrong one. A cell where fewer than half of the
+flights get an interval counts as "none given".
+
+    python benchmarks/coverage_of_intervals.py [--flights 400] [--json]
 """
 
 from __future__ import annotations
@@ -17,7 +21,7 @@ from scipy.signal import lfilter
 from scipy.stats import multivariate_normal, norm
 
 from aerpaw_cmp.compare.rank import compare_ranks
-from aerpaw_cmp.compare.statistics import error_intervals
+from aerpaw_cmp.compare.statistics import error_intervals, paired_difference
 
 OFFSET_DB, SHADOW_DB, NOISE_DB = 7.3, 4.0, 2.0
 CUTS = np.array([-0.8, 0.5, 1.6])
@@ -52,22 +56,63 @@ def rank_truth(mix: float) -> dict[str, float]:
     }
 
 
-def rss_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[str, float]:
-    rng = np.random.default_rng(int(memory * 10) + n)
-    t = np.linspace(0, 2 * np.pi, n)
+SIZES = (100, 200, 500, 1000, 3000)
+CORRELATIONS = (0.0, 0.5, 0.9, 0.95, 0.98, 0.99)
+STATISTICS = ("offset_db", "rmse_db", "correlation", "paired")
+
+
+def shadowed(rng: np.random.Generator, n: int, neighbours: float) -> np.ndarray:
+    """Unit-variance AR(1) with this correlation of neighbours."""
+    return rng.normal(size=n) if neighbours == 0 else remembering(rng, n, -1.0 / np.log(neighbours))
+
+
+def rss_cell(flights: int, n: int, neighbours: float, noise_db: float, replicates: int) -> dict[str, object]:
+    """Given and held, per statistic, over so many flights."""
+    rng = np.random.default_rng([n, round(1000 * neighbours), round(10 * noise_db)])
+    t = np.linspace(0, 2 * np.pi, n, endpoint=False)
     simulated = -80 + 8 * np.sin(3 * t) + 4 * np.cos(11 * t)
-    variance = SHADOW_DB**2 + NOISE_DB**2
-    truth = (OFFSET_DB, np.sqrt(variance), np.sqrt(simulated.var() / (simulated.var() + variance)))
-    hits = np.zeros(3)
+    variance = SHADOW_DB**2 + noise_db**2
+    truth = (OFFSET_DB, np.sqrt(variance), np.sqrt(simulated.var() / (simulated.var() + variance)), 0.0)
+    given, held = np.zeros((2, len(STATISTICS)))
     effective = []
     for _ in range(flights):
-        noise = SHADOW_DB * remembering(rng, n, memory) + rng.normal(0, NOISE_DB, n)
-        found = error_intervals(simulated - OFFSET_DB + noise, simulated, replicates=replicates)
-        ends = (found.offset_db, found.rmse_db, found.correlation)
-        hits += [low <= true <= high for (low, high), true in zip(ends, truth, strict=True)]
+        error = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
+        other = SHADOW_DB * shadowed(rng, n, neighbours) + rng.normal(0, noise_db, n)
+        found = error_intervals(simulated - OFFSET_DB + error, simulated, replicates=replicates)
+        pair = paired_difference(error, 0.5 * error + np.sqrt(0.75) * other, replicates=replicates)
+        ends = np.array([found.offset_db, found.rmse_db, found.correlation, pair.mean_square_ci95_db2])
+        given += np.isfinite(ends[:, 0])
+        held += (ends[:, 0] <= truth) & (truth <= ends[:, 1])
         effective.append(found.memory.n_effective)
-    names = ("offset_db", "rmse_db", "correlation")
-    return {**dict(zip(names, hits / flights, strict=True)), "n_effective": float(np.median(effective))}
+    ratio = (1 + neighbours) / (1 - neighbours)
+    independent = n * variance / (SHADOW_DB**2 * ratio + noise_db**2)
+    return {
+        "samples": n, "neighbours": neighbours, "noise_db": noise_db, "independent": float(independent),
+        "estimated": float(np.median(effective)),
+        **{name: cell(g, h, flights) for name, g, h in zip(STATISTICS, given, held, strict=True)},
+    }  # fmt: skip
+
+
+def cell(given: float, held: float, flights: int) -> dict[str, float | None]:
+    """Shares of one cell."""
+    return {
+        "given": given / flights,
+        "coverage": held / given if given else None,
+        "wrong_of_all": (given - held) / flights,
+    }
+
+
+def judged(row: dict[str, object], flights: int) -> list[str]:
+    """Statistics of a row that are neither none given nor 92 to 97 %, give or take two standard errors."""
+    bad = []
+    for name in STATISTICS:
+        entry = row[name]
+        assert isinstance(entry, dict)
+        if entry["given"] >= 0.5:
+            slack = 2 * np.sqrt(0.05 * 0.95 / (flights * entry["given"]))
+            if not 0.92 - slack <= entry["coverage"] <= 0.97 + slack:
+                bad.append(name)
+    return bad
 
 
 def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[str, float]:
@@ -96,24 +141,44 @@ def rank_coverage(flights: int, n: int, memory: float, replicates: int) -> dict[
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--quick", action="store_true", help="40 flights, 200 replicates")
+    parser.add_argument("--flights", type=int, default=400, help="simulated flights per cell")
+    parser.add_argument("--replicates", type=int, default=300)
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    flights, replicates = (40, 200) if arguments.quick else (500, 500)
-    rows = []
-    for n, memory in ((3300, 3.0), (3300, 15.0), (3300, 50.0), (10_000, 50.0)):
-        rows.append({"samples": n, "memory_samples": memory, **rss_coverage(flights, n, memory, replicates)})
-    ranks = []
-    for n, memory in ((1500, 5.0), (3000, 30.0)):
-        ranks.append({"samples": n, "memory_samples": memory, **rank_coverage(flights, n, memory, replicates)})
+    flights, replicates = arguments.flights, arguments.replicates
+    rows = [
+        rss_cell(flights, n, neighbours, noise, replicates)
+        for noise in (0.0, NOISE_DB)
+        for n in SIZES
+        for neighbours in CORRELATIONS
+    ]
+    ranks = [
+        {"samples": n, "memory_samples": memory, **rank_coverage(flights, n, memory, replicates)}
+        for n, memory in ((1500, 5.0), (3000, 30.0))
+    ]
+    bad = {f"{r['samples']}, {r['neighbours']}, {r['noise_db']} dB": b for r in rows if (b := judged(r, flights))}
     if arguments.json:
-        print(json.dumps({"flights": flights, "replicates": replicates, "rss": rows, "rank": ranks}))
+        print(json.dumps({"flights": flights, "replicates": replicates, "rss": rows, "rank": ranks, "outside": bad}))
         return
-    print(f"{flights} simulated flights per row, {replicates} replicates, 95 % intervals")
-    for table in (rows, ranks):
-        print("  ".join(f"{name:>15s}" for name in table[0]))
-        for row in table:
-            print("  ".join(f"{value:15.3f}" for value in row.values()))
+    print(f"{flights} simulated flights per cell, {replicates} replicates, 95 % intervals: coverage (wrong of all)")
+    head = ("samples", "neighbours", "noise dB", "independent", "estimated", *STATISTICS)
+    print(" | ".join(f"{name:>13s}" for name in head))
+    for row in rows:
+        plain = [f"{row[name]:13.5g}" for name in ("samples", "neighbours", "noise_db", "independent", "estimated")]
+        print(" | ".join([*plain, *(in_words(row[name]) for name in STATISTICS)]))
+    print(f"cells outside 92-97 % and not none given (two standard errors of {flights} flights allowed): {bad or 0}")
+    print("  ".join(f"{name:>15s}" for name in ranks[0]))
+    for row in ranks:
+        print("  ".join(f"{value:15.3f}" for value in row.values()))
+
+
+def in_words(entry: object) -> str:
+    """One cell of the table."""
+    assert isinstance(entry, dict)
+    wrong = f"({100 * entry['wrong_of_all']:.1f})"
+    if entry["given"] >= 0.5:
+        return f"{100 * entry['coverage']:6.1f} {wrong:>6s}"
+    return f"{'none':>6s} {wrong:>6s}"
 
 
 if __name__ == "__main__":

@@ -24,8 +24,8 @@ from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.compare_flight import audit_replays, compare_rank_series, compare_rss_series, pairs_of, versions
 from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.report.canvas import figure, save, style
 from aerpaw_cmp.report.export import json_safe
-from aerpaw_cmp.report.figures import figure, save, style
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "tests" / "field"

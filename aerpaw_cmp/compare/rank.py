@@ -6,7 +6,7 @@ a float with NaN where the modem gave no CSI; it is never 0.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -19,7 +19,6 @@ from .statistics import (
     REPLICATES,
     SEED,
     Interval,
-    Memory,
     bootstrap_means,
     interval,
     memory,
@@ -36,6 +35,8 @@ _CHUNK = 1 << 20
 
 def singular_values(h: ArrayLike) -> FloatArray:
     """Singular values of every channel matrix, divided by the largest magnitude of an entry.
+
+    Source: arXiv 2502.10324 eq. 2.
 
     Parameters
     ----------
@@ -83,6 +84,8 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
     Singular values that tie with ``sigma_1 / k`` do not count (strict). SVD noise is a few ulp of ``sigma_1``, so a
     tie is decided with a margin of ``8 eps sigma_1``: 1 and 0.1 at K = 10 is rank 1, whatever the rounding.
+
+    Source: arXiv 2502.10324 eq. 3.
     """
     if not k >= 1:
         raise ValueError(f"K is a ratio of singular values and must be >= 1, found {k}")
@@ -102,6 +105,8 @@ def rank_from_singular_values(sigma: ArrayLike, k: float) -> IntArray:
 
 def channel_rank(h: ArrayLike, k: float) -> IntArray:
     """Number of singular values above ``sigma_1 / k`` (strict) of every channel matrix.
+
+    Source: arXiv 2502.10324 eq. 3.
 
     Parameters
     ----------
@@ -391,7 +396,8 @@ def k_curve(
         return KCurve(grid, nothing, nothing, float("nan"), NO_INTERVAL, float("nan"), NO_INTERVAL, False)
     ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
     equal = (ranks == ri[:, None]).astype(np.float64)
-    length = memory(equal.mean(axis=1)).block_length
+    known = memory(equal.mean(axis=1))
+    length = known.block_length
     agree = equal.mean(axis=0)
     drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
     vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
@@ -405,9 +411,9 @@ def k_curve(
         agree,
         vary,
         float(best),
-        _central(_middle_of_best(drawn, grid), grid),
+        _central(_middle_of_best(drawn, grid), grid) if known.enough else NO_INTERVAL,
         float(best_tv),
-        _central(_middle_of_best(-varied, grid), grid),
+        _central(_middle_of_best(-varied, grid), grid) if known.enough else NO_INTERVAL,
         bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
     )
 
@@ -775,10 +781,12 @@ def compare_rank(
 def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    known = memory(rank)
-    columns = _indicators(rank)
-    drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
-    return [share_interval(float(columns[:, i].mean()), float(drawn[:, i].std()), known) for i in range(MAX_RANK)]
+    found, whole = [], memory(rank)
+    for bar in _indicators(rank).T:
+        known = memory(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
+        drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates, seed=seed)
+        found.append(share_interval(float(bar.mean()), float(drawn.std()), known))
+    return found
 
 
 def compare_ranks(
@@ -813,21 +821,51 @@ def _pair_intervals(
     if len(a) < 2:
         return [NO_INTERVAL] * 4
     equal, one, two = (a == b).astype(np.float64), _indicators(a), _indicators(b)
-    known = _longest(memory(equal), memory(a - b), memory(a))
-    drawn = bootstrap_means(np.column_stack([equal, one, two]), known.block_length, replicates=replicates, seed=seed)
-    p, q = drawn[:, 1 : MAX_RANK + 1], drawn[:, MAX_RANK + 1 :]
-    chance = (p * q).sum(axis=1)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        kappa = np.where(chance < 1 - 1e-12, (drawn[:, 0] - chance) / (1 - chance), np.nan)
-    tv = 0.5 * np.abs(p - q).sum(axis=1)
-    move = np.abs(np.cumsum(p - q, axis=1))[:, :-1].sum(axis=1)
+    columns = np.column_stack([equal, one, two])
+    found: list[Interval] = []
+    for influence, statistic, bounds in _pair_statistics(equal, one, two):
+        known = memory(influence)
+        drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
+        value = values[len(found)]
+        found.append(
+            share_interval(value, float(drawn.std()), known)
+            if not found
+            else interval(value, drawn, known, bounds=bounds)
+        )
+    return found
+
+
+def _pair_statistics(
+    equal: FloatArray, one: FloatArray, two: FloatArray
+) -> list[tuple[FloatArray, Callable[[FloatArray], FloatArray], tuple[float, float]]]:
+    """Agreement, kappa, total variation and Wasserstein distance of paired ranks.
+
+    For each: what a pose adds to it (n,), to first order; the statistic as a function of means (r, 1 + 2 MAX_RANK) of
+    agreement and indicators; and its range.
+    """
+    p, q = one.mean(axis=0), two.mean(axis=0)
+    agree, chance = float(equal.mean()), float(p @ q)
+    by_chance = one @ q + two @ p
+    left = max(1.0 - chance, 1e-12)
+    apart = np.sign(np.cumsum(p - q))
+
+    def bars(means: FloatArray) -> tuple[FloatArray, FloatArray]:
+        return means[:, 1 : MAX_RANK + 1], means[:, MAX_RANK + 1 :]
+
+    def kappa(means: FloatArray) -> FloatArray:
+        by_luck = np.prod(bars(means), axis=0).sum(axis=1)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            return np.where(by_luck < 1 - 1e-12, (means[:, 0] - by_luck) / (1 - by_luck), np.nan)
+
+    def distance(means: FloatArray) -> FloatArray:
+        return np.asarray(0.5 * np.abs(np.subtract(*bars(means))).sum(axis=1))
+
+    def move(means: FloatArray) -> FloatArray:
+        return np.asarray(np.abs(np.cumsum(np.subtract(*bars(means)), axis=1))[:, :-1].sum(axis=1))
+
     return [
-        share_interval(values[0], float(drawn[:, 0].std()), known),
-        interval(values[1], kappa, known, bounds=(-1.0, 1.0)),
-        interval(values[2], tv, known, bounds=(0.0, 1.0)),
-        interval(values[3], move, known, bounds=(0.0, MAX_RANK - 1.0)),
+        (equal, lambda means: means[:, 0], (0.0, 1.0)),
+        (equal / left + (agree - 1.0) / left**2 * by_chance, kappa, (-1.0, 1.0)),
+        ((one - two) @ np.sign(p - q), distance, (0.0, 1.0)),
+        (np.cumsum(one - two, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]
-
-
-def _longest(*memories: Memory) -> Memory:
-    return max(memories, key=lambda item: item.block_length)

@@ -28,6 +28,13 @@ _LONGER = 2.0
 """Blocks are twice Politis and White's length: that one minimises the error of the variance, not of the coverage
 (on 500 simulated flights it brings 89-93 % to 92-95 % where a flight holds only 25 independent samples)."""
 
+FEWEST_INDEPENDENT = 10.0
+"""Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it."""
+
+_UNSURE = 3.0
+"""The variance is widened by this over the number of independent samples, for what its estimate leaves open (chosen
+on simulated flights: benchmarks/coverage_of_intervals.py)."""
+
 _HELD = 1 << 21
 """Numbers held at once per bootstrap: bounds memory to tens of MiB."""
 
@@ -82,11 +89,20 @@ class Memory:
 
     @property
     def half_width(self) -> float:
-        """Half width of a 95 % interval per bootstrap standard deviation (Student's t for few blocks)."""
+        """Half width of a 95 % interval per bootstrap standard deviation.
+
+        Student's t for few blocks, the block variance's first-order bias, and the uncertainty of the memory itself.
+        """
         from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
         blocks = max(self.blocks, 2.0)
-        return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(self.variance_factor * blocks / (blocks - 1.0)))
+        unsure = 1.0 + _UNSURE / self.n_effective if self.n_effective > 0 else 1.0
+        return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(unsure * self.variance_factor * blocks / (blocks - 1.0)))
+
+    @property
+    def enough(self) -> bool:
+        """Whether an interval can be given at all: at least :data:`FEWEST_INDEPENDENT` independent samples."""
+        return bool(self.n_effective >= FEWEST_INDEPENDENT)
 
 
 def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
@@ -98,14 +114,47 @@ def autocovariance(values: ArrayLike, lags: int) -> FloatArray:
     return np.asarray(np.fft.irfft(np.abs(spectrum) ** 2, size)[: lags + 1] / n)
 
 
+def _significant(n: int) -> float:
+    """Autocorrelation above which a lag counts (Politis and White's rule)."""
+    return 2.0 * float(np.sqrt(np.log10(n) / n))
+
+
 def _cutoff(correlation: FloatArray, n: int) -> int:
     """Last lag before the autocorrelation stays insignificant for a run of lags (Politis and White's rule)."""
     run = max(5, int(np.ceil(np.sqrt(np.log10(n)))))
-    small = np.abs(correlation[1:]) < 2.0 * np.sqrt(np.log10(n) / n)
+    small = np.abs(correlation[1:]) < _significant(n)
     if len(small) < run:
         return max(1, len(small))
-    runs = np.convolve(small, np.ones(run), mode="valid") == run
+    seen = np.concatenate([[0], np.cumsum(small)])
+    runs = seen[run:] - seen[:-run] == run
     return int(np.argmax(runs)) if runs.any() else len(small)
+
+
+def _flat_top(covariance: FloatArray, n: int) -> tuple[float, float, float]:
+    """Long-run variance, the sum of its lag window and the sum over lag times covariance, by the flat-top window."""
+    lags = min(2 * max(1, _cutoff(covariance / covariance[0], n)), len(covariance) - 1)
+    lag = np.arange(1, lags + 1)
+    window = np.clip(2.0 * (1.0 - lag / lags), 0.0, 1.0)
+    weighted = window * covariance[1 : lags + 1]
+    return float(covariance[0] + 2.0 * weighted.sum()), float(1.0 + 2.0 * window.sum()), float((lag * weighted).sum())
+
+
+def _exponential(covariance: FloatArray, n: int) -> tuple[float, float]:
+    """Long-run variance, and the sum over lag times covariance, of white noise plus an exponential memory.
+
+    The decay comes from the ratio of neighbouring lags down to a correlation of one half: the lags that the removed
+    mean touches least.
+    """
+    correlation = covariance / covariance[0]
+    if correlation[1] < _significant(n):
+        return float(covariance[0]), 0.0
+    below = np.flatnonzero(correlation[1:] <= 0.5)
+    last = min(max(2, int(below[0]) + 1 if len(below) else len(correlation)), len(correlation) - 1)
+    one, two = correlation[1:last], correlation[2 : last + 1]
+    decay = float(np.clip(one @ two / (one @ one), 0.0, 1.0 - 1.0 / n))
+    share = min(1.0, float(correlation[1]) / decay) if decay > 0 else 0.0
+    kept = covariance[0] * share * decay
+    return float(covariance[0] + 2.0 * kept / (1.0 - decay)), float(kept / (1.0 - decay) ** 2)
 
 
 def memory(values: ArrayLike) -> Memory:
@@ -119,14 +168,21 @@ def memory(values: ArrayLike) -> Memory:
     Returns
     -------
     Memory
-        A constant sequence and fewer than two samples give blocks of one.
+        A constant sequence and fewer than eight samples give blocks of one.
 
     Notes
     -----
-    Flat-top lag window of Politis and White (2004), doi:10.1081/ETC-120028836, with the constants of Patton,
-    Politis and White (2009), doi:10.1080/07474930802459016, for the circular block bootstrap. Lags are searched up
-    to n / 4 (not sqrt n), because radio samples come many per correlation length; blocks are at most n / 5. The
-    block variance is short by G / (g L) to first order (Kuensch 1989, doi:10.1214/aos/1176347265).
+    With the mean taken off, autocovariances are short by V / n, where V is the long-run variance (sum of all
+    autocovariances): on a flight that is a few correlation times long, that hides most of the memory. V is therefore
+    solved for together with the covariances that it completes; where no V below n times the variance does, the
+    sequence is worth one sample.
+
+    V is the larger of two estimates: the flat-top lag window of Politis and White (2004),
+    doi:10.1081/ETC-120028836, and white noise plus an exponential memory (Gudmundson 1991,
+    doi:10.1049/el:19911328). The block length is that of Patton, Politis and White (2009),
+    doi:10.1080/07474930802459016, for the circular block bootstrap; lags are searched up to n / 2 (not sqrt n),
+    because radio samples come many per correlation length, and blocks are at most n / 5. The block variance is short
+    by G / (g L) to first order (Kuensch 1989, doi:10.1214/aos/1176347265).
 
     Examples
     --------
@@ -137,19 +193,28 @@ def memory(values: ArrayLike) -> Memory:
     n = len(x)
     if n < 8 or np.ptp(x) == 0.0:
         return Memory(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
-    covariance = autocovariance(x, max(2, n // 4))
-    lags = 2 * max(1, _cutoff(covariance / covariance[0], n))
-    lag = np.arange(1, min(lags, len(covariance) - 1) + 1)
-    window = np.clip(2.0 * (1.0 - lag / lags), 0.0, 1.0)
-    weighted = window * covariance[lag]
-    long_run = covariance[0] + 2.0 * weighted.sum()
-    if long_run <= 0.0:  # oscillating residual: the mean is known at least as well as from independent samples
-        long_run = covariance[0]
-    slope = max(0.0, 2.0 * float((lag * weighted).sum()) / long_run)
+    lags = max(2, n // 2)
+    seen = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
+    hidden, long_run, reach = 0.0, float(seen[0]), 0.0
+    for _ in range(12):
+        covariance = seen + hidden
+        by_window, width, window_reach = _flat_top(covariance, n)
+        by_decay, decay_reach = _exponential(covariance, n)
+        # the window's own sum holds the hidden part width / n times over
+        by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
+        long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
+        if long_run >= n * covariance[0]:
+            return Memory(n, max(1, n // 5), 1.0, 2.0)
+        if long_run <= 0.0:  # oscillating: the mean is known at least as well as from independent samples
+            long_run = float(seen[0])
+        if abs(long_run / n - hidden) < 1e-3 * seen[0]:
+            break
+        hidden = long_run / n
+    slope = max(0.0, 2.0 * reach / long_run)
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     factor = 1.0 / (1.0 - min(0.5, slope / block))
-    return Memory(n, block, float(np.clip(n * covariance[0] / long_run, 1.0, n)), factor)
+    return Memory(n, block, float(np.clip(n * (seen[0] + hidden) / long_run, 1.0, n)), factor)
 
 
 def bootstrap_means(
@@ -241,10 +306,10 @@ def interval(
     Returns
     -------
     (low, high)
-        NaN below two samples. Where resampling biases the statistic (distances, RMSE), the same bias sits in the
-        estimate and is taken off.
+        NaN ("none given") below :data:`FEWEST_INDEPENDENT` independent samples. Where resampling biases the
+        statistic (distances, RMSE), the same bias sits in the estimate and is taken off.
     """
-    if known.n < 2 or not np.isfinite(estimate):
+    if not known.enough or not np.isfinite(estimate):
         return NO_INTERVAL
     with np.errstate(divide="ignore", invalid="ignore"):
         value = float(np.asarray(forward(np.asarray(estimate))) if forward else estimate)
@@ -271,7 +336,9 @@ class ErrorIntervals:
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN where fewer than two samples, or where the statistic does not exist.
+        NaN ("none given") where the samples are worth fewer than :data:`FEWEST_INDEPENDENT` independent ones for that
+        statistic, or where it does not exist. Squares forget sooner than levels, so an RMSE may have an interval
+        where the offset has none.
     memory : Memory
         Of the residual.
     """
@@ -298,23 +365,43 @@ def error_intervals(
     known = memory(difference)
     d = difference - difference.mean()
     s = simulated_db - simulated_db.mean()
-    drawn = bootstrap_means(np.column_stack([d, d * d, d * s]), known.block_length, replicates=replicates, seed=seed)
-    offset = drawn[:, 0] + difference.mean()
-    variance = np.maximum(drawn[:, 1] - drawn[:, 0] ** 2, 0.0)
-    rmse = np.sqrt(variance)
+    squared, crossed, spread = d * d, d * s, float(s @ s) / len(s)
+
+    def drawn(columns: list[FloatArray], of: Memory) -> FloatArray:
+        return bootstrap_means(np.column_stack(columns), of.block_length, replicates=replicates, seed=seed)
+
+    of_squares = memory(squared)
+    mean, square = drawn([d, squared], of_squares).T
+    of_correlation = memory(_correlation_influence(spread, crossed, squared))
+    again, with_residual, residual = drawn([d, crossed, squared], of_correlation).T
     return ErrorIntervals(
-        interval(float(difference.mean()), offset, known),
-        interval(float(np.sqrt(np.mean(d * d))), rmse, known, forward=np.log, backward=np.exp),
+        interval(float(difference.mean()), drawn([d], known)[:, 0] + difference.mean(), known),
+        interval(
+            float(np.sqrt(np.mean(squared))),
+            np.sqrt(np.maximum(square - mean**2, 0.0)),
+            of_squares,
+            forward=np.log,
+            backward=np.exp,
+        ),
         interval(
             correlation(measured_db, simulated_db),
-            _correlation_of_residual(float(s @ s) / len(s), drawn[:, 2], variance),
-            known,
+            _correlation_of_residual(spread, with_residual, np.maximum(residual - again**2, 0.0)),
+            of_correlation,
             bounds=(-1.0, 1.0),
             forward=np.arctanh,
             backward=np.tanh,
         ),
         known,
     )
+
+
+def _correlation_influence(spread: float, with_residual: FloatArray, residual: FloatArray) -> FloatArray:
+    """What each sample (n,) adds to :func:`_correlation_of_residual`, to first order and up to a factor."""
+    covariance = spread - float(with_residual.mean())
+    variance = covariance - float(with_residual.mean()) + float(residual.mean())
+    if spread <= 0 or variance <= 0:
+        return np.zeros(len(residual))
+    return np.asarray(-with_residual - 0.5 * covariance / variance * (residual - 2.0 * with_residual))
 
 
 def _correlation_of_residual(spread: float, with_residual: FloatArray, residual: FloatArray) -> FloatArray:
@@ -509,7 +596,7 @@ def share_interval(share: float, spread: float, known: Memory) -> Interval:
     Wilson's interval stays sensible at shares of 0 and 1, where a bootstrap has no spread at all; there the
     effective size of the whole sequence counts. Wilson (1927), doi:10.1080/01621459.1927.10502953.
     """
-    if known.n < 2 or not np.isfinite(share):
+    if not known.enough or not np.isfinite(share):
         return NO_INTERVAL
     variance = spread**2 * known.half_width**2 / 1.959964**2
     size = known.n_effective if variance <= 0 else share * (1 - share) / variance

@@ -92,6 +92,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             **{k: v for k, v in result.as_dict().items() if k in EXTRA_RSS},
             "n_too_low": int((replayed.valid & ~levels.posed).sum()),
             "n_no_pose": int((~replayed.valid).sum()),
+            "n_flagged": dict(series.flagged),
             "clock": _clock_entry(clock),
             "baseline_rmse_ci95_db": {name: list(bounds) for name, bounds in result.baseline_intervals.items()},
             **_further_numbers(data, series, replayed, levels, result.offset_db),
@@ -519,6 +520,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         stale=~result.staleness.fresh,
         extra={
             **{k: v for k, v in result.as_dict().items() if k not in PANEL_RANK},
+            "n_flagged": dict(series.flagged),
             "kappa_ci95": {f"{k:g}": list(fit.kappa_ci95) for k, fit in result.simulated.items()},
             **({"foliage": foliage} if foliage else {}),
         },

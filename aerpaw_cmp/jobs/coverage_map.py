@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
@@ -52,7 +52,8 @@ from ..propagation.channel import channel_matrices, rss_dbm
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
-from ..propagation.tracer import Engine, Replay, Scene, replay
+from ..propagation.scene import Scene
+from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
 from ..site.site import Site
 from .what_if import p833_note
@@ -383,10 +384,10 @@ def tower_round(site: Site) -> tuple[FloatArray, str]:
 # --- the page ------------------------------------------------------------------------------------------------------
 
 
-def maps_record(outcome: MapOutcome, *, name: str, generated: str, versions: Mapping[str, str]) -> page.MapsData:
-    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files."""
-    from .paper_table import paper_rows
-
+def maps_record(
+    outcome: MapOutcome, *, name: str, generated: str, versions: Mapping[str, str], paper: Iterable[page.PaperRow] = ()
+) -> page.MapsData:
+    """The record that :func:`~aerpaw_cmp.report.maps_html.write_maps` turns into files; ``paper``: its table."""
     s, result = outcome.settings, outcome.shown
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
@@ -404,7 +405,7 @@ def maps_record(outcome: MapOutcome, *, name: str, generated: str, versions: Map
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
-        paper=tuple(paper_rows(outcome)),
+        paper=tuple(paper),
         warnings=tuple(_warnings(outcome)),
         notes=_notes(outcome),
         versions=versions,

@@ -6,7 +6,7 @@ Every row quotes the paper on one side; the other side is computed here from the
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -14,11 +14,9 @@ from ..common.units import power_from_db
 from ..maps.job import Antennas
 from ..maps.study import Study, rank_fields
 from ..maps.variogram import PAPER_BIEXPONENTIAL
-from ..report.export import k_key, safe_name
 from ..report.maps_data import PaperRow
-
-if TYPE_CHECKING:
-    from .coverage_map import MapOutcome
+from ..report.names import k_key, safe_name
+from .coverage_map import MapOutcome
 
 TABLE_II = "Table II"
 NEAR_M = 150.0

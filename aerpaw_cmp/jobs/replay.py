@@ -191,15 +191,19 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
 
 
 def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
-    """Replay every rank series with the arrays of ``link.rank``."""
+    """Replay every rank series with the arrays of ``link.rank``.
+
+    Position and attitude come each from what has them: positions from the log where it holds its own, else from the
+    track; attitude from the track, whoever gave the position. Where the track has none, the UAV array stays as mounted.
+    """
     out = []
     for series in data.rank:
         link = data.settings.link.rank.build([series.tower], data.folder)
         position, valid = rank_positions(series, data.track)
-        track = None if series.position_m is not None else _track_poses(data, series.time)
-        rotation = np.broadcast_to(np.eye(3), (len(position), 3, 3))
+        track = None if data.track is None else _track_poses(data, series.time)
+        rotation = np.tile(np.eye(3), (len(position), 1, 1))
         if track is not None:
-            rotation = attitude_rotation(track, data.settings.rt.attitude)
+            rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         out.append(Replayed(link, poses, valid, _replay(data, link, poses, progress), track))

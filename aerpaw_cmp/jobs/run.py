@@ -127,7 +127,7 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
-    from ..report.export import write_report
+    from ..report.write import write_report
 
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
@@ -470,7 +470,7 @@ def run_map(
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
     from .compare_flight import versions
-    from .paper_table import paper_markdown
+    from .paper_table import paper_markdown, paper_rows
 
     given = {name: value for name, value in options.items() if value is not None}
     settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
@@ -489,7 +489,9 @@ def run_map(
             with outcome.stage("export", progress):
                 files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
             progress("page")
-            record = mapping.maps_record(outcome, name=name, generated=generated, versions=versions())
+            record = mapping.maps_record(
+                outcome, name=name, generated=generated, versions=versions(), paper=paper_rows(outcome)
+            )
             written = write_maps(record, part)
             written.append(part / "paper.md")
             written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line
 from .flight_file import IngestedFile
-from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, identify
+from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
 from .records import has_wall_clock
 
 if TYPE_CHECKING:
@@ -175,7 +175,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
             cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
             path=path,
         )
-    if reader is None and not head.startswith(_GZIP):
+    if reader is None and not head.startswith(_GZIP) and not hides_its_content(head):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     data, digest = read_bytes(place)
     if not data.strip() or data.startswith(b"version https://git-lfs"):
@@ -184,10 +184,12 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
 
 
 def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
+    from . import limits  # loads pandas, as any reader does
+
     given = options(path) if callable(options) else options or ReadOptions()
     given = replace(given, file_name=path.name)
     try:
-        result = reader.read(data, given)
+        result = limits.check(reader.read(data, given))
     except (InputError, UsageError) as error:
         if error.path is None:  # readers know bytes only
             raise type(error)(

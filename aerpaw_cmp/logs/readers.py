@@ -133,6 +133,19 @@ def by_name(name: str) -> Reader:
     )
 
 
+def head_of(data: bytes) -> bytes:
+    """What sniffers see of a file: its first bytes; of a KML, without the styles in front of the first placemark."""
+    head = data[:HEAD_BYTES]
+    if hides_its_content(head) and (place := data.find(b"<Placemark")) > 0:
+        return head[:2048] + data[place : place + HEAD_BYTES - 2048]
+    return head
+
+
+def hides_its_content(head: bytes) -> bool:
+    """Whether the first bytes of a file do not show what it holds: a KML whose styles fill them."""
+    return b"<kml" in head[:2048] and b"<Placemark" not in head and len(head) >= HEAD_BYTES
+
+
 def identify(data: bytes, *, path: str | None = None) -> Reader:
     """The one reader whose sniffer accepts the content.
 
@@ -143,7 +156,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     """
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
-    head = data[:HEAD_BYTES]
+    head = head_of(data)
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
             "a Git-LFS pointer stands in place of the data",

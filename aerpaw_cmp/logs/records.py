@@ -18,6 +18,12 @@ rss
 rank
     ``rank`` (float; NaN = no CSI, never 0), ``ri_raw``, and where the log has them ``rsrp_dbm sinr_db cqi mcs
     latitude_deg longitude_deg altitude_m``. Attributes: ``ri_base`` (``"one"`` or ``"zero"``).
+kpi
+    ``value``: any other quantity of a modem or base station (RSRQ, SINR, CQI, throughput, ...); a report does not
+    compare it. Attributes: ``quantity``, ``unit``.
+
+A cell: an rss stream may be that of one cell; its attributes then hold ``pci`` and, where known, ``arfcn``, ``band``,
+``rat``, and its column ``serving`` says when the cell served the phone (1, 0; NaN where the log does not say).
 """
 
 from __future__ import annotations
@@ -30,7 +36,7 @@ if TYPE_CHECKING:
     import numpy as np
     import pandas as pd
 
-Kind = Literal["telemetry", "rss", "rank"]
+Kind = Literal["telemetry", "rss", "rank", "kpi"]
 Attribute = str | float | int | bool
 
 COLUMNS: dict[str, tuple[str, ...]] = {
@@ -49,6 +55,7 @@ COLUMNS: dict[str, tuple[str, ...]] = {
     ),
     "rss": ("rss_db",),
     "rank": ("rank", "ri_raw"),
+    "kpi": ("value",),
 }
 """Columns that a frame of each kind must have, besides ``time``, ``line`` and ``flag``."""
 
@@ -59,7 +66,7 @@ class Stream:
 
     Parameters
     ----------
-    kind : {"telemetry", "rss", "rank"}
+    kind : {"telemetry", "rss", "rank", "kpi"}
         Decides the columns, see the module text.
     name : str
         Unique within the file, e.g. ``"vehicle"``, ``"power"``, ``"USRP1"``.

@@ -34,6 +34,7 @@ __all__ = [
     "PAPER_BIEXPONENTIAL",
     "BiExponential",
     "BinnedCorrelation",
+    "Variogram",
     "field_correlation",
     "fit_biexponential",
     "fit_vertical_scale",
@@ -52,6 +53,8 @@ PAPER_MAXIMUM_M = 500.0
 @dataclass(frozen=True, slots=True)
 class BinnedCorrelation:
     """Correlation (or semivariance) against distance.
+
+    Source: arXiv 2502.10324 eq. 11; arXiv 2502.10324 eq. 12; arXiv 2502.10324 eq. 13.
 
     Parameters
     ----------
@@ -90,6 +93,8 @@ def vector_correlation(
     minimum_common: int = 3,
 ) -> BinnedCorrelation:
     """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
+
+    Source: arXiv 2502.10324 eq. 9; arXiv 2502.10324 eq. 10.
 
     Parameters
     ----------
@@ -242,6 +247,64 @@ def fit_vertical_scale(
 
 Block = Callable[[IntArray, IntArray], FloatArray]
 """Value of each pair of two sets of positions: (rows,), (columns,) -> (rows, columns); NaN where undefined."""
+
+
+class Variogram:
+    """Correlation of a field against horizontal distance, binned and fitted.
+
+    Parameters
+    ----------
+    width_m, maximum_m : float
+        Bins of the distance.
+
+    Attributes
+    ----------
+    binned_ : BinnedCorrelation
+        What :func:`field_correlation` gives for the samples.
+    model_ : BiExponential
+        The curve through it; callable on distances.
+
+    Notes
+    -----
+    ``gamma(d) = v^2 (1 - Phi(d))`` with ``Phi(d) = c1 exp(c2 d) + c3 exp(c4 d)`` (arXiv 2502.10324, section VI).
+    :class:`~aerpaw_cmp.maps.kriging.OrdinaryKriging` takes a fitted one as its correlation.
+
+    Examples
+    --------
+    >>> points = np.stack(np.meshgrid(np.arange(20.0), np.arange(20.0)), axis=-1).reshape(-1, 2) * 30.0
+    >>> variogram = Variogram().fit(points, np.sin(points[:, 0] / 200.0))
+    >>> 0.9 < float(variogram(30.0)) <= 1.0
+    True
+    """
+
+    def __init__(self, width_m: float = PAPER_WIDTH_M, maximum_m: float = PAPER_MAXIMUM_M) -> None:
+        self.width_m = width_m
+        self.maximum_m = maximum_m
+
+    def fit(self, points_m: ArrayLike, values: ArrayLike) -> Variogram:
+        """Bin and fit samples (n,) or (n, fields) at points (n, 2) [m].
+
+        Raises
+        ------
+        UsageError
+            Fewer than the samples or bins that a fit needs.
+        """
+        self.binned_ = field_correlation(points_m, values, width_m=self.width_m, maximum_m=self.maximum_m)
+        pairs = np.isfinite(self.binned_.correlation)
+        # at the mean distance of a bin's pairs: on a grid it lies up to a fifth of the width beyond the bin's middle
+        self.model_ = fit_biexponential(self.binned_.mean_distance_m[pairs], self.binned_.correlation[pairs])
+        return self
+
+    def __call__(self, distance_m: ArrayLike) -> FloatArray:
+        """Fitted correlation at distances [m]."""
+        return self.model_(distance_m)
+
+    def semivariance(self, distance_m: ArrayLike, sill: float = 1.0) -> FloatArray:
+        """``sill * (1 - Phi(d))`` at distances [m], in the unit of the sill.
+
+        Source: arXiv 2502.10324 eq. 17.
+        """
+        return np.asarray(sill * (1.0 - self.model_(distance_m)))
 
 
 class _PairProduct:

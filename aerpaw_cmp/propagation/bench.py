@@ -20,7 +20,8 @@ from ..site.site import Building, Site, Tower
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from .audit import RANK_K, Difference, compare
 from .channel import mean_pair_power, rss_dbm
-from .tracer import Replay, Scene, replay
+from .scene import Scene
+from .tracer import Replay, replay
 
 Progress = Callable[[str], None]
 

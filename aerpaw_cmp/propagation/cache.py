@@ -12,7 +12,6 @@ import zipfile
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -20,9 +19,7 @@ from .. import __version__
 from ..common.files import whole
 from ..common.units import FloatArray
 from .paths import PathSet
-
-if TYPE_CHECKING:
-    from .tracer import Scene, Settings
+from .scene import Scene, Settings
 
 LAYOUT = 2
 """Raised whenever the entries or the search change."""

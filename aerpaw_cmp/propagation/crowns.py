@@ -28,8 +28,9 @@ from ..site.materials import CROWN
 from ..site.meshes import CROWN_SIDES, crown_corners_m
 from ..site.site import Trees
 from .foliage import CrownIndex
-from .image import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, Occlusion, merge
+from .image import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, merge
 from .paths import Faces, PathSet, joined
+from .solids import Occlusion
 
 FACES_PER_CROWN = CROWN_SIDES + 1
 """Sides, then the bottom."""

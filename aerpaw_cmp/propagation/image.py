@@ -4,12 +4,13 @@ For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path
 
 1. each image lies in front of the next face, and the target in front of the last (decided per sequence);
 2. going back from the target, each line to the current image meets its face inside the polygon;
-3. no segment is cut by another face.
+3. no segment is cut by a solid.
 
 A sequence is followed only while the beam from the image through its last face can still reach the next one.
 Sides are decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point.
-A solid hides only with its open inside: a segment that merely touches edges is decided by the points halfway between
-the touches. So a path along a wall stays, and there is no crack between two walls.
+A solid hides with its open inside (:mod:`aerpaw_cmp.propagation.solids`), so a path along a wall stays, and there is no
+crack between two walls. An end that lies on a face reflects there like one a hair before it: nothing jumps when a UAV
+lands.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .faces import corners, inside
 from .paths import Faces, PathSet
+from .solids import Occlusion
 
 RELATIVE_TOLERANCE = 1e-12
 """Of the largest coordinate: some thousand times the rounding error of a plane equation."""
@@ -151,7 +153,7 @@ class Sequences:
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]
         facing = facing & usable[None, :]
-        lit = (faces.normal @ targets.T - faces.offset_m[:, None] > tolerance_m).any(axis=1)
+        lit = (faces.normal @ targets.T - faces.offset_m[:, None] >= -tolerance_m).any(axis=1)
         low, high = targets.min(axis=0), targets.max(axis=0)
         hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
         total = 1
@@ -191,7 +193,8 @@ def _grow(
         past = level.images_m[start : start + step]
         last_image = past[:, -1] if now.shape[1] else np.broadcast_to(source, (len(now), 3))
         height = last_image @ faces.normal.T - faces.offset_m
-        good = height > tolerance_m
+        # the source itself may lie on the face, an image may not: its reflection would be an edge of two faces
+        good = height > tolerance_m if now.shape[1] else height >= -tolerance_m
         if now.shape[1]:
             good &= facing[now[:, -1]]
             row, face = np.nonzero(good)
@@ -291,8 +294,8 @@ def meets_last_face(
     below = np.einsum("ij,ij->i", faces.normal[last], image) - faces.offset_m[last]
     with np.errstate(divide="ignore", invalid="ignore"):
         share = below[:, None] / (below[:, None] - height)
-    share[height <= tolerance_m] = 0.0
-    good = height > tolerance_m
+    good = height >= -tolerance_m
+    share[~good] = 0.0
     for axis, which in ((faces.along, 0), (faces.across, 1)):
         start = np.einsum("ij,ij->i", axis[last], image)[:, None]
         point = (axis[used] @ targets.T)[position]
@@ -314,6 +317,8 @@ def trace_back(
     edge_m: float | None = None,
 ) -> tuple[FloatArray, BoolArray]:
     """Reflection points of sequences, from the target back to the source.
+
+    Source: arXiv 2502.10324 eq. 4.
 
     Parameters
     ----------
@@ -341,7 +346,9 @@ def trace_back(
         normal, offset = faces.normal[face], faces.offset_m[face]
         ahead = np.einsum("ij,ij->i", normal, point) - offset
         behind = offset - np.einsum("ij,ij->i", normal, image)
-        good &= (ahead > tolerance_m) & (behind > 0.0)
+        # an end may lie on its face, the other reflection points lie before it
+        good &= ahead >= -tolerance_m if step == depth - 1 else ahead > tolerance_m
+        good &= (behind >= -tolerance_m if step == 0 else behind > 0.0) & (ahead + behind > tolerance_m)
         with np.errstate(divide="ignore", invalid="ignore"):
             share = behind / (behind + ahead)
         share = np.where(good, share, 0.0)
@@ -361,105 +368,6 @@ def images_of(faces: Faces, sequence: IntArray, sources_m: FloatArray) -> FloatA
         point = point - 2.0 * height[:, None] * normal
         images[:, step] = point
     return images
-
-
-class Occlusion:
-    """Answers whether segments are cut by the faces of solids.
-
-    Parameters
-    ----------
-    faces : Faces
-        Faces with ``solid >= 0`` hide, the ground does not: nothing that is traced lies below it.
-    tolerance_m : float
-        A face is crossed by a segment whose ends lie farther than this on either side.
-    """
-
-    def __init__(self, faces: Faces, tolerance_m: float) -> None:
-        self.faces = faces
-        self.tolerance_m = tolerance_m
-        self.members = [np.flatnonzero(faces.solid == solid) for solid in np.unique(faces.solid[faces.solid >= 0])]
-        box = corners(faces, 0.0) if not self.members else corners(faces, 1e9)
-        self.low = np.array([box[m].min(axis=(0, 1)) for m in self.members]).reshape(-1, 3) - tolerance_m
-        self.high = np.array([box[m].max(axis=(0, 1)) for m in self.members]).reshape(-1, 3) + tolerance_m
-
-    def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
-        """Which polylines source - vertices (paths, depth, 3) - target are cut (paths,)."""
-        cut = np.zeros(len(sources_m), dtype=np.bool_)
-        start = sources_m
-        for step in range(vertices_m.shape[1] + 1):
-            end = vertices_m[:, step] if step < vertices_m.shape[1] else targets_m
-            rows = np.flatnonzero(~cut)
-            cut[rows] = self.segments(start[rows], end[rows])
-            start = end
-        return cut
-
-    def segments(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        """Which segments (n, 3) - (n, 3) are cut."""
-        cut = np.zeros(len(start), dtype=np.bool_)
-        if not self.members:
-            return cut
-        step = max(1, CELLS_PER_CHUNK // len(self.members))
-        for first in range(0, len(start), step):
-            part = slice(first, first + step)
-            a, b = start[part], end[part]
-            near = self._boxes(a, b)
-            here = np.zeros(len(a), dtype=np.bool_)
-            for solid, members in enumerate(self.members):
-                rows = np.flatnonzero(near[:, solid] & ~here)
-                if len(rows):
-                    here[rows] = self._crosses(a[rows], b[rows], members)
-            cut[part] = here
-        return cut
-
-    def _boxes(self, start: FloatArray, end: FloatArray) -> BoolArray:
-        """Which segments meet which bounding boxes: slab test, (segments, solids)."""
-        direction = end - start
-        direction = np.where(direction == 0.0, 1e-300, direction)
-        enter = np.zeros((len(start), len(self.members)))
-        leave = np.ones_like(enter)
-        with np.errstate(over="ignore"):
-            for axis in range(3):
-                inverse = 1.0 / direction[:, axis, None]
-                one = (self.low[:, axis] - start[:, axis, None]) * inverse
-                two = (self.high[:, axis] - start[:, axis, None]) * inverse
-                np.maximum(enter, np.minimum(one, two), out=enter)
-                np.minimum(leave, np.maximum(one, two), out=leave)
-        return np.asarray(enter <= leave)
-
-    def _crosses(self, start: FloatArray, end: FloatArray, members: IntArray) -> BoolArray:
-        """Which segments cross one of the faces ``members``."""
-        faces, tolerance_m = self.faces, self.tolerance_m
-        normal, offset = faces.normal[members], faces.offset_m[members]
-        before = start @ normal.T - offset
-        after = end @ normal.T - offset
-        through = ((before > tolerance_m) & (after < -tolerance_m)) | ((before < -tolerance_m) & (after > tolerance_m))
-        row, column = np.nonzero(through)
-        share = before[row, column] / (before[row, column] - after[row, column])
-        point = start[row] + share[:, None] * (end[row] - start[row])
-        face = members[column]
-        surely = inside(faces, face, point, -tolerance_m)
-        result = np.zeros(len(start), dtype=np.bool_)
-        result[row[surely]] = True
-        touch = np.flatnonzero(~surely & ~result[row])
-        touch = touch[inside(faces, face[touch], point[touch], tolerance_m)]
-        if len(touch):
-            self._touching(result, start, end, row[touch], share[touch], members)
-        return result
-
-    def _touching(
-        self, result: BoolArray, start: FloatArray, end: FloatArray, row: IntArray, share: FloatArray, members: IntArray
-    ) -> None:
-        """Mark segments that pass through edges of a solid and run inside it between two of them."""
-        order = np.lexsort((share, row))
-        row, share = row[order], share[order]
-        pair = np.flatnonzero(row[1:] == row[:-1])
-        halfway = ((share[1:] + share[:-1]) / 2)[pair]
-        row = row[pair]
-        point = start[row] + halfway[:, None] * (end[row] - start[row])
-        for roof in members[self.faces.normal[members, 2] == 1.0]:
-            below = point[:, 2] < self.faces.offset_m[roof] - self.tolerance_m
-            under = inside(self.faces, np.full(len(point), roof), point, -self.tolerance_m)
-            result[row[below & under]] = True
 
 
 def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, max_depth: int) -> PathSet:

@@ -7,7 +7,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -19,16 +19,17 @@ from .arrays import Link, Poses
 from .cache import PathCache
 from .channel import channel_matrices, mean_pair_power, rss_dbm
 from .crowns import Crowns
-from .faces import inside_solids, site_faces, smaller_than_fresnel_zone
+from .faces import inside_solids, smaller_than_fresnel_zone
 from .paths import Faces, PathSet
 from .relevance import Relevance
+from .scene import Scene, Settings
 
 Engine = Literal["sionna", "image"]
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 """``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, repr=False)
 class Replay:
     """What a replay found.
 
@@ -68,6 +69,47 @@ class Replay:
     towers: tuple[str, ...]
     left_out: list[str] = field(default_factory=list)
     from_cache: bool = False
+
+    def __repr__(self) -> str:
+        """One line: the arrays are too large to be shown."""
+        return (
+            f"Replay({len(self.has_path)} poses, towers {', '.join(self.towers)}, engine {self.engine!r}, "
+            f"{len(self.paths)} paths, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
+        )
+
+    def to_xarray(self) -> Any:
+        """The replay as an ``xarray.Dataset`` with dimensions pose, tower, n_rx, n_tx.
+
+        Returns
+        -------
+        xarray.Dataset
+            ``rss_dbm``, ``rss_power_dbm``, ``has_path``, ``h_real`` and ``h_imag`` with units as attributes.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise UsageError(
+                "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
+            ) from None
+        level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
+        power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
+        ports = ("pose", "tower", "n_rx", "n_tx")
+        return xarray.Dataset(
+            {
+                "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
+                "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
+                "has_path": (("pose", "tower"), self.has_path),
+                "h_real": (ports, self.h.real, {"units": "1"}),
+                "h_imag": (ports, self.h.imag, {"units": "1"}),
+            },
+            coords={"tower": list(self.towers)},
+            attrs={"engine": self.engine, "seconds": self.seconds},
+        )
 
 
 def replay(
@@ -156,74 +198,6 @@ def replay(
         left_out=left_out,
         from_cache=from_cache,
     )
-
-
-@dataclass(frozen=True, slots=True)
-class Settings:
-    """What decides the paths besides the scene."""
-
-    engine: str
-    max_depth: int = 2
-    samples: int = 1_000_000
-    batch: int = 50
-    variant: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class Scene:
-    """Geometry of a replay.
-
-    Parameters
-    ----------
-    faces : Faces
-    sources_m : (towers, 3)
-    usable : (towers, faces) bool
-        Faces that reflect for each tower.
-    excluded : (towers, poses) bool
-        Links without a path: an end inside a building or under the ground.
-    """
-
-    faces: Faces
-    sources_m: FloatArray
-    usable: BoolArray
-    excluded: BoolArray
-
-    @classmethod
-    def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
-        """Scene of a site as the towers of a link see it."""
-        names = tuple(link.tower_arrays)
-        unknown = [name for name in names if name not in site.towers]
-        if unknown:
-            raise UsageError(
-                f"the site has no tower {unknown[0]!r}",
-                expected="one of " + ", ".join(site.towers),
-                cause="a typing error",
-            )
-        faces = site_faces(site, names)
-        towers = [site.towers[name] for name in names]
-        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
-        ground = np.array([tower.ground_m for tower in towers])
-        is_ground = faces.solid < 0
-        usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
-        up = poses.position_m[:, 2]
-        # terrain is not traced: a pose below a tower's own plane but above the lowest ground is no buried pose
-        buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
-        excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
-        return cls(faces, sources, usable, excluded)
-
-    def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
-        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths."""
-        paths, faces = crowns.bounces(
-            self.faces,
-            self.sources_m,
-            poses.position_m,
-            max_depth=max_depth,
-            usable=self.usable,
-            excluded=self.excluded,
-            dem=site.dem,
-        )
-        more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
-        return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
 
 
 def _buried_towers(site: Site, link: Link) -> list[str]:

@@ -10,8 +10,7 @@ import numpy as np
 from ..common.units import FloatArray
 from ..site.site import Site
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
-from .export import k_key, safe_name
-from .figures import (
+from .canvas import (
     BASELINE,
     Plate,
     beyond,
@@ -27,6 +26,7 @@ from .figures import (
     thinned_plan,
 )
 from .maps_figures import COLOURS, LINES, MARKERS, grouped
+from .names import k_key, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -11,11 +11,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from . import campaign_figures, figures
+from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
-from .export import json_safe, k_key, write_file
-from .figures import Picture
+from .canvas import Picture
+from .export import json_safe, write_file
 from .html import CONTENT_POLICY, by_section, environment
+from .names import k_key
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
@@ -249,7 +250,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=rss_flights(data),
-        pretty=figures.pretty,
+        pretty=canvas.pretty,
         files=files,
         content_policy=CONTENT_POLICY,
     )
@@ -262,7 +263,7 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
     written = [write_file(folder / "campaign.json", numbers), write_file(folder / "campaign.csv", table)]
-    drawn, pictures = figures.write_plates(campaign_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
     page = write_file(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
     return [page, *written]

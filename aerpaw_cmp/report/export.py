@@ -1,10 +1,8 @@
-"""metrics.json, rss.csv, rank.csv and the whole folder of a report."""
+"""metrics.json, rss.csv and rank.csv: finished numbers to JSON and tables."""
 
 from __future__ import annotations
 
-import json
 import math
-import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -13,51 +11,12 @@ import numpy as np
 
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
+from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 if TYPE_CHECKING:
     import pandas as pd
 
-RSS_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first sample of this tower and channel",
-    "tower": "name of the tower",
-    "channel": "name of the channel",
-    "unit": "unit of measured_db",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_db": "as logged; empty: no signal",
-    "calibrated_db": "measured_db plus the offset of this tower and channel",
-    "simulated_dbm": "ray tracing; empty: no path",
-    "residual_db": "calibrated_db minus simulated_dbm",
-    "measured_out_of_coverage": "1: the log has no signal here",
-    "simulated_out_of_coverage": "1: the ray tracing has no path here",
-}
-"""Columns of rss.csv, followed by one ``<baseline>_dbm`` per baseline."""
-
-RANK_COLUMNS: dict[str, str] = {
-    "time_utc": "instant of the report, ISO 8601, UTC; empty: the log has relative times and no origin was given",
-    "time_s": "seconds after the first report of this tower",
-    "tower": "name of the tower",
-    "east_m": "UAV position, metres east of the site origin",
-    "north_m": "metres north",
-    "up_m": "metres above the ground at the origin",
-    "measured_rank": "reported rank 1 to 4; empty: no CSI",
-}
-"""Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path)."""
-
 _DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
-
-
-def k_key(k: float) -> str:
-    """K as a key of metrics.json and of rank.csv.
-
-    Examples
-    --------
-    >>> k_key(1000.0), k_key(12.5)
-    ('1000', '12.5')
-    """
-    return f"{k:.10g}"
 
 
 def json_safe(value: Any) -> Any:
@@ -300,14 +259,6 @@ def _stacked(frames: list[pd.DataFrame], columns: Iterable[str]) -> pd.DataFrame
     return rounded
 
 
-def iso_time(time: Any) -> Any:
-    """Instants as ISO 8601 text with milliseconds and ``Z``; empty where not a time."""
-    instants = np.asarray(time, dtype="datetime64[ns]")
-    # half a unit added: numpy truncates, and a stored 0.9999999 s must not lose a millisecond
-    text = np.datetime_as_string((instants + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
-    return np.where(np.isnat(instants), "", text)
-
-
 def _times(time: Any) -> dict[str, Any]:
     """Columns ``time_utc`` and ``time_s``."""
     instants = np.asarray(time, dtype="datetime64[ns]")
@@ -319,17 +270,6 @@ def _times(time: Any) -> dict[str, Any]:
     return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
 
 
-def safe_name(text: str) -> str:
-    """A part of a file name from any text.
-
-    Examples
-    --------
-    >>> safe_name("LW1 USRP1"), safe_name("../a b"), safe_name("")
-    ('LW1_USRP1', 'a_b', '_')
-    """
-    return re.sub(r"[^A-Za-z0-9.-]+", "_", text).strip("._")[:80] or "_"
-
-
 def write_file(path: Path, content: str | bytes) -> Path:
     """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
 
@@ -338,37 +278,3 @@ def write_file(path: Path, content: str | bytes) -> Path:
     path.parent.mkdir(exist_ok=True)
     path.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     return path
-
-
-def write_report(data: ReportData, folder: str | Path) -> list[Path]:
-    """Write the files of a report.
-
-    Parameters
-    ----------
-    data : ReportData
-    folder : path
-        Empty; that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`, say.
-
-    Returns
-    -------
-    list of Path
-        ``report.html`` first, then ``metrics.json``, the CSVs (header only when they have no rows), the figures.
-
-    Raises
-    ------
-    OSError
-        If the folder cannot be written.
-    """
-    from . import figures, html
-
-    folder = Path(folder)
-    numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    written = [write_file(folder / "metrics.json", numbers)]
-    for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
-        # written even without rows: a reader finds the same files in every report
-        written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
-    drawn, pictures = figures.write_plates(figures.plates(data), folder / "figures")
-    written += pictures
-    files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
-    page = write_file(folder / "report.html", html.page(data, drawn, files))
-    return [page, *written]

@@ -16,9 +16,9 @@ import numpy as np
 
 from ..logs.records import has_wall_clock
 from . import words
+from .canvas import Picture, start_of
 from .data import RANKS, ReportData
-from .export import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
-from .figures import Picture, start_of
+from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 REJECTED_SHOWN = 20
 """Rejected lines shown per file; the flight file holds all."""
@@ -43,9 +43,11 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 
 
 def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
-    """An interval as ``[low, high]``, or nothing."""
-    if value is None or not all(map(math.isfinite, value)):
+    """An interval as ``[low, high]``, or nothing; "[none given]" where there are too few independent samples."""
+    if value is None:
         return ""
+    if not all(map(math.isfinite, value)):
+        return "[none given]"
     return f"[{number(value[0], decimals)}, {number(value[1], decimals)}]"
 
 

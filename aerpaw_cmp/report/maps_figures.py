@@ -9,10 +9,10 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..site.site import Site
+from .canvas import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .data import RANKS
-from .export import k_key, safe_name
-from .figures import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
+from .names import k_key, safe_name
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -7,12 +7,13 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from . import figures, maps_figures
+from . import canvas, maps_figures
+from .canvas import Picture
 from .data import RANKS
-from .export import json_safe, k_key, merge, write_file
-from .figures import Picture
+from .export import json_safe, merge, write_file
 from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData
+from .names import k_key
 
 
 def maps_metrics(data: MapsData) -> dict[str, Any]:
@@ -91,7 +92,7 @@ def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")]
-    drawn, pictures = figures.write_plates(maps_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_plates(maps_figures.plates(data), folder / "figures")
     written += pictures
     page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
     return [page, *written]

@@ -18,10 +18,11 @@ from shapely.geometry import Polygon
 
 from ..common.units import FloatArray
 from ..site.site import Building, Site, Trees
-from . import figures
+from . import canvas
 from .data import Track
-from .export import safe_name, write_file
+from .export import write_file
 from .html import environment
+from .names import safe_name
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -88,12 +89,12 @@ def plan(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ())
     limits = view_limits(site, track, paths)
     width, height = np.ptp(limits[:2], axis=1)
     shape = float(np.clip(width / height, 0.45, 2.2))
-    fig = figures.figure((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
+    fig = canvas.figure((7.0 * min(shape, 1.0) + 2.4, 7.0 / max(shape, 1.0) + 0.6))
     ax = fig.subplots()
-    figures.draw_site(ax, site)
+    canvas.draw_site(ax, site)
     if track is not None and len(track.time):
         ax.plot(
-            *figures.thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.3, label="flight", zorder=4
+            *canvas.thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.3, label="flight", zorder=4
         )
     seen: set[int] = set()
     for path in paths:
@@ -127,7 +128,7 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
     limits = view_limits(site, track, paths)
     width, height, up = np.ptp(limits, axis=1)
     stretch = float(np.clip(round(0.12 * max(width, height) / up), 1, 8))
-    fig = figures.figure((9.2, 6.2))
+    fig = canvas.figure((9.2, 6.2))
     ax: Any = fig.add_subplot(projection="3d", computed_zorder=False)
     invented = " (illustrative)" if site.illustrative else ""
     _solid_ground(ax, site, invented)
@@ -135,7 +136,7 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
     _solid_trees(ax, site.trees, invented)
     for number, tower in enumerate(site.towers.values()):
         ax.plot(
-            [tower.east_m] * 2, [tower.north_m] * 2, [tower.ground_m, tower.position_m[2]], color=figures.TOWER,
+            [tower.east_m] * 2, [tower.north_m] * 2, [tower.ground_m, tower.position_m[2]], color=canvas.TOWER,
             linewidth=2.2, zorder=5, label="tower" if number == 0 else None,
         )  # fmt: skip
         halo = [patheffects.withStroke(linewidth=2.5, foreground="white")]
@@ -180,7 +181,7 @@ def _solid_ground(ax: Any, site: Site, invented: str) -> None:
     flat = [_flat(outline(forest.area), 0.0) for forest in site.forests]
     if flat:
         areas = Poly3DCollection(
-            flat, facecolor=figures.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
+            flat, facecolor=canvas.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
         )
         # matplotlib 3.11 would scale by corners that polygons of unlike length do not have; the limits are set anyway
         ax.add_collection3d(areas, autolim=False)
@@ -234,7 +235,7 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
 
     if not len(trees):
         return
-    pick = figures.spread_out(len(trees), TREES_IN_PICTURE)
+    pick = canvas.spread_out(len(trees), TREES_IN_PICTURE)
     east, north, ground = trees.east_m[pick], trees.north_m[pick], trees.ground_m[pick]
     top, base, half = ground + trees.height_m[pick], ground + trees.crown_base_m[pick], trees.crown_diameter_m[pick] / 2
     corners = [(east - half, north, base), (east + half, north, base), (east, north, top)]
@@ -253,7 +254,7 @@ def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
     def listed(points: Any) -> Any:
         return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
 
-    trees, pick = site.trees, figures.spread_out(len(site.trees), TREES_IN_PAGE)
+    trees, pick = site.trees, canvas.spread_out(len(site.trees), TREES_IN_PAGE)
     flight: list[Any] = []
     if track is not None and len(track.time):
         line = np.stack([track.east_m, track.north_m, track.up_m], axis=1)[:: max(1, len(track.time) // FLIGHT_POINTS)]
@@ -309,7 +310,7 @@ def write_site_view(
     folder, stem = Path(folder), safe_name(site.name)
     written = [write_file(folder / f"{stem}.html", viewer(site, track, paths))]
     for name, draw in (("plan", plan), ("3d", solid)):
-        with figures.style():
-            svg, png = figures.save(draw(site, track, paths))
+        with canvas.style():
+            svg, png = canvas.save(draw(site, track, paths))
         written += [write_file(folder / f"{stem}_{name}.svg", svg), write_file(folder / f"{stem}_{name}.png", png)]
     return written

@@ -39,8 +39,10 @@ def signed(value: float) -> str:
 
 
 def _within(value: Interval | None, decimals: int = 1) -> str:
-    if value is None or not all(map(math.isfinite, value)):
+    if value is None:
         return ""
+    if not all(map(math.isfinite, value)):
+        return " (too few independent samples for an interval)"
     return f" (95 % interval {value[0]:.{decimals}f} to {value[1]:.{decimals}f})"
 
 

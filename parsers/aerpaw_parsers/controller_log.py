@@ -13,13 +13,11 @@ import numpy as np
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, _time, aadm_snr
+from . import _lines, _rows, _time
 
-_STAMP = rb"^\[(" + _time.TIME + rb")\] "
-_VALUE = re.compile(_STAMP + rb"(\d{1,2}):(" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
-_BLOCK = re.compile(
-    rb"^\[" + _time.TIME + rb"\] [^\n]{0,40}?\[Controller-->UAV\] (SNR|Download):[ \t]*\r?$", re.MULTILINE
-)
+_STAMP = rb"^\[(?P<time>" + _time.TIME + rb")\] "
+_VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
+_BLOCK = re.compile(_STAMP + rb"[^\n]{0,40}?\[Controller-->UAV\] (?P<what>SNR|Download):[ \t]*\r?$", re.MULTILINE)
 _TORN = re.compile(_STAMP + rb"\d{1,2}:")
 
 
@@ -28,52 +26,19 @@ def sniff(head: bytes) -> bool:
     return head.startswith(b"[") and (b"[Controller-->UAV]" in head or b"[UAV-->Controller]" in head)
 
 
-def _reason(line: bytes) -> str | None:
-    return "an incomplete 'tower:value' line (torn line?)" if _TORN.match(line) else None
-
-
 def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """One SNR stream per tower number, named ``LW<n>``.
-
-    Raises
-    ------
-    UsageError
-        If no time zone is given.
-    """
-    lines = _lines.split(data)
-    heads, kinds = _lines.match(lines, _BLOCK)
-    rows, groups = _lines.match(lines, _VALUE)
-    column = _lines.columns(groups, 3)
-    # the block that a value line stands in: the last head before it
-    before = np.searchsorted(heads, rows) - 1
-    levels = np.array([kind[0] == b"SNR" for kind in kinds] + [False], dtype=bool)[before] & (before >= 0)
-    instants, valid = _time.texts_to_utc(column[0], options, needed_by="controller_log")
-    comments = rows[(before >= 0) & ~levels]
-    stray = rows[before < 0]
-    blank, rejected = _lines.remainder(lines, rows, _reason)
-    rejected += lines.reject_all(stray, "a 'tower:value' line outside any block")
-    rejected += lines.reject_all(rows[levels & ~valid], "the time stamp is no date of the calendar")
-    take = levels & valid
-    flag = _lines.flags(len(rows))
-    instants.flag(flag)
-    if lines.unterminated:
-        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
-    tower, value = _lines.numbers(column[1]), _lines.numbers(column[2])
-    streams = []
-    for number in np.unique(tower[take]).astype(int).tolist():
-        mine = take & (tower == number)
-        streams.append(
-            aadm_snr.level_stream(f"LW{number}", instants.time[mine], rows[mine] + 1, flag[mine], value[mine], options)
-        )
-    return ReadResult(
-        "controller_log",
-        tuple(streams),
-        len(lines),
-        int(take.sum()),
-        blank + len(comments),
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        instants.warnings,
-    )
+    """One SNR stream per tower number, named ``LW<n>``; UsageError if no time zone is given."""
+    heads, kinds = _lines.match(_lines.split(data), _BLOCK)
+    of_levels = np.array([False] + [kind[1] == b"SNR" for kind in kinds], dtype=bool)
+    rows = _rows.matched(
+        data, _VALUE, options, reader="controller_log",
+        reason=_rows.torn(_TORN, "an incomplete 'tower:value' line (torn line?)"),
+        # the block that a value line stands in is that of the last head before it
+        skip=lambda row: ~of_levels[np.searchsorted(heads, row)],
+    )  # fmt: skip
+    tower, level = rows.number("tower"), rows.number("snr")
+    numbers = np.unique(tower[np.isfinite(tower)]).astype(int).tolist()
+    return rows.result(_rows.snr(rows, f"LW{number}", level, tower == number) for number in numbers)
 
 
 READER = Reader(

@@ -12,14 +12,15 @@ import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _lines, _nemo, _table
+from . import _lines, _rows, _table
 
 _HEADER = b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
 _ROW = re.compile(rb"^(\d{1,12})," + _N + (rb"," + _CELL) * 7 + rb"\r?$", re.MULTILINE)
+NO_RANK = "no_rank_in_row"
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 
 
@@ -67,22 +68,24 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         If ``time_origin`` is no time, or is local and no time zone is given.
     """
     lines = _lines.split(data)
-    rows, column = _columns(lines)
-    fits = np.abs(column[1]) <= _nemo.MOST_MS
-    blank, rejected = _lines.remainder(lines, rows, _reason)
-    rejected += lines.reject_all(rows[~fits], "the relative time is beyond any flight")
-    values = {name: column[2 + i][fits] for i, name in enumerate(_COLUMNS)}
-    stream, warnings = _nemo.stream(lines, rows[fits], column[1][fits], values, options, "nemo_csv")
-    count = int(fits.sum())
-    return ReadResult(
-        "nemo_csv",
-        (stream,) if count else (),
-        len(lines),
-        count,
-        blank,
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        tuple(warnings) if count else (),
-    )
+    number, column = _columns(lines)
+    content = {"time": column[1], **dict(zip(_COLUMNS, column[2:], strict=True))}
+    rows = _rows.built(lines, number, content, options, reader="nemo_csv", reason=_reason, clock="relative_ms")
+    return rows.result([pdsch_rank(rows, dict(rows.columns))])
+
+
+def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None:
+    """Stream of the scheduled rank; ``values`` holds ``ri_raw`` and what stands beside it."""
+    raw = values["ri_raw"]
+    missing = np.isnan(raw)
+    odd = ~missing & ~((raw >= 1) & (raw <= 8))
+    rows.mark(missing, NO_RANK)
+    rows.mark(odd & (raw != 0), "rank_out_of_range")
+    rows.mark(odd & (raw == 0), "no_csi")
+    values["rank"] = np.where(missing | odd, np.nan, raw)
+    clock = "relative" if rows.relative else "utc"
+    name = rows.options.channel or "pdsch_rank"
+    return rows.stream("rank", name, values, ri_base="one", source="scheduled PDSCH rank", clock=clock)
 
 
 READER = Reader(

@@ -7,6 +7,7 @@ import pytest
 from scipy.signal import lfilter
 
 from aerpaw_cmp.compare.statistics import (
+    Memory,
     _correlation_of_residual,
     autocovariance,
     bootstrap_means,
@@ -37,16 +38,40 @@ def test_autocovariance_by_hand():
     np.testing.assert_allclose(autocovariance(x, 5), expected, atol=1e-14)
 
 
-def test_effective_sample_size_of_a_known_process():
+@pytest.mark.parametrize(("n", "correlation", "noise"), [
+    (200, 0.5, 0.0), (500, 0.9, 0.0), (1000, 0.98, 0.0), (3000, 0.99, 0.0), (20_000, 0.98, 0.0), (1000, 0.95, 0.25),
+])  # fmt: skip
+def test_effective_sample_size_of_a_known_process(n, correlation, noise):
+    """The median over flights, also of flights a few correlation times long (where the mean hides the memory)."""
     rng = np.random.default_rng(1)
-    for samples in (2, 10, 40):
-        keep = np.exp(-1.0 / samples)
-        expected = 20_000 * (1 - keep) / (1 + keep)
-        found = np.median([memory(shadowing(rng, 20_000, samples, 3.0)).n_effective for _ in range(7)])
-        assert found == pytest.approx(expected, rel=0.15)
-    white = memory(rng.normal(size=5000))
-    assert white.n_effective > 4000
-    assert white.block_length < 20
+    ratio = (1 + correlation) / (1 - correlation)
+    expected = n * (1 + noise) / (ratio + noise)
+    found = []
+    for _ in range(60 if n < 10_000 else 15):
+        x = shadowing(rng, n, -1.0 / np.log(correlation), 1.0) + np.sqrt(noise) * rng.normal(size=n)
+        found.append(memory(x).n_effective)
+    assert np.median(found) == pytest.approx(expected, rel=0.2)
+
+
+def test_white_noise_is_independent():
+    rng = np.random.default_rng(1)
+    found = [memory(rng.normal(size=500)) for _ in range(40)]
+    assert np.median([m.n_effective for m in found]) > 480
+    assert np.median([m.block_length for m in found]) < 20
+    assert sum(m.enough for m in found) == 40
+
+
+def test_no_interval_where_a_flight_is_two_correlation_times_long():
+    """n = 200 at a correlation of 0.98: two independent samples. A wrong interval in at most 5 % of all flights."""
+    rng = np.random.default_rng(8)
+    given = wrong = 0
+    for _ in range(200):
+        x = shadowing(rng, 200, -1 / np.log(0.98), 4.0)
+        low, high = error_intervals(x, np.zeros(200), replicates=100).offset_db
+        given += np.isfinite(low)
+        wrong += bool(low > 0 or high < 0)
+    assert given <= 20
+    assert wrong <= 14  # 3 % expected
 
 
 def test_blocks_grow_with_memory_and_stay_a_fifth_of_the_flight():
@@ -120,10 +145,11 @@ def test_interval_contains_the_estimate_and_respects_bounds():
 
 
 def test_share_interval_is_wilsons():
-    known = memory(np.random.default_rng(0).normal(size=5))  # below 8 samples: taken as independent
-    low, high = share_interval(0.0, 0.0, known)
+    low, high = share_interval(0.0, 0.0, Memory(n=40, block_length=1, n_effective=40.0, variance_factor=1.0))
     assert low == 0.0
-    assert high == pytest.approx(1.959964**2 / (5 + 1.959964**2), rel=1e-6)
+    assert high == pytest.approx(1.959964**2 / (40 + 1.959964**2), rel=1e-6)
+    few = Memory(n=40, block_length=8, n_effective=9.9, variance_factor=1.0)
+    assert np.isnan(share_interval(0.3, 0.1, few)).all()
 
 
 def test_correlation():

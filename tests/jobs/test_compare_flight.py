@@ -12,8 +12,10 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.track import body_rotation
 from aerpaw_cmp.jobs.compare_flight import (
     Compared,
     audit_replays,
@@ -171,7 +173,7 @@ def test_nan_on_both_sides_is_censored_not_averaged(tmp_path: Path) -> None:
 
 def test_an_optimum_at_the_edge_is_an_error_to_look_at(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
-    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 300)})
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + 160)})
     (one,) = compared_rss(path)
     assert one.panel.at_search_edge
     assert any("edge" in text for text in one.warnings)
@@ -478,3 +480,98 @@ def test_a_ratio_to_noise_is_not_taken_for_a_level_in_silence(tmp_path: Path) ->
     said = [text for text in data.warnings if "ratio to the noise" in text]
     assert len(said) == 1
     assert said[0].startswith("quality.csv: 'quality'")
+
+
+@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308"])
+def test_one_absurd_level_changes_no_number_and_is_told(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], absurd: str
+) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))})
+    lines = (tmp_path / "USRP1.csv").read_text().splitlines()
+    kept = [line for i, line in enumerate(lines) if i != 30]
+    (tmp_path / "USRP1.csv").write_text("\n".join(kept) + "\n")
+    want = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    lines[30] = lines[30].split(",")[0] + "," + absurd
+    (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
+    metrics = report_completes(path, capsys)
+    found = metrics["rss"]["LW1"]["USRP1"]
+    if absurd in ("inf", "-inf"):  # no number for the reader of plain tables: no signal
+        assert found["n_out_of_coverage"] == 1
+    else:
+        assert found["n_flagged"] == {"level_out_of_range": 1}
+        assert any("level_out_of_range" in text for text in metrics["warnings"])
+        assert found["n_out_of_coverage"] == 0
+    for key in ("offset_db", "rmse_db", "n", "at_search_edge"):
+        assert found[key] == pytest.approx(want[key]), key
+
+
+def test_exchanged_or_mirrored_angles_are_told_before_anything_else(tmp_path: Path) -> None:
+    at = np.arange(0, 60, 0.5)
+    path = flight(tmp_path, rss={"USRP1": (at, free_space_db(at))})
+    text = path.read_text()
+    path.write_text(text.replace("latitude_deg: lat, longitude_deg: lon", "latitude_deg: lon, longitude_deg: lat"))
+    with pytest.raises(InputError, match=r"no nearer than \d+ km to any tower.*latitude and longitude are exchanged"):
+        gathered(path)
+    path.write_text(text)
+    table = (tmp_path / "track.csv").read_text()
+    (tmp_path / "track.csv").write_text(table.replace(",-78.", ",78."))
+    with pytest.raises(InputError, match="the longitude lacks its sign"):
+        gathered(path)
+    (tmp_path / "track.csv").write_text(table.replace(",35.", ",36."))
+    with pytest.raises(InputError, match=r"no nearer than 1\d\d km to any tower.*another site"):
+        gathered(path)
+
+
+def rank_with_positions(folder: Path, *, rt: str, origin: str = ORIGIN) -> Path:
+    """A flight whose rank log carries positions of its own, beside telemetry with attitude."""
+    at = np.arange(1.0, 59.0)
+    path = flight(folder, rank=(at, np.where(at % 2, 1, 2)), rt=rt)
+    lon = LW1[1] + (at - 10) * 5 / 90_000.0
+    same = np.zeros(len(at))
+    write_csv(
+        folder / "ri.csv", "t,ri,lat,lon,alt", at, np.where(at % 2, 1.0, 2.0), same + LW1[0] + 5e-4, lon, same + 40.0
+    )
+    text = path.read_text().replace(
+        "columns: {time: t, ri_raw: ri}",
+        "columns: {time: t, ri_raw: ri, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}",
+    )
+    first, rest = text.split("{path: ri.csv")
+    path.write_text(first + "{path: ri.csv" + rest.replace(ORIGIN, origin))
+    return path
+
+
+def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> None:
+    found = {}
+    for mode in ("logged", "ignored"):
+        folder = tmp_path / mode
+        folder.mkdir()
+        data = gathered(rank_with_positions(folder, rt="").with_name("flight.yaml"))
+        rt = data.settings.rt.model_copy(update={"attitude": mode})
+        data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
+        assert data.rank[0].position_m is not None
+        (found[mode],) = replay_rank(data, str)
+    assert np.array_equal(found["logged"].poses.position_m, found["ignored"].poses.position_m), "of the log itself"
+    turned = found["logged"].poses.rotation
+    assert np.allclose(turned, body_rotation(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
+    assert np.allclose(found["ignored"].poses.rotation, np.eye(3))
+    assert not np.allclose(found["logged"].replay.h, found["ignored"].replay.h, rtol=1e-3, atol=0)
+
+
+def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
+    data = gathered(rank_with_positions(tmp_path, rt="", origin="2025-06-02T14:00:00Z"))
+    assert data.warnings[0].startswith("rt.attitude: logged has no effect on rank of LW1: the telemetry covers none")
+    data = gathered(rank_with_positions(tmp_path, rt=""))
+    assert not any("rt.attitude" in text for text in data.warnings)
+
+
+def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -> None:
+    path = rank_with_positions(tmp_path, rt="")
+    table = (tmp_path / "ri.csv").read_text().splitlines()
+    table[20] = ",".join(table[20].split(",")[:2]) + ",,,"
+    (tmp_path / "ri.csv").write_text("\n".join(table) + "\n")
+    data = gathered(path)
+    assert np.isnan(data.rank[0].position_m[19]).all()
+    (found,) = replay_rank(data, str)
+    assert found.valid.all()
+    assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)

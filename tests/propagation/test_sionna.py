@@ -12,7 +12,8 @@ from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparis
 from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.channel import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.crowns import Crowns
-from aerpaw_cmp.propagation.tracer import Scene, replay
+from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building, Trees
 
 pytestmark = pytest.mark.sionna

@@ -7,7 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.report import export
+from aerpaw_cmp.report import export, names
 from aerpaw_cmp.report.data import Engine
 
 
@@ -71,7 +71,7 @@ def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
     path = tmp_path / "rss.csv"
     export.rss_frame(report_data.rss).to_csv(path, index=False)
     back = pd.read_csv(path, parse_dates=["time_utc"])
-    assert [c for c in export.RSS_COLUMNS if c not in back.columns] == []
+    assert [c for c in names.RSS_COLUMNS if c not in back.columns] == []
     for panel in report_data.rss:
         rows = back[(back.tower == panel.tower) & (back.channel == panel.channel)]
         assert len(rows) == len(panel.time)
@@ -110,8 +110,8 @@ def test_rank_csv_keeps_no_csi_apart_from_no_path(report_data, tmp_path):
 
 
 def test_tables_without_rows_have_their_columns():
-    assert list(export.rss_frame([]).columns) == list(export.RSS_COLUMNS)
-    assert list(export.rank_frame([]).columns) == list(export.RANK_COLUMNS)
+    assert list(export.rss_frame([]).columns) == list(names.RSS_COLUMNS)
+    assert list(export.rank_frame([]).columns) == list(names.RANK_COLUMNS)
 
 
 def test_panels_with_different_baselines_share_one_table(report_data):
@@ -131,7 +131,7 @@ def test_panels_with_different_baselines_share_one_table(report_data):
     ],
 )
 def test_time_is_rounded_not_cut(stored, text):
-    assert export.iso_time([np.datetime64(stored, "ns")]).tolist() == [text]
+    assert names.iso_time([np.datetime64(stored, "ns")]).tolist() == [text]
 
 
 def test_no_engine_no_audit(report_data):

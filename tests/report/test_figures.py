@@ -12,13 +12,13 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from aerpaw_cmp.report import figures, html
+from aerpaw_cmp.report import canvas, figures, html, rss_figures, speed_figures
 from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, Track
 
 
 def drawn(data: ReportData):
     for plate in figures.plates(data):
-        with figures.style():
+        with canvas.style():
             fig = plate.draw()
         yield plate, fig
 
@@ -74,15 +74,15 @@ def long_panel(panel: RssPanel, times: int) -> RssPanel:
 def test_svg_stays_small_however_long_the_flight(report_data):
     panel = long_panel(report_data.rss[2], 8)
     data = dataclasses.replace(report_data, rss=(panel,))
-    with figures.style():
-        svg, _ = figures.save(figures.rss_over_time(data, panel))
+    with canvas.style():
+        svg, _ = canvas.save(rss_figures.rss_over_time(data, panel))
     assert len(panel.time) == 48_000
     assert len(svg) < 500_000
 
 
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
     plate = next(p for p in figures.plates(small_report) if p.name == "altitude")
-    one, two = figures.render(plate), figures.render(plate)
+    one, two = canvas.render(plate), canvas.render(plate)
     assert one.svg == two.svg
     fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.svg)
     assert all(f.startswith((b"#", b"data:")) for f in fetched)
@@ -92,7 +92,7 @@ def test_style_leaves_the_users_settings_alone(small_report):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    figures.render(figures.plates(small_report)[1])
+    canvas.render(figures.plates(small_report)[1])
     assert dict(matplotlib.rcParams) == before
 
 
@@ -189,14 +189,14 @@ def still(track: Track) -> Track:
 def test_odd_flights_are_drawn_without_a_warning(report_data, change):
     data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
     for _, fig in drawn(data):
-        with figures.style():
+        with canvas.style():
             fig.draw_without_rendering()  # lays out and draws every part; warnings are errors
 
 
 @given(arrays(bool, st.integers(0, 60)))
 def test_runs_cover_exactly_the_true_samples(mask):
     again = np.zeros(len(mask), dtype=bool)
-    spans = figures.runs(mask)
+    spans = canvas.runs(mask)
     for a, b in spans:
         assert not again[a : b + 1].any()
         again[a : b + 1] = True
@@ -208,7 +208,7 @@ def test_runs_cover_exactly_the_true_samples(mask):
 def test_thinning_keeps_extremes_order_and_size(n, limit, random):
     level = np.array([random.gauss(0, 1) for _ in range(n)])
     at = np.arange(n, dtype=float)
-    a, b = figures.thinned(at, level, limit)
+    a, b = canvas.thinned(at, level, limit)
     assert len(a) <= max(limit + 2, n if n <= limit else 0)
     assert (np.diff(a) >= 0).all()
     assert set(zip(a, b, strict=True)) <= set(zip(at, level, strict=True))
@@ -219,14 +219,14 @@ def test_thinning_keeps_extremes_order_and_size(n, limit, random):
 def test_thinning_keeps_a_gap_open():
     level = np.sin(np.arange(10_000.0))
     level[4000:6000] = np.nan
-    a, b = figures.thinned(np.arange(10_000.0), level, 500)
+    a, b = canvas.thinned(np.arange(10_000.0), level, 500)
     assert not np.isfinite(b[(a > 4050) & (a < 5950)]).any()
     assert np.isnan(b).any()
 
 
 def test_pareto_front_is_not_beaten():
     seconds, error = [3.0, 1.0, 2.0, 2.0, 5.0], [1.0, 5.0, 3.0, 4.0, np.nan]
-    assert figures.pareto_front(seconds, error) == [1, 2, 0]
+    assert speed_figures.pareto_front(seconds, error) == [1, 2, 0]
 
 
 def test_residual_sign_is_measured_minus_simulated(report_data):
@@ -236,15 +236,15 @@ def test_residual_sign_is_measured_minus_simulated(report_data):
 
 
 def test_grey_steps_of_the_ranks_are_apart():
-    grey = [np.dot(figures.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
+    grey = [np.dot(canvas.rank_colour(r)[:3], (0.299, 0.587, 0.114)) for r in (1, 2, 3, 4)]
     assert min(np.diff(grey)) > 0.12
 
 
 def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
     """``Figure.savefig`` draws once more before each file; leaving that out must not move anything."""
     plate = next(p for p in figures.plates(small_report) if p.name == "trajectory")
-    with figures.style():
-        ours = figures.save(plate.draw())[1]
+    with canvas.style():
+        ours = canvas.save(plate.draw())[1]
         theirs = io.BytesIO()
         plate.draw().savefig(theirs, format="png")
     one, two = (np.asarray(Image.open(io.BytesIO(png))) for png in (ours, theirs.getvalue()))
@@ -280,12 +280,12 @@ def test_relative_times_count_from_the_first_sample(small_report):
 
 
 def test_samples_are_told_by_size_and_no_labels_collide(report_data):
-    with figures.style():
-        fig = figures.pareto(report_data.speed)
+    with canvas.style():
+        fig = speed_figures.pareto(report_data.speed)
     left, right = fig.axes
     assert not left.texts
     assert not right.texts
-    sizes = {n: figures.marker_size(n) for n in (1_000, 10_000, 100_000, 1_000_000)}
+    sizes = {n: speed_figures.marker_size(n) for n in (1_000, 10_000, 100_000, 1_000_000)}
     assert (np.diff(list(sizes.values())) >= 1.5).all()
     drawn_sizes = {line.get_markersize() for line in left.lines if len(line.get_xdata()) == 1}
     assert set(sizes.values()) <= drawn_sizes
@@ -297,8 +297,8 @@ def test_no_empty_rank_plane_where_no_setting_changes_a_rank(report_data):
     same = tuple(
         dataclasses.replace(r, rank_disagreement=dict.fromkeys(r.rank_disagreement, 0.0)) for r in report_data.speed
     )
-    with figures.style():
-        fig = figures.pareto(same)
+    with canvas.style():
+        fig = speed_figures.pareto(same)
     assert len(fig.axes) == 1
     plate = next(p for p in figures.plates(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
     assert plate.caption.endswith("No setting changes the rank of a link.")
@@ -318,7 +318,7 @@ def test_captions_speak_of_what_is_drawn(report_data):
 
 def test_a_log_axis_says_plain_numbers(small_report):
     plate = next(p for p in figures.plates(small_report) if p.name.startswith("rank_k_"))
-    with figures.style():
+    with canvas.style():
         fig = plate.draw()
         fig.draw_without_rendering()
     shown = [t.get_text() for t in fig.axes[0].get_xticklabels() if t.get_text()]
@@ -330,13 +330,13 @@ def test_both_antennas_are_shown_in_their_own_frames(small_report):
     panel = small_report.rss[0]
     n = len(panel.time)
     own = {"tower_elevation_deg": np.linspace(-70, 70, n)}
-    with figures.style():
-        (one, _) = figures.seen_from_antennas(dataclasses.replace(panel, geometry={**panel.geometry, **own})).axes
+    with canvas.style():
+        (one, _) = rss_figures.seen_from_antennas(dataclasses.replace(panel, geometry={**panel.geometry, **own})).axes
     drawn = one.collections[0].get_offsets()
     assert drawn[:, 1].min() < -60, "the elevation in the antenna's frame, not the one above the horizon"
     both = {**panel.geometry, **own, "uav_azimuth_deg": np.full(n, 12.0), "uav_elevation_deg": np.full(n, -8.0)}
-    with figures.style():
-        axes = figures.seen_from_antennas(dataclasses.replace(panel, geometry=both)).axes
+    with canvas.style():
+        axes = rss_figures.seen_from_antennas(dataclasses.replace(panel, geometry=both)).axes
     assert [ax.get_xlabel() for ax in axes[:2]] == [
         "Azimuth of the UAV, tower antenna frame [deg]",
         "Azimuth of the tower, UAV antenna frame [deg]",

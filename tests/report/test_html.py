@@ -12,8 +12,8 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import html, words
+from aerpaw_cmp.report.canvas import Picture
 from aerpaw_cmp.report.data import InputFile, ReportData
-from aerpaw_cmp.report.figures import Picture
 
 VOID = {"meta", "img", "br", "link", "input", "hr"}
 HOSTILE = "<script>alert(1)</script><img src=x onerror=alert(2)>\"'&{{ 7*7 }}"

@@ -7,8 +7,8 @@ import re
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import figures, maps_figures, maps_html
-from aerpaw_cmp.report.figures import Picture
+from aerpaw_cmp.report import canvas, maps_figures, maps_html
+from aerpaw_cmp.report.canvas import Picture
 from aerpaw_cmp.report.maps_data import MapsData
 
 
@@ -42,7 +42,7 @@ def test_files(few_maps, tmp_path):
 
 def test_every_map_figure_has_units_and_a_legend(few_maps):
     for plate in maps_figures.plates(few_maps):
-        with figures.style():
+        with canvas.style():
             fig = plate.draw()
         labels = [ax.get_xlabel() + ax.get_ylabel() for ax in fig.axes]
         assert any("[" in label or "Number" in label for label in labels), plate.name
@@ -53,7 +53,7 @@ def test_north_is_up_and_east_is_right(maps_data):
     """The one bright cell of a map must lie where its tower stands."""
     values = np.full((len(maps_data.north_m), len(maps_data.east_m)), -100.0)
     values[70, 0] = 0.0  # north-west corner
-    with figures.style():
+    with canvas.style():
         _, (ax,) = maps_figures.map_axes(maps_data, 1)
         image = maps_figures.draw_map(ax, maps_data, values)
     west, east, south, north = image.get_extent()
@@ -72,7 +72,7 @@ def _event(ax, east, north):
 
 def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
     maps = [m for m in maps_data.rss if m.antennas == "SISO"]
-    with figures.style():
+    with canvas.style():
         fig = maps_figures.cdfs(maps)
     lines = fig.axes[0].get_lines()
     for line, one in zip(lines, maps, strict=False):
@@ -81,7 +81,7 @@ def test_cdf_counts_positions_out_of_coverage_as_below(maps_data):
 
 
 def test_borders_only_where_towers_share_the_area(maps_data):
-    with figures.style():
+    with canvas.style():
         _, axes = maps_figures.map_axes(maps_data, 2)
         maps_figures.draw_map(axes[0], maps_data, maps_data.rss[0].rss_dbm, highlight="LW1")
         maps_figures.draw_map(axes[1], maps_data, maps_data.rss[0].rss_dbm)
@@ -135,4 +135,4 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
     maps_html.maps_page(empty, pictures(empty), [])
     dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
     for plate in maps_figures.plates(dataclasses.replace(empty, rss=(dark,))):
-        figures.render(plate)
+        canvas.render(plate)

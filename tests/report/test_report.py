@@ -5,12 +5,12 @@ import json
 import subprocess
 import sys
 
-from aerpaw_cmp.report import export
+from aerpaw_cmp.report import names, write
 
 
 def test_whole_report(small_report, tmp_path):
     figures = tmp_path / "figures"
-    files = export.write_report(small_report, tmp_path)
+    files = write.write_report(small_report, tmp_path)
     assert files[0] == tmp_path / "report.html"
     assert all(f.stat().st_size > 0 for f in files)
     assert json.loads((tmp_path / "metrics.json").read_text())["rss"]["LW4"]["USRP1"]["n"] == small_report.rss[0].n
@@ -21,8 +21,8 @@ def test_whole_report(small_report, tmp_path):
 
 def test_without_rss_the_tables_have_their_columns(small_report, tmp_path):
     bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), speed=(), track=None, waypoints=())
-    export.write_report(bare, tmp_path)
-    assert (tmp_path / "rss.csv").read_text() == ",".join(export.RSS_COLUMNS) + "\n"
+    write.write_report(bare, tmp_path)
+    assert (tmp_path / "rss.csv").read_text() == ",".join(names.RSS_COLUMNS) + "\n"
 
 
 def test_importing_the_room_draws_nothing():

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.report import figures, site_view
+from aerpaw_cmp.report import canvas, site_view
 from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
 
@@ -73,8 +73,8 @@ def test_limits_hold_everything(report_data, paths):
 def test_an_empty_site_can_be_shown(report_data):
     bare = Site("nothing", report_data.site.frame, {})
     for draw in (site_view.plan, site_view.solid):
-        with figures.style():
-            figures.save(draw(bare))
+        with canvas.style():
+            canvas.save(draw(bare))
     assert scene_of(site_view.viewer(bare))["trees"] == []
 
 
@@ -99,8 +99,8 @@ def test_ten_thousand_trees_keep_the_files_small(report_data):
     page = site_view.viewer(site)
     assert len(page) < 500_000
     assert f"10000 trees ({site_view.TREES_IN_PAGE} drawn)" in page
-    with figures.style():
-        svg, _ = figures.save(site_view.solid(site))
+    with canvas.style():
+        svg, _ = canvas.save(site_view.solid(site))
     assert len(svg) < 500_000
 
 
@@ -120,14 +120,14 @@ def test_holes_stay_empty_and_fences_are_drawn(report_data):
     assert scene["fences"][0][0] == [900.0, -900.0]
     assert site_view.view_limits(site, None)[0, 0] < -900
     for draw in (site_view.plan, site_view.solid):
-        with figures.style():
+        with canvas.style():
             labels = draw(site).axes[0].get_legend_handles_labels()[1]
         assert "geofence" in labels
 
 
 def test_the_pose_of_the_paths_is_marked(report_data, paths):
     for draw in (site_view.plan, site_view.solid):
-        with figures.style():
+        with canvas.style():
             labels = draw(report_data.site, report_data.track, paths).axes[0].get_legend_handles_labels()[1]
         assert "UAV, 40 m up" in labels
         assert {"line of sight", "one reflection", "flight", "tower"} <= set(labels)
@@ -135,7 +135,7 @@ def test_the_pose_of_the_paths_is_marked(report_data, paths):
 
 def test_crowns_on_the_plan_are_to_scale(report_data):
     trees = Trees(*(np.array([v]) for v in (5.0, 7.0, 0.0, 30.0, 14.0, 7.5, 0.4)))
-    with figures.style():
+    with canvas.style():
         ax = site_view.plan(dataclasses.replace(report_data.site, trees=trees)).axes[0]
     [crowns] = [c for c in ax.collections if type(c).__name__ == "EllipseCollection"]
     assert crowns.get_offsets().tolist() == [[5.0, 7.0]]
@@ -154,5 +154,5 @@ def test_the_picture_is_scaled_by_corners_that_exist(report_data, monkeypatch):
 
     shapes = (box(0, 0, 10, 10), Polygon([(50, 0), (80, 0), (90, 20), (70, 40), (50, 30)]))
     forests = tuple(Forest(f"f{n}", shape) for n, shape in enumerate(shapes))
-    with figures.style():
-        figures.save(site_view.solid(dataclasses.replace(report_data.site, forests=forests)))
+    with canvas.style():
+        canvas.save(site_view.solid(dataclasses.replace(report_data.site, forests=forests)))

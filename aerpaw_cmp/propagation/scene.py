@@ -1,0 +1,83 @@
+"""Geometry of a replay, and what decides its paths besides."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray
+from ..site.site import Site
+from .arrays import Link, Poses
+from .crowns import Crowns
+from .faces import inside_solids, site_faces
+from .paths import Faces, PathSet
+
+
+@dataclass(frozen=True, slots=True)
+class Settings:
+    """What decides the paths besides the scene."""
+
+    engine: str
+    max_depth: int = 2
+    samples: int = 1_000_000
+    batch: int = 50
+    variant: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Scene:
+    """Geometry of a replay.
+
+    Parameters
+    ----------
+    faces : Faces
+    sources_m : (towers, 3)
+    usable : (towers, faces) bool
+        Faces that reflect for each tower.
+    excluded : (towers, poses) bool
+        Links without a path: an end inside a building or under the ground.
+    """
+
+    faces: Faces
+    sources_m: FloatArray
+    usable: BoolArray
+    excluded: BoolArray
+
+    @classmethod
+    def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
+        """Scene of a site as the towers of a link see it."""
+        names = tuple(link.tower_arrays)
+        unknown = [name for name in names if name not in site.towers]
+        if unknown:
+            raise UsageError(
+                f"the site has no tower {unknown[0]!r}",
+                expected="one of " + ", ".join(site.towers),
+                cause="a typing error",
+            )
+        faces = site_faces(site, names)
+        towers = [site.towers[name] for name in names]
+        sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
+        ground = np.array([tower.ground_m for tower in towers])
+        is_ground = faces.solid < 0
+        usable = ~is_ground[None, :] | (faces.offset_m[None, :] == ground[:, None])
+        up = poses.position_m[:, 2]
+        # terrain is not traced: a pose below a tower's own plane but above the lowest ground is no buried pose
+        buried = up[None, :] < np.minimum(ground, 0.0)[:, None]
+        excluded = buried | inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
+        return cls(faces, sources, usable, excluded)
+
+    def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
+        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths."""
+        paths, faces = crowns.bounces(
+            self.faces,
+            self.sources_m,
+            poses.position_m,
+            max_depth=max_depth,
+            usable=self.usable,
+            excluded=self.excluded,
+            dem=site.dem,
+        )
+        more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
+        return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths

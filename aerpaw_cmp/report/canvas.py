@@ -1,0 +1,496 @@
+"""Figures of a report: finished arrays in, matplotlib figures out.
+
+No pyplot and no global state: every figure is a :class:`matplotlib.figure.Figure` of its own, drawn inside
+:func:`style`. Colours are told apart in grey as well, by lightness, line style, marker or hatch. Clouds of points
+are rasterised and long lines thinned (extremes kept), so that an SVG stays small however long the flight.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.units import AnyArray, BoolArray, FloatArray
+from ..logs.records import has_wall_clock
+from ..site.site import Site, Trees
+from .data import RankPanel, ReportData, RssPanel
+from .export import write_file
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.axis import Axis
+    from matplotlib.figure import Figure
+
+
+# Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
+MEASURED = "#56B4E9"
+SIMULATED = "#111111"
+BASELINE = {"free_space": ("#D55E00", (0, (5, 2))), "two_ray": ("#009E73", (0, (1, 1.5)))}
+OTHER_BASELINES = (("#CC79A7", (0, (6, 2, 1, 2))), ("#0072B2", (0, (8, 3))))
+OUT_OF_COVERAGE = "#BBBBBB"
+TOWER = "#C1121F"
+BUILDING = "#8A8A8A"
+FOREST = "#B9D8B0"
+WAYPOINT = "#555555"
+
+BASELINE_TITLE = {"free_space": "free space", "two_ray": "two-ray ground"}
+RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
+RANK_HATCH = {1: "", 2: "///", 3: "xx", 4: ".."}
+
+POINTS_PER_LINE = 3000
+RASTER_DPI = 130
+WIDE = (9.2, 4.2)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plate:
+    """A figure that can be drawn, with the words that go with it."""
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    alt: str
+    draw: Callable[[], Figure]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Picture:
+    """A drawn plate."""
+
+    name: str
+    section: str
+    title: str
+    caption: str
+    alt: str
+    svg: bytes
+    png: bytes
+
+
+@contextmanager
+def style() -> Iterator[None]:
+    """The look of every figure, without touching the user's settings."""
+    import matplotlib
+
+    settings = {
+        "font.family": "sans-serif",
+        "font.sans-serif": ["DejaVu Sans"],
+        "font.size": 9.0,
+        "axes.titlesize": 10.0,
+        "axes.titleweight": "bold",
+        "axes.titlelocation": "left",
+        "axes.spines.top": False,
+        "axes.spines.right": False,
+        "axes.axisbelow": True,
+        "axes.grid": True,
+        "grid.color": "#E2E2E2",
+        "grid.linewidth": 0.6,
+        "legend.frameon": True,
+        "legend.framealpha": 0.9,
+        "legend.edgecolor": "#DDDDDD",
+        "legend.fontsize": 8.0,
+        "hatch.linewidth": 0.5,
+        "figure.dpi": 100.0,
+        "savefig.dpi": RASTER_DPI,
+        "svg.fonttype": "path",  # the page must look the same where the font is missing
+        "svg.hashsalt": "aerpaw-cmp",  # same numbers, same bytes
+        "path.simplify": True,
+        "figure.autolayout": False,  # the layout is set here, and is switched off again when it is done
+        "figure.constrained_layout.use": False,
+    }
+    with matplotlib.rc_context(settings):
+        yield
+
+
+def figure(size: tuple[float, float] = WIDE) -> Figure:
+    """An empty figure [inch] whose parts do not overlap."""
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=size, layout="constrained")
+
+
+def save(fig: Figure) -> tuple[bytes, bytes]:
+    """The figure as SVG and PNG."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
+    svg, png = io.BytesIO(), io.BytesIO()
+    fig.set_dpi(RASTER_DPI)
+    FigureCanvasAgg(fig).print_png(png, pil_kwargs={"compress_level": 2})
+    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
+    FigureCanvasSVG(fig).print_svg(svg, metadata={"Date": None})
+    return svg.getvalue(), png.getvalue()
+
+
+def render(plate: Plate) -> Picture:
+    """Draw a plate and forget the figure."""
+    with style():
+        svg, png = save(plate.draw())
+    return Picture(
+        name=plate.name,
+        section=plate.section,
+        title=plate.title,
+        caption=plate.caption,
+        alt=plate.alt,
+        svg=svg,
+        png=png,
+    )
+
+
+def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], list[Path]]:
+    """Draw plates one after the other and write each as SVG and PNG; gives the pictures and the files."""
+    drawn, written = [], []
+    for plate in plates:
+        picture = render(plate)
+        drawn.append(picture)
+        written.append(write_file(folder / f"{picture.name}.svg", picture.svg))
+        written.append(write_file(folder / f"{picture.name}.png", picture.png))
+    return drawn, written
+
+
+# --- parts --------------------------------------------------------------------------------------
+
+
+def seconds_since(time: AnyArray, start: np.datetime64) -> FloatArray:
+    """Instants as seconds after ``start``."""
+    return np.asarray((np.asarray(time) - start) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def start_of(data: ReportData) -> np.datetime64:
+    """The instant that is zero on every time axis: the first of the track, or of any panel."""
+    times = [] if data.track is None or not len(data.track.time) else [data.track.time[0]]
+    panels: list[RssPanel | RankPanel] = [*data.rss, *data.rank]
+    times += [panel.time[0] for panel in panels if len(panel.time)]
+    if not times:
+        return np.datetime64(0, "ns")
+    return times[0] if data.track is not None and len(data.track.time) else min(times)
+
+
+def time_label(start: np.datetime64) -> str:
+    """Label of a time axis.
+
+    Examples
+    --------
+    >>> time_label(np.datetime64("2025-06-01T14:00:00.25")), time_label(np.datetime64("1970-01-01T00:02:29"))
+    ('Time after 2025-06-01 14:00:00 UTC [s]', 'Time after the first sample [s]')
+    """
+    if not has_wall_clock(start):
+        return "Time after the first sample [s]"
+    return f"Time after {str(start)[:19].replace('T', ' ')} UTC [s]"
+
+
+def count(n: int) -> str:
+    """A number of samples, thousands set apart.
+
+    Examples
+    --------
+    >>> count(3172) == "3\N{NARROW NO-BREAK SPACE}172", count(40)
+    (True, '40')
+    """
+    return f"{n:,}".replace(",", "\N{NARROW NO-BREAK SPACE}")
+
+
+def plain_ticks(axis: Axis) -> None:
+    """Decades of a logarithmic axis as plain numbers (0.01, 1, 1000): read at a glance, and drawn faster."""
+    from matplotlib.ticker import FuncFormatter, NullFormatter
+
+    axis.set_major_formatter(FuncFormatter(lambda value, _at: f"{value:.10g}".replace("-", "\N{MINUS SIGN}")))
+    axis.set_minor_formatter(NullFormatter())
+
+
+def thinned(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
+    """A line with at most about ``limit`` points that looks the same: both extremes of each stretch are kept.
+
+    Parameters
+    ----------
+    east, north : (n,)
+        Abscissa and ordinate; NaN in the ordinate breaks the line and is kept as a break.
+
+    Examples
+    --------
+    >>> a, b = thinned(np.arange(100000.0), np.sin(np.arange(100000.0)))
+    >>> len(a) <= 3002, bool(b.max() > 0.999999)
+    (True, True)
+    """
+    n = len(east)
+    if n <= limit:
+        return east, north
+    per = -(-2 * n // limit)
+    buckets = -(-n // per)
+    padded = np.full(buckets * per, np.nan)
+    padded[:n] = north
+    table = padded.reshape(buckets, per)
+    gone = np.isnan(table)
+    low = np.where(gone, np.inf, table).argmin(axis=1)
+    high = np.where(gone, -np.inf, table).argmax(axis=1)
+    base = np.arange(buckets) * per
+    index = np.minimum(np.sort(np.stack([base + low, base + high], axis=1), axis=1).ravel(), n - 1)
+    return east[index], north[index]
+
+
+def spread_out(count: int, most: int) -> AnyArray:
+    """At most ``most`` indices of ``count``, evenly spread, both ends included.
+
+    Examples
+    --------
+    >>> spread_out(9, 3).tolist(), spread_out(2, 5).tolist(), spread_out(0, 3).tolist()
+    ([0, 4, 8], [0, 1], [])
+    """
+    return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)
+
+
+def runs(mask: BoolArray) -> list[tuple[int, int]]:
+    """Stretches of True as (first, last) indices, both inside.
+
+    Examples
+    --------
+    >>> runs(np.array([True, False, True, True]))
+    [(0, 0), (2, 3)]
+    """
+    edges = np.diff(np.concatenate([[0], np.asarray(mask, dtype=np.int8), [0]]))
+    return list(zip(np.flatnonzero(edges == 1).tolist(), (np.flatnonzero(edges == -1) - 1).tolist(), strict=True))
+
+
+def lonely(level: FloatArray) -> BoolArray:
+    """Finite samples whose neighbours are both missing.
+
+    Examples
+    --------
+    >>> lonely(np.array([1.0, np.nan, 2.0, 3.0, np.nan])).tolist()
+    [True, False, False, False, False]
+    """
+    good = np.isfinite(level)
+    beside = np.zeros(len(good), dtype=bool)
+    beside[1:] |= good[:-1]
+    beside[:-1] |= good[1:]
+    return np.asarray(good & ~beside)
+
+
+def draw_out_of_coverage(
+    ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
+) -> None:
+    """Hatched spans, marked Z where there is room, over a share of the height of the axes."""
+    if not mask.any():
+        return
+    step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
+    spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in runs(mask)]
+    bars = ax.broken_barh(
+        spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
+        hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
+    )  # fmt: skip
+    bars.set_rasterized(len(spans) > 300)
+    whole = max(float(seconds[-1] - seconds[0]), step)
+    for left, width in spans:
+        if width > 0.015 * whole and height == 1.0:
+            ax.text(
+                left + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
+                fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
+            )  # fmt: skip
+
+
+def draw_waypoints(ax: Axes, data: ReportData, start: np.datetime64, *, names: bool = True) -> None:
+    """Vertical lines at the named moments of the flight."""
+    for number, waypoint in enumerate(data.waypoints):
+        at = float((waypoint.time - start) / np.timedelta64(1, "s"))
+        ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label="waypoint" if number == 0 else None)
+        if names:
+            ax.annotate(
+                waypoint.label, (at, 1.0), xycoords=ax.get_xaxis_transform(), xytext=(0, 2),
+                textcoords="offset points", ha="center", va="bottom", fontsize=8, color=WAYPOINT,
+            )  # fmt: skip
+
+
+def legend_below(ax: Axes, columns: int = 4) -> None:
+    """A legend under the axes, where it hides no data."""
+    handles, labels = ax.get_legend_handles_labels()
+    if handles:
+        ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
+
+
+def pretty(name: str) -> str:
+    """A baseline's name in words."""
+    return BASELINE_TITLE.get(name, name.replace("_", " "))
+
+
+def baseline_style(name: str, number: int) -> tuple[str, Any]:
+    """Colour and line style of a baseline."""
+    return BASELINE.get(name, OTHER_BASELINES[number % len(OTHER_BASELINES)])
+
+
+def rank_colour(rank: int) -> Any:
+    """Colour of rank 1 to 4, from dark to light in even steps; black for the crosses of 0."""
+    from matplotlib import colormaps
+
+    return "black" if rank == 0 else colormaps["viridis"]((0.02, 0.38, 0.70, 1.0)[rank - 1])
+
+
+# --- site ---------------------------------------------------------------------------------------
+
+
+def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, names: bool = True) -> None:
+    """Forests, trees, buildings, geofences and towers on a plan (east, north) [m]."""
+    from matplotlib.patches import PathPatch
+    from matplotlib.path import Path as Outline
+
+    def patch(polygon: Any, **options: Any) -> None:
+        rings = [polygon.exterior, *polygon.interiors]
+        outline = Outline.make_compound_path(*(Outline(np.asarray(r.coords)[:, :2], closed=True) for r in rings))
+        ax.add_patch(PathPatch(outline, **options))
+
+    invented = " (illustrative)" if site.illustrative else ""
+    for number, forest in enumerate(site.forests):
+        patch(
+            forest.area, facecolor=FOREST, edgecolor="#7FA873", hatch="..", linewidth=0.6, alpha=0.7, zorder=0.3,
+            label=f"forest{invented}" if number == 0 else None,
+        )  # fmt: skip
+    if len(site.trees):
+        _draw_crowns(ax, site.trees, f"tree{invented}")
+    for number, building in enumerate(site.buildings):
+        patch(
+            building.footprint, facecolor=BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
+            label=f"building{invented}" if number == 0 else None,
+        )  # fmt: skip
+    for number, fence in enumerate(site.geofences):
+        patch(
+            fence.area, facecolor="none", edgecolor="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=0.6,
+            label="geofence" if number == 0 else None,
+        )  # fmt: skip
+    chosen = [t for name, t in site.towers.items() if towers is None or name in towers]
+    for number, tower in enumerate(chosen):
+        ax.plot(
+            tower.east_m, tower.north_m, marker="^", markersize=9, color=TOWER, markeredgecolor="black",
+            linestyle="none", zorder=5, label="tower" if number == 0 else None,
+        )  # fmt: skip
+        if names:
+            ax.annotate(
+                tower.name, (tower.east_m, tower.north_m), xytext=(6, 4), textcoords="offset points", zorder=6,
+                fontsize=8, fontweight="bold", annotation_clip=True,
+                bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.75, "pad": 0.8},
+            )  # fmt: skip
+    plan_axes(ax)
+
+
+def _draw_crowns(ax: Axes, trees: Trees, label: str) -> None:
+    """Crowns to scale, each with a dot where the trunk stands."""
+    from matplotlib.collections import EllipseCollection
+
+    wide, places = trees.crown_diameter_m, np.column_stack([trees.east_m, trees.north_m])
+    crowns = EllipseCollection(
+        wide, wide, np.zeros(len(trees)), units="xy", offsets=places, offset_transform=ax.transData,
+        facecolor="#5E8C4F", alpha=0.45, linewidth=0, zorder=0.4,
+    )  # fmt: skip
+    crowns.set_rasterized(True)
+    ax.add_collection(crowns, autolim=False)
+    ax.scatter(trees.east_m, trees.north_m, s=1.5, color="#2F5A25", linewidths=0, rasterized=True, zorder=0.45)
+    ax.plot([], [], marker="o", markersize=6, color="#5E8C4F", alpha=0.6, linestyle="none", label=label)
+
+
+def plan_axes(ax: Axes) -> None:
+    """Labels and equal scale of a plan."""
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_xlabel("East of the site origin [m]")
+    ax.set_ylabel("North of the site origin [m]")
+
+
+def frame_around(
+    ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, least_m: float = 60.0, shape: float = 1.0
+) -> None:
+    """Limits of a plan around points, with a margin and a least extent [m]; ``shape`` is width over height."""
+    good = np.isfinite(east) & np.isfinite(north)
+    if not good.any():
+        return
+    east, north = east[good], north[good]
+    width = max(float(np.ptp(east)) * (1 + 2 * margin), least_m)
+    height = max(float(np.ptp(north)) * (1 + 2 * margin), least_m)
+    width, height = max(width, height * shape), max(height, width / shape)
+    middle_east, middle_north = (east.min() + east.max()) / 2, (north.min() + north.max()) / 2
+    ax.set_xlim(middle_east - width / 2, middle_east + width / 2)
+    ax.set_ylim(middle_north - height / 2, middle_north + height / 2)
+
+
+def plan_shape(east: FloatArray, north: FloatArray) -> float:
+    """Width over height of the area that points cover, kept between 0.8 and 2."""
+    good = np.isfinite(east) & np.isfinite(north)
+    if not good.any():
+        return 1.0
+    return float(np.clip((np.ptp(east[good]) + 60.0) / (np.ptp(north[good]) + 60.0), 0.8, 2.0))
+
+
+def beyond(values: FloatArray, low: float, high: float) -> str:
+    """Ends of a colour scale from ``low`` to ``high`` that values pass: its colours mean "or more" there.
+
+    Examples
+    --------
+    >>> beyond(np.array([1.0, 9.0]), 0.0, 5.0), beyond(np.array([1.0, np.nan]), 0.0, 5.0)
+    ('max', 'neither')
+    """
+    under, over = bool(np.nanmin(values, initial=np.inf) < low), bool(np.nanmax(values, initial=-np.inf) > high)
+    return {(True, True): "both", (True, False): "min", (False, True): "max"}.get((under, over), "neither")
+
+
+def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> Any:
+    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond."""
+    bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
+    if bar.solids is not None:
+        bar.solids.set_rasterized(True)
+        bar.solids.set_edgecolor("face")
+    return bar
+
+
+def used_towers(data: ReportData) -> list[str]:
+    """Towers that a panel of the report names, or all."""
+    panels: list[RssPanel | RankPanel] = [*data.rss, *data.rank]
+    used = dict.fromkeys(panel.tower for panel in panels)
+    return [name for name in used if name in data.site.towers] or list(data.site.towers)
+
+
+def thinned_plan(east: FloatArray, north: FloatArray, limit: int = POINTS_PER_LINE) -> tuple[FloatArray, FloatArray]:
+    """Every so many points of a plan line: shape matters there, not extremes."""
+    step = max(1, -(-len(east) // limit))
+    return east[::step], north[::step]
+
+
+def only(ax: Axes, labels: Sequence[str]) -> tuple[list[Any], list[str]]:
+    """Handles and labels of the named legend entries."""
+    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t in labels]
+    return [h for h, _ in pairs], [t for _, t in pairs]
+
+
+def signed(value: float) -> str:
+    """A number with its sign set off: ``+ 52.1``.
+
+    Examples
+    --------
+    >>> signed(52.13), signed(-4.0)
+    ('+ 52.1', '− 4.0')
+    """
+    if not np.isfinite(value):
+        return "(no offset) 0"
+    return f"{'−' if value < 0 else '+'} {abs(value):.1f}"
+
+
+def robust_limits(ax: Axes, levels: Sequence[FloatArray], around: float | None = None) -> None:
+    """Ordinate limits that a few two-ray nulls cannot stretch: the 0.2 to 99.8 % range and a margin."""
+    values = np.concatenate([level[np.isfinite(level)] for level in levels])
+    if not len(values):
+        ax.set_ylim(-1.0, 1.0)
+        return
+    low, high = np.percentile(values, [0.2, 99.8])
+    if around is not None:
+        reach = max(abs(low - around), abs(high - around), 1.0)
+        low, high = around - reach, around + reach
+    margin = max(0.08 * (high - low), 0.5)
+    ax.set_ylim(low - margin, high + margin)
+
+
+def first_labels(ax: Axes, count: int) -> tuple[list[Any], list[str]]:
+    """Legend entries but the waypoints."""
+    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t != "waypoint"][:count]
+    return [h for h, _ in pairs], [t for _, t in pairs]

@@ -1,0 +1,255 @@
+"""Figures of the rank: maps, histograms, time, confusion, agreement."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..site.site import Site
+from .canvas import (
+    RANK_MARKER,
+    SIMULATED,
+    TOWER,
+    WAYPOINT,
+    colour_bar,
+    count,
+    draw_out_of_coverage,
+    draw_site,
+    draw_waypoints,
+    figure,
+    first_labels,
+    frame_around,
+    legend_below,
+    plain_ticks,
+    plan_shape,
+    rank_colour,
+    seconds_since,
+    start_of,
+    time_label,
+)
+from .data import RANKS, Histogram, RankAtK, RankPanel, ReportData
+from .names import k_key
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+# --- rank ---------------------------------------------------------------------------------------
+
+
+def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
+    """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out."""
+    draw_site(ax, site)
+    for value in (0, *RANKS):
+        at = rank == value
+        number = int(at.sum())
+        if not number:
+            continue
+        look: dict[str, Any] = {"color": "black", "linewidths": 0.8}
+        if value:
+            look = {"facecolor": rank_colour(value), "edgecolors": "#222222", "linewidths": 0.25}
+        ax.scatter(
+            east[at], north[at], s=14, marker=RANK_MARKER[value], rasterized=True, **look,
+            label=f"{'Z: no path' if value == 0 else f'rank {value}'} ({count(number)})",
+            zorder=3.0 + 1.0 / number,  # the rarer a rank, the higher it lies: a few points must not vanish under many
+        )  # fmt: skip
+    ax.set_title(title)
+    pairs = [(h, t) for h, t in zip(*ax.get_legend_handles_labels(), strict=True) if t.startswith(("rank", "Z"))]
+    if pairs:
+        handles, labels = zip(*pairs, strict=True)
+        ax.legend(
+            handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.13), ncols=3, markerscale=1.6,
+            columnspacing=1.0,
+        )  # fmt: skip
+
+
+def rank_maps(data: ReportData, panel: RankPanel) -> Figure:
+    """Measured rank and the rank of every K along the flight."""
+    maps = [("Measured (reported RI)", panel.measured)]
+    maps += [(f"Ray tracing, K = {k_key(at.k)}", at.rank.astype(float)) for at in panel.simulated]
+    columns = 2 if len(maps) > 1 else 1
+    rows = -(-len(maps) // columns)
+    shape = plan_shape(panel.east_m, panel.north_m)
+    fig = figure((9.2, rows * (3.9 / shape + 1.1)))
+    axes = fig.subplots(rows, columns, squeeze=False)
+    for ax, (title, rank) in zip(axes.ravel(), maps, strict=False):
+        rank_map(ax, data.site, panel.east_m, panel.north_m, rank, title)
+        frame_around(ax, panel.east_m, panel.north_m, shape=shape)
+    for ax in axes.ravel()[len(maps) :]:
+        ax.set_visible(False)
+    return fig
+
+
+def rank_histograms(panel: RankPanel) -> Figure:
+    """Shares of rank 1 to 4, measured beside every K, with intervals where known."""
+    fig = figure((9.2, 3.4))
+    ax = fig.subplots()
+    reported = int(np.isfinite(panel.measured).sum())
+    series: list[tuple[str, Histogram]] = [(f"measured ({count(reported)} samples)", panel.histogram)]
+    series += [(at_label(at), at.histogram) for at in panel.simulated]
+    width = 0.8 / len(series)
+    from matplotlib import colormaps
+
+    for number, (label, histogram) in enumerate(series):
+        at = np.array(RANKS) + (number - (len(series) - 1) / 2) * width
+        shade = SIMULATED if number == 0 else colormaps["cividis"](0.25 + 0.75 * number / max(len(series) - 1, 1))
+        share = np.nan_to_num(histogram.share)
+        ax.bar(
+            at, 100 * share, width * 0.92, color=shade, edgecolor="black", linewidth=0.6, label=label,
+            hatch=("", "///", "xxx", "...", "---", "\\\\\\")[number % 6],
+        )  # fmt: skip
+        if histogram.low is not None and histogram.high is not None:
+            spread = 100 * np.stack([share - histogram.low, histogram.high - share]).clip(min=0)
+            ax.errorbar(at, 100 * share, spread, fmt="none", ecolor="#D55E00", elinewidth=1.3, capsize=2.5)
+    ax.set_xticks(RANKS, [f"{r}" for r in RANKS])
+    ax.set_xlabel("Channel rank")
+    ax.set_ylabel("Share of the samples in coverage [%]")
+    ax.grid(axis="x", visible=False)
+    legend_below(ax)
+    return fig
+
+
+def at_label(at: RankAtK) -> str:
+    """Legend entry of one K."""
+    distance = "" if not np.isfinite(at.total_variation) else f" (total variation {at.total_variation:.2f})"
+    return f"K = {k_key(at.k)}{distance}"
+
+
+def rank_over_time(data: ReportData, panel: RankPanel) -> Figure:
+    """Measured rank and the rank of every K over time, one row each; SINR and singular values under them."""
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    rows = 1 + len(panel.simulated)
+    below = [1.3] * (panel.sinr_db is not None) + [2.2] * (panel.singular_ratio_db is not None)
+    ratios = [1.0] * rows + below
+    fig = figure((9.2, 1.1 * sum(ratios) + 0.5))
+    axes = fig.subplots(len(ratios), 1, sharex=True, height_ratios=ratios, squeeze=False)[:, 0]
+    draw_measured_rank(axes[0], seconds, panel)
+    for ax, at in zip(axes[1:], panel.simulated, strict=False):
+        rank = np.where(at.rank == 0, np.nan, at.rank)
+        ax.plot(
+            seconds, rank, linestyle="none", marker="|", markersize=7, rasterized=True, color=SIMULATED,
+            label=f"K = {k_key(at.k)}",
+        )  # fmt: skip
+        draw_out_of_coverage(ax, seconds, at.rank == 0, "Z: no path")
+    for number, ax in enumerate(axes[:rows]):
+        draw_waypoints(ax, data, start, names=number == 0)
+        ax.set_yticks(RANKS)
+        ax.set_ylim(0.5, 4.5)
+        ax.set_ylabel("Rank")
+        ax.legend(*first_labels(ax, 2), loc="center left", bbox_to_anchor=(1.0, 0.5))
+    if panel.sinr_db is not None:
+        axes[rows].plot(
+            seconds, panel.sinr_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
+            label="SINR",
+        )  # fmt: skip
+        axes[rows].set_ylabel("SINR [dB]")
+        axes[rows].legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+    if panel.singular_ratio_db is not None:
+        draw_singular_values(axes[-1], seconds, panel.singular_ratio_db, panel)
+    axes[-1].set_xlabel(time_label(start))
+    return fig
+
+
+def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
+    """Reported ranks as ticks; those held over from an earlier report are smaller and grey."""
+    held = np.zeros(len(seconds), dtype=bool) if panel.stale is None else panel.stale
+    for mask, label, colour, size in (
+        (~held, "measured", "#0072B2", 7),
+        (held, "measured, held over", "#9A9A9A", 4),
+    ):
+        if mask.any():
+            ax.plot(
+                seconds[mask], panel.measured[mask], linestyle="none", marker="|", markersize=size, color=colour,
+                rasterized=True, label=label,
+            )  # fmt: skip
+
+
+def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, panel: RankPanel) -> None:
+    """Singular values relative to the largest, with every threshold K."""
+    for column, (colour, marker) in enumerate((("#111111", "."), ("#0072B2", "."), ("#9AD0F0", "."))):
+        ax.plot(
+            seconds, values[:, column], linestyle="none", marker=marker, markersize=2, color=colour, rasterized=True,
+            label=rf"$\sigma_{column + 2}/\sigma_1$",
+        )  # fmt: skip
+    for number, at in enumerate(panel.simulated):
+        level = -20 * np.log10(at.k)
+        ax.axhline(
+            level, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)), label="thresholds 1/K" if not number else None
+        )
+        ax.annotate(
+            f"K = {k_key(at.k)}",
+            (0.004, level),
+            xycoords=ax.get_yaxis_transform(),
+            fontsize=7,
+            va="bottom",
+            color=TOWER,
+            bbox={"facecolor": "white", "edgecolor": "none", "alpha": 0.8, "pad": 0.6},
+            zorder=6,
+        )
+    lowest = [-20 * np.log10(at.k) for at in panel.simulated] + values[np.isfinite(values)].tolist()
+    ax.set_ylim(max(min(lowest, default=-20.0) - 6.0, -110.0), 2.0)  # below -110 dB lies nothing but rounding
+    ax.set_ylabel("Singular value\nover largest [dB]")
+    ax.legend(loc="center left", bbox_to_anchor=(1.0, 0.5), markerscale=4)
+
+
+def confusion(panel: RankPanel) -> Figure:
+    """Measured rank against simulated rank for every K, as counts and shares of the measured rank."""
+    with_table = [at for at in panel.simulated if at.confusion is not None]
+    fig = figure((9.2, 3.3))
+    axes = fig.subplots(1, len(with_table), sharey=True, squeeze=False)[0]
+    image = None
+    for ax, at in zip(axes, with_table, strict=True):
+        table = np.asarray(at.confusion, dtype=float)
+        total = table.sum(axis=1, keepdims=True)
+        share = 100 * np.divide(table, total, out=np.zeros_like(table), where=total > 0)
+        image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
+        ax.plot(RANKS, range(len(RANKS)), "s", markersize=25, markerfacecolor="none", markeredgecolor=TOWER,
+                markeredgewidth=1.2, clip_on=False, label="equal")  # fmt: skip
+        for row in range(table.shape[0]):
+            for column in range(table.shape[1]):
+                ax.text(
+                    column, row, f"{int(table[row, column])}", ha="center", va="center", fontsize=8,
+                    color="white" if total[row] > 0 and share[row, column] < 55 else "black",
+                )  # fmt: skip
+        ax.set_xticks(range(5), ["Z", "1", "2", "3", "4"])
+        ax.set_yticks(range(4), [f"{r}" for r in RANKS])
+        ax.set_xlabel("Simulated rank")
+        samples = count(int(table.sum()))
+        equal = f": equal in {100 * at.agreement:.0f} % of {samples}" if np.isfinite(at.agreement) else ""
+        ax.set_title(f"K = {k_key(at.k)}{equal}")
+        ax.grid(visible=False)
+    axes[0].set_ylabel("Measured rank")
+    if image is not None:
+        colour_bar(fig, image, list(axes), "Share of the measured rank [%]")
+    return fig
+
+
+def agreement_curve(panel: RankPanel) -> Figure:
+    """Agreement and total variation against continuous K."""
+    curve = panel.curve
+    fig = figure((9.2, 3.4))
+    ax = fig.subplots()
+    if curve is not None:
+        ax.semilogx(
+            curve.k, curve.agreement, color=SIMULATED, linewidth=1.3, label="agreement by pose (higher is better)"
+        )
+        ax.semilogx(
+            curve.k, curve.total_variation, color="#D55E00", linestyle=(0, (5, 2)), linewidth=1.3,
+            label="total variation of the histograms (lower is better)",
+        )  # fmt: skip
+    if panel.best_k_ci95 is not None and np.isfinite(panel.best_k_ci95).all():
+        ax.axvspan(*panel.best_k_ci95, color="#DDDDDD", hatch="///", alpha=0.6, label="95 % interval of the best K")
+    if np.isfinite(panel.best_k):
+        ax.axvline(panel.best_k, color=TOWER, linewidth=1.2, label=f"best K = {panel.best_k:.3g}")
+    for number, at in enumerate(panel.simulated):
+        ax.axvline(at.k, color=WAYPOINT, linestyle=":", linewidth=0.9, label="K of the report" if number == 0 else None)
+    ax.set_ylim(0.0, 1.02)
+    plain_ticks(ax.xaxis)
+    ax.set_xlabel("K (ratio of singular values)")
+    ax.set_ylabel("Agreement, total variation")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    return fig

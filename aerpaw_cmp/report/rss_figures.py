@@ -1,0 +1,378 @@
+"""Figures of the track and of received signal strength."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from .canvas import (
+    MEASURED,
+    SIMULATED,
+    TOWER,
+    WAYPOINT,
+    baseline_style,
+    beyond,
+    colour_bar,
+    count,
+    draw_out_of_coverage,
+    draw_site,
+    draw_waypoints,
+    figure,
+    frame_around,
+    lonely,
+    only,
+    pretty,
+    robust_limits,
+    seconds_since,
+    signed,
+    start_of,
+    thinned,
+    thinned_plan,
+    time_label,
+    used_towers,
+)
+from .data import GEOMETRY, ChannelPair, ReportData, RssPanel, Track
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+    from matplotlib.figure import Figure
+
+
+def trajectory(data: ReportData, track: Track) -> Figure:
+    """The flight on the plan of the whole site, and closer, coloured by height."""
+    fig = figure((9.2, 5.4))
+    whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
+    draw_site(whole, data.site)
+    draw_site(close, data.site)
+    whole.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
+    points = close.scatter(
+        track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,
+        label="flight (colour: height)",
+    )  # fmt: skip
+    towers = list(data.site.towers.values())
+    whole_east = np.concatenate([[t.east_m for t in towers], track.east_m[np.isfinite(track.east_m)]])
+    whole_north = np.concatenate([[t.north_m for t in towers], track.north_m[np.isfinite(track.north_m)]])
+    frame_around(whole, whole_east, whole_north, least_m=200.0, shape=0.75)
+    near = [data.site.towers[name] for name in used_towers(data)]
+    extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
+    centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
+    near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
+    frame_around(
+        close,
+        np.concatenate([track.east_m, [t.east_m for t in near]]),
+        np.concatenate([track.north_m, [t.north_m for t in near]]),
+    )
+    for waypoint in data.waypoints:
+        close.annotate(
+            waypoint.label, (waypoint.east_m, waypoint.north_m), fontsize=8, ha="center", va="center", zorder=7,
+            bbox={"boxstyle": "circle,pad=0.15", "facecolor": "white", "edgecolor": WAYPOINT},
+        )  # fmt: skip
+    colour_bar(fig, points, close, "Height above ground [m]")
+    whole.set_title("Whole site")
+    close.set_title("The flight")
+    whole.legend(loc="upper center", bbox_to_anchor=(0.5, -0.14), ncols=2)
+    close.legend(*only(close, ("flight (colour: height)",)), loc="upper center", bbox_to_anchor=(0.5, -0.12))
+    return fig
+
+
+def altitude(data: ReportData, track: Track) -> Figure:
+    """Height over time, with waypoints and the ground speed below."""
+    start = start_of(data)
+    seconds = seconds_since(track.time, start)
+    fig = figure((9.2, 2.9))
+    ax = fig.subplots()
+    ax.plot(*thinned(seconds, track.up_m), color=SIMULATED, linewidth=1.2, label="height of the UAV")
+    draw_waypoints(ax, data, start)
+    ax.set_xlabel(time_label(start))
+    ax.set_ylabel("Height above ground [m]")
+    ax.set_ylim(bottom=min(0.0, float(np.nanmin(track.up_m, initial=0.0))))
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=2)
+    return fig
+
+
+# --- RSS ----------------------------------------------------------------------------------------
+
+
+def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
+    """Calibrated measurement, simulation and baselines over time, and the residual under them."""
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    fig = figure((9.2, 5.6))
+    ax, below = fig.subplots(2, 1, sharex=True, height_ratios=(2.6, 1.0))
+    draw_out_of_coverage(ax, seconds, panel.simulated_out_of_coverage, "Z: no path in the simulation")
+    draw_out_of_coverage(
+        ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
+    )
+    ax.plot(
+        seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        label=f"measured {signed(panel.offset_db)} dB ({count(panel.n)} scored)", zorder=3.5,
+    )  # fmt: skip
+    for number, baseline in enumerate(panel.baselines):
+        colour, dashes = baseline_style(baseline.name, number)
+        # each model is drawn where its own best offset puts it against the same calibrated points
+        level = baseline.level_dbm + (panel.offset_db - baseline.offset_db)
+        ax.plot(
+            *thinned(seconds, level), color=colour, linestyle=dashes, linewidth=1.2,
+            zorder=2.5 if baseline.name == "two_ray" else 3.7,  # its dense fringes would hide the rest
+            label=f"{pretty(baseline.name)} (own offset)",
+        )  # fmt: skip
+    ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
+    alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
+    ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
+    draw_waypoints(ax, data, start)
+    robust_limits(ax, [panel.calibrated_db, panel.simulated_dbm])
+    ax.set_ylabel("RSS [dBm]")
+    ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
+    below.plot(
+        seconds, panel.residual_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
+        label="measured − simulated",
+    )  # fmt: skip
+    below.axhline(0.0, color=SIMULATED, linewidth=0.8)
+    if np.isfinite(panel.rmse_db):
+        for sign in (-1, 1):
+            below.axhline(
+                sign * panel.rmse_db, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 3)),
+                label=f"RMSE {panel.rmse_db:.1f} dB" if sign == 1 else None,
+            )  # fmt: skip
+    draw_waypoints(below, data, start, names=False)
+    robust_limits(below, [panel.residual_db], around=0.0)
+    below.set_ylabel("Residual [dB]")
+    below.set_xlabel(time_label(start))
+    handles, labels = only(below, ("measured − simulated", f"RMSE {panel.rmse_db:.1f} dB"))
+    below.legend(
+        handles, labels, loc="lower right", bbox_to_anchor=(1.0, 1.0), ncols=2, markerscale=4, borderaxespad=0.1
+    )  # fmt: skip
+    return fig
+
+
+def rss_diagnostics(panel: RssPanel) -> Figure:
+    """Measured against simulated, histogram of the residual, RMSE against offset, residual against distance."""
+    fig = figure((9.2, 3.1))
+    curve = panel.offset_curve is not None
+    axes = fig.subplots(1, 3 if curve else 2)
+    scatter_levels(axes[0], panel)
+    residual_histogram(axes[1], panel)
+    if panel.offset_curve is not None:
+        offset_curve(axes[2], panel)
+    return fig
+
+
+def scatter_levels(ax: Axes, panel: RssPanel) -> None:
+    """Calibrated measurement against simulation, with the line of equality."""
+    ax.plot(
+        panel.simulated_dbm, panel.calibrated_db, linestyle="none", marker=".", markersize=2, alpha=0.5,
+        color="#0072B2", rasterized=True, label=f"sample ({count(panel.n)})",
+    )  # fmt: skip
+    both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
+    if both.any():
+        values = np.concatenate([panel.simulated_dbm[both], panel.calibrated_db[both]])
+        low, high = np.percentile(values, [0.2, 99.8])
+        low, high = low - 2.0, high + 2.0
+        ax.plot([low, high], [low, high], color=SIMULATED, linewidth=1.0, label="equal")
+        ax.set_xlim(low, high)
+        ax.set_ylim(low, high)
+    ax.set_aspect("equal", adjustable="box")
+    ax.set_xlabel("Simulated RSS [dBm]")
+    ax.set_ylabel("Measured RSS after offset [dBm]")
+    ax.set_title("Sample by sample")
+    ax.legend(loc="upper left", markerscale=4)
+
+
+def residual_histogram(ax: Axes, panel: RssPanel) -> None:
+    """Histogram of the residual beside the normal curve of the same RMSE."""
+    residual = panel.residual_db[np.isfinite(panel.residual_db)]
+    if len(residual):
+        reach = max(float(np.percentile(np.abs(residual), 99.8)), 1.0)
+        bins = np.linspace(-reach, reach, 41)
+        ax.hist(
+            np.clip(residual, -reach, reach), bins.tolist(), density=True, color=MEASURED, edgecolor="white",
+            linewidth=0.3, label=f"residual ({count(len(residual))})",
+        )  # fmt: skip
+        if np.isfinite(panel.rmse_db) and panel.rmse_db > 0:
+            at = np.linspace(-reach, reach, 200)
+            height = np.exp(-0.5 * (at / panel.rmse_db) ** 2) / (panel.rmse_db * np.sqrt(2 * np.pi))
+            ax.plot(at, height, color=SIMULATED, linewidth=1.0, linestyle=(0, (4, 2)), label="normal, same RMSE")
+        ax.set_ylim(top=1.35 * ax.get_ylim()[1])  # room for the legend above the bars
+        ax.legend(loc="upper left", fontsize=7)
+    ax.set_xlabel("Measured − simulated [dB]")
+    ax.set_ylabel("Density [1/dB]")
+    ax.set_title("Residual")
+
+
+def offset_curve(ax: Axes, panel: RssPanel) -> None:
+    """RMSE against the candidate offset, with the chosen one and those of the baselines."""
+    curve = panel.offset_curve
+    if curve is None:
+        return
+    ax.plot(*thinned(curve.offset_db, curve.rmse_db), color=SIMULATED, linewidth=1.2, label="ray tracing")
+    span = (float(np.min(curve.offset_db)), float(np.max(curve.offset_db)))
+    if np.isfinite(panel.offset_db):
+        edge = " (edge of the search!)" if panel.at_search_edge else ""
+        ax.plot(
+            panel.offset_db, panel.rmse_db, marker="o", color=TOWER, linestyle="none",
+            label=f"chosen: {signed(panel.offset_db).replace(' ', '')} dB{edge}",
+        )  # fmt: skip
+    for number, baseline in enumerate(panel.baselines):
+        colour, dashes = baseline_style(baseline.name, number)
+        if np.isfinite(baseline.offset_db):
+            ax.axvline(baseline.offset_db, color=colour, linestyle=dashes, linewidth=1.0, label=pretty(baseline.name))
+    centres = [panel.offset_db, *(b.offset_db for b in panel.baselines)]
+    near = [c for c in centres if np.isfinite(c)]
+    if near:
+        # the shape near the minimum decides; the rest of the span is a straight line
+        low, high = min(near) - 10.0, max(near) + 10.0
+        shown = (curve.offset_db >= low) & (curve.offset_db <= high) & np.isfinite(curve.rmse_db)
+        ax.set_xlim(low, high)
+        ax.set_ylim(0.0, 1.5 * float(np.max(curve.rmse_db[shown], initial=1.0)))
+        for a, b in ((low, span[0]), (span[1], high)):
+            if a < b:
+                ax.axvspan(a, b, color="#DDDDDD", hatch="///", linewidth=0, label="not searched")
+    ax.set_xlabel(f"Offset added [dB]\n(searched {span[0]:.0f} to {span[1]:.0f})".replace("-", "−"))
+    ax.set_ylabel("RMSE [dB]")
+    ax.set_title("Is the offset well defined?")
+    ax.legend(loc="upper center", fontsize=7)
+
+
+def residual_against_geometry(panel: RssPanel) -> Figure:
+    """Residual against distance, angles, height, foliage, split by line of sight where known."""
+    names = [name for name in GEOMETRY if name in panel.geometry]
+    columns = -(-len(names) // 2) if len(names) > 3 else len(names)
+    rows = -(-len(names) // columns)
+    fig = figure((9.2, 2.6 * rows + 0.5))
+    grid = fig.add_gridspec(rows, columns)
+    axes: list[Axes] = []
+    for number, name in enumerate(names):
+        row, column = divmod(number, columns)
+        ax = fig.add_subplot(grid[row, column], sharey=axes[0] if axes else None)
+        axes.append(ax)
+        residual_cloud(ax, panel.geometry[name], panel)
+        ax.locator_params(axis="x", nbins=5)
+        ax.set_xlabel(GEOMETRY[name].replace(" in the frame of the tower antenna", ",\ntower antenna frame")
+                      .replace(" seen from the tower", "").replace(" above ground", "")
+                      .replace("deg clockwise from north", "deg from north"))  # fmt: skip
+        if column:
+            ax.tick_params(labelleft=False)
+        else:
+            ax.set_ylabel("Measured − simulated [dB]")
+    robust_limits(axes[0], [panel.residual_db], around=0.0)
+    legend = fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=5, markerscale=4)
+    handles: list[Any] = legend.legend_handles
+    for handle in handles:
+        if handle.get_linestyle() not in ("None", ""):  # markers on a line are not enlarged
+            handle.set_markersize(1.6)
+    return fig
+
+
+def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
+    """Residual against one quantity, with its running median and middle 80 %."""
+    residual = panel.residual_db
+    sight = panel.line_of_sight
+    groups = (
+        [("sample", np.isfinite(residual), "#56B4E9", ".")]
+        if sight is None
+        else [
+            ("line of sight", sight & np.isfinite(residual), "#56B4E9", "."),
+            ("no line of sight", ~sight & np.isfinite(residual), "#D55E00", "x"),
+        ]
+    )
+    for label, chosen, colour, marker in groups:
+        if chosen.any():
+            ax.plot(
+                quantity[chosen], residual[chosen], linestyle="none", marker=marker, markersize=2, alpha=0.5,
+                color=colour, rasterized=True, label=f"{label} ({count(int(chosen.sum()))})",
+            )  # fmt: skip
+    ax.axhline(0.0, color=SIMULATED, linewidth=0.8)
+    good = np.isfinite(quantity) & np.isfinite(residual)
+    if good.sum() < 40 or np.ptp(quantity[good]) == 0:
+        return
+    bins = int(np.clip(good.sum() // 40, 8, 20))
+    middle, low, median, high = running_levels(quantity[good], residual[good], bins).T
+    ax.plot(middle, median, color=SIMULATED, linewidth=1.3, marker="o", markersize=1.6, label="median")
+    ax.plot(middle, low, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)), label="10 % and 90 %")
+    ax.plot(middle, high, color=SIMULATED, linewidth=0.8, linestyle=(0, (3, 2)))
+
+
+def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, fewest: int = 8) -> FloatArray:
+    """Mean quantity and 10, 50, 90 % points of the values in bins of equal width (bins, 4).
+
+    NaN where a bin has fewer than ``fewest`` samples: no line is drawn over what was not flown.
+
+    Examples
+    --------
+    >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])
+    >>> levels = running_levels(at, at)
+    >>> np.flatnonzero(np.isfinite(levels[:, 2])).tolist(), levels[0].round(3).tolist()
+    ([0, 1, 18, 19], [9.5, 1.9, 9.5, 17.1])
+    """
+    edges = np.linspace(quantity.min(), quantity.max(), bins + 1)
+    which = np.clip(np.searchsorted(edges, quantity, side="right") - 1, 0, bins - 1)
+    levels = np.full((bins, 4), np.nan)
+    for number in range(bins):
+        inside = which == number
+        if inside.sum() >= fewest:
+            levels[number] = quantity[inside].mean(), *np.percentile(values[inside], [10, 50, 90])
+    return levels
+
+
+def seen_from_antennas(panel: RssPanel) -> Figure:
+    """Where the tower's antenna sees the UAV and the UAV's sees the tower, each in its own frame; colour: residual."""
+    seen = panel.geometry
+    views = [("UAV, tower antenna frame", seen["azimuth_deg"], seen.get("tower_elevation_deg", seen["elevation_deg"]))]
+    if {"uav_azimuth_deg", "uav_elevation_deg"} <= set(seen):
+        views.append(("tower, UAV antenna frame", seen["uav_azimuth_deg"], seen["uav_elevation_deg"]))
+    residual = panel.residual_db
+    known = residual[np.isfinite(residual)]
+    reach = float(np.percentile(np.abs(known), 98)) if known.size else 1.0
+    fig = figure((9.2, 3.6))
+    axes = fig.subplots(1, len(views), squeeze=False)[0]
+    for ax, (words, azimuth, elevation) in zip(axes, views, strict=True):
+        good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
+        if (~good).any():
+            ax.plot(
+                azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+                rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
+            )  # fmt: skip
+        points = ax.scatter(
+            azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach,
+            linewidths=0, rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
+        )  # fmt: skip
+        ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
+        ax.set_facecolor("#F4F4F4")
+        ax.set_xlim(-180, 180)
+        ax.set_xticks(range(-180, 181, 90))
+        ax.set_xlabel(f"Azimuth of the {words} [deg]")
+        ax.set_ylabel("Elevation in that frame [deg]")
+    colour_bar(fig, points, list(axes), "Measured − simulated [dB]", beyond(known, -reach, reach))
+    fig.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, markerscale=2)
+    return fig
+
+
+def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
+    """First minus second channel over time, measured and simulated, with the limit beyond which they part."""
+    start = start_of(data)
+    seconds = seconds_since(pair.time, start)
+    fig = figure((9.2, 3.2))
+    ax = fig.subplots()
+    ax.plot(
+        seconds, pair.difference_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
+    )  # fmt: skip
+    levels = [pair.difference_db]
+    if pair.simulated_difference_db is not None:
+        ax.plot(*thinned(seconds, pair.simulated_difference_db), color=SIMULATED, linewidth=0.9, label="ray tracing")
+        levels.append(pair.simulated_difference_db)
+    for sign in (-1, 1):
+        ax.axhline(
+            sign * pair.limit_db, color=TOWER, linewidth=0.9, linestyle=(0, (5, 2)),
+            label=f"{pair.limit_db:g} dB apart" if sign == 1 else None,
+        )  # fmt: skip
+    draw_waypoints(ax, data, start)
+    robust_limits(ax, levels, around=0.0)
+    reach = max(ax.get_ylim()[1], 1.1 * pair.limit_db)  # the limit is drawn, so it is seen
+    ax.set_ylim(-reach, reach)
+    ax.set_xlabel(time_label(start))
+    ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
+    return fig

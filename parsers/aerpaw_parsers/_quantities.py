@@ -1,0 +1,88 @@
+"""What a phone or a drive-test program calls its quantities, in one table for all of them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs.records import Attribute, Kind, Stream
+
+from . import _rows
+
+
+@dataclass(frozen=True)
+class Quantity:
+    """Meaning of a name.
+
+    Parameters
+    ----------
+    kind : str
+        Of the stream that it gives.
+    name : str
+        The field's name of the quantity, e.g. ``RSRP``.
+    unit : str
+        Where the log writes none.
+    """
+
+    kind: Kind
+    name: str
+    unit: str
+
+
+_TABLE: tuple[tuple[str, Quantity], ...] = (
+    # the first that fits: 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
+    (r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri)\b", Quantity("rank", "rank", "")),
+    (r"\brs ?rp\b|\bss ?rsrp\b|\brsrp\b", Quantity("rss", "RSRP", "dBm")),
+    (r"\brsrq\b", Quantity("kpi", "RSRQ", "dB")),
+    (r"\b(rs ?)?s(i)?nr\b|\brssnr\b", Quantity("kpi", "SINR", "dB")),
+    (r"\brssi\b", Quantity("rss", "RSSI", "dBm")),
+    (r"\bcqi\b", Quantity("kpi", "CQI", "")),
+    (r"\bpath ?loss\b", Quantity("kpi", "path loss", "dB")),
+    (r"\b(throughput|tput|bit ?rate|thr?put)\b", Quantity("kpi", "throughput", "bit/s")),
+    (r"\bmcs\b", Quantity("kpi", "MCS", "")),
+    (r"\bbler\b", Quantity("kpi", "BLER", "%")),
+)
+_COMPILED = tuple((re.compile(pattern), quantity) for pattern, quantity in _TABLE)
+
+
+def plain(name: str) -> str:
+    """A name in lower case with its marks as single spaces.
+
+    Examples
+    --------
+    >>> plain("RSRP (LTE detected) - 1")
+    'rsrp lte detected 1'
+    """
+    return re.sub(r"[^a-z0-9]+", " ", name.lower()).strip()
+
+
+def quantity(name: str) -> Quantity | None:
+    """What a name means, None if nothing that is known."""
+    text = plain(name)
+    return next((meaning for pattern, meaning in _COMPILED if pattern.search(text)), None)
+
+
+def is_rank(name: str) -> bool:
+    """Whether a name is that of a rank."""
+    meaning = quantity(name)
+    return meaning is not None and meaning.kind == "rank"
+
+
+def stream(
+    rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
+    about: Mapping[str, Attribute | None] | None = None,
+) -> Stream | None:  # fmt: skip
+    """Level or KPI stream of a named quantity; of an unknown one, a KPI under its own name."""
+    meaning = quantity(name) or Quantity("kpi", name, "")
+    short = re.sub(r"\W+", "_", plain(name))
+    if meaning.kind == "rss":
+        level, flag = rows.level(values)
+        return rows.stream(
+            "rss", short, {"rss_db": level}, where=where, flag=flag, channel=rows.options.channel or short,
+            unit=rows.options.unit or unit or meaning.unit, quantity=meaning.name, about=about,
+        )  # fmt: skip
+    return rows.stream(
+        "kpi", short, {"value": values}, where=where, unit=unit or meaning.unit, quantity=meaning.name, about=about
+    )

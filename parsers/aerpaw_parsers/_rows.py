@@ -1,0 +1,303 @@
+"""From lines to records: what every text format repeats, so that a format is its pattern, its columns and its text.
+
+:func:`matched` takes a pattern with named groups (``time`` among them) and gives :class:`Rows`; :func:`built` does so
+for readers that find their rows another way. ``Rows.number`` and ``Rows.text`` are its columns, ``Rows.stream`` makes
+a stream of them, ``Rows.result`` closes the account.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
+
+from . import _frames, _lines, _time
+
+NO_DATE = "the time stamp is no date of the calendar"
+NO_TIME = "the time is beyond any flight"
+Reason = Callable[[bytes], "str | None"]
+
+
+@dataclass
+class Rows:
+    """Rows of a log that have a time, and the account of all other lines.
+
+    Parameters
+    ----------
+    reader : str
+        Name of the reader.
+    options : ReadOptions
+    lines : int
+        Lines of the file.
+    row : int array, shape (n,)
+        0-based line of each row.
+    time : datetime64[ns] array, shape (n,)
+    flag : object array, shape (n,)
+    columns : mapping of str to bytes array, shape (n,)
+        What the groups of the pattern matched.
+    blank : int
+    rejected : list of RejectedLine
+    warnings : list of str
+    relative : bool
+        Do the times count from an origin that nobody named?
+    """
+
+    reader: str
+    options: ReadOptions
+    lines: int
+    row: IntArray
+    time: AnyArray
+    flag: AnyArray
+    columns: dict[str, AnyArray] = field(default_factory=dict)
+    blank: int = 0
+    rejected: list[RejectedLine] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    relative: bool = False
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.row)
+
+    def number(self, name: str, *, none: Iterable[bytes] = (b"n/a", b"-")) -> FloatArray:
+        """A column as numbers; empty text and the words for none are NaN."""
+        cells = self.columns[name]
+        if cells.dtype.kind == "f":
+            return np.asarray(cells, dtype=np.float64)
+        for word in none:
+            cells = np.where(cells == word, b"", cells)
+        return np.asarray(_lines.numbers(cells), dtype=np.float64)
+
+    def text(self, name: str) -> list[str]:
+        """A column as text."""
+        return [cell.decode("utf-8", "replace") for cell in self.columns[name].tolist()]
+
+    def mark(self, where: BoolArray, reason: str) -> None:
+        """Add a reason to the flag of some rows."""
+        _lines.add_flag(self.flag, where, reason)
+
+    def stream(
+        self,
+        kind: Kind,
+        name: str,
+        values: Mapping[str, AnyArray],
+        *,
+        where: BoolArray | None = None,
+        flag: AnyArray | None = None,
+        about: Mapping[str, Attribute | None] | None = None,
+        **attributes: Attribute | None,
+    ) -> Stream | None:
+        """A stream of all rows, or of those of a mask; None where there are none.
+
+        Parameters
+        ----------
+        values : mapping
+            Columns of the kind, and any others, each of shape (n,).
+        where : bool array, shape (n,), optional
+        flag : object array, shape (n,), optional
+            In place of the flags that all streams of the rows share.
+        about : mapping, optional
+            Further attributes.
+        """
+        pick = np.flatnonzero(np.ones(len(self), dtype=bool) if where is None else where)
+        if not len(pick):
+            return None
+        shown = self.flag if flag is None else flag
+        columns = {key: np.asarray(column)[pick] for key, column in values.items()}
+        frame = _frames.frame(kind, self.time[pick], self.row[pick] + 1, shown[pick], columns)
+        attributes = ({"clock": "relative"} if self.relative else {}) | dict(about or {}) | attributes
+        return Stream(kind, name, frame, _frames.attributes(self.options, **attributes))
+
+    def level(self, values: FloatArray) -> tuple[FloatArray, AnyArray]:
+        """Levels with those at or below the floor as NaN, and their flags ``out_of_coverage``."""
+        flag, level = self.flag.copy(), np.array(values, dtype=np.float64)
+        silent = ~(level > self.options.floor_db)  # +inf is no silence: the limits of all readers flag it
+        _lines.add_flag(flag, silent, "out_of_coverage")
+        level[silent] = np.nan
+        return level, flag
+
+    def rank(self, ri: FloatArray, *, base: int = 1, none: BoolArray | None = None) -> dict[str, FloatArray]:
+        """Columns ``rank`` and ``ri_raw`` of reported indicators; what is no rank is flagged.
+
+        Parameters
+        ----------
+        ri : float array, shape (n,)
+            As written; NaN where nothing is.
+        base : {0, 1}
+            What rank 1 is written as.
+        none : bool array, shape (n,), optional
+            Rows in which the number means that nothing was reported.
+        """
+        absent = np.isnan(ri) | (np.zeros(len(self), dtype=bool) if none is None else none)
+        good = (ri >= base) & (ri <= 7 + base) & (ri == np.round(ri)) & ~absent
+        self.mark(absent, "no_csi")
+        self.mark(~good & ~absent, "ri_out_of_range")
+        return {"rank": np.where(good, ri + 1 - base, np.nan), "ri_raw": ri}
+
+    def result(self, streams: Iterable[Stream | None]) -> ReadResult:
+        """The streams that have rows, with the account."""
+        kept = tuple(stream for stream in streams if stream is not None)
+        back = [text for stream in kept[:1] for text in _frames.steps_back(stream.frame)]
+        return ReadResult(
+            self.reader,
+            kept,
+            self.lines,
+            len(self),
+            self.blank,
+            tuple(sorted(self.rejected, key=lambda line: line.number)),
+            tuple(dict.fromkeys([*self.warnings, *back])),
+        )
+
+
+def matched(
+    data: bytes,
+    pattern: re.Pattern[bytes],
+    options: ReadOptions,
+    *,
+    reader: str,
+    reason: Reason,
+    skip: Callable[[IntArray], BoolArray] | None = None,
+    clock: str = "wall",
+) -> Rows:
+    r"""Rows of a log whose lines a pattern describes.
+
+    Parameters
+    ----------
+    pattern : re.Pattern
+        MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
+        them ``time``.
+    reason : callable
+        Why a line that does not match is rejected, or None for a header, a comment or a console's talk.
+    skip : callable, optional
+        Mask of the matching rows (0-based lines) that are comments.
+    clock : str
+        See :func:`times`.
+
+    Raises
+    ------
+    UsageError
+        If a zone-less clock has no zone.
+    """
+    lines = _lines.split(data)
+    names = list(pattern.groupindex)
+    rows, groups = _lines.match(lines, pattern)
+    column = dict(zip(names, _picked(groups, pattern), strict=True))
+    return built(lines, rows, column, options, reader=reader, reason=reason, skip=skip, clock=clock)
+
+
+def _picked(groups: list[tuple[bytes, ...]], pattern: re.Pattern[bytes]) -> list[AnyArray]:
+    column = _lines.columns(groups, pattern.groups)
+    return [column[i - 1] for i in pattern.groupindex.values()]
+
+
+def built(
+    lines: _lines.Lines,
+    rows: IntArray,
+    column: dict[str, AnyArray],
+    options: ReadOptions,
+    *,
+    reader: str,
+    reason: Reason,
+    skip: Callable[[IntArray], BoolArray] | None = None,
+    clock: str = "wall",
+    extra: Iterable[RejectedLine] = (),
+    markup: IntArray | None = None,
+) -> Rows:
+    """Rows from their lines and columns of text, ``time`` among them; see :func:`matched`.
+
+    Parameters
+    ----------
+    extra : iterable of RejectedLine
+        Lines that were rejected before.
+    markup : int array, optional
+        0-based lines known to be comments.
+    """
+    comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
+    before = list(extra)
+    known = np.concatenate((rows, np.array([line.number - 1 for line in before], dtype=np.int64))).astype(np.int64)
+    blank, rejected = _lines.remainder(lines, known, reason, blank=markup)
+    rejected += before
+    blank += int(comment.sum())
+    rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
+    relative, instants, valid = times(column.pop("time"), options, clock=clock, reader=reader)
+    rejected += lines.reject_all(rows[~valid], NO_DATE if clock == "wall" else NO_TIME)
+    flag = _lines.flags(len(rows))
+    instants.flag(flag)
+    if lines.unterminated:
+        _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
+    warnings = list(instants.warnings)
+    if relative and len(rows):
+        warnings.append(RELATIVE)
+    return Rows(
+        reader,
+        options,
+        len(lines),
+        rows[valid],
+        instants.time[valid],
+        flag[valid],
+        {name: cells[valid] for name, cells in column.items()},
+        blank,
+        rejected,
+        warnings,
+        relative,
+    )
+
+
+RELATIVE = "the times are relative and no time_origin is given: they count from 1970-01-01T00:00"
+_SCALE_NS = {"s": 1e9, "ms": 1e6, "us": 1e3}
+_MOST_S = 9.2e9
+_FLIGHT_S = 9.0e9
+"""Relative times beyond about 285 years would leave the range of datetime64[ns]."""
+
+
+def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> tuple[bool, _time.Instants, BoolArray]:
+    """Instants of a column of times.
+
+    Parameters
+    ----------
+    cells : bytes or float array, shape (n,)
+    clock : str
+        ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
+        ``relative_s`` or ``relative_ms`` (from ``time_origin``, else from 1970-01-01).
+
+    Returns
+    -------
+    relative : bool
+        Are the times without an origin?
+    instants : Instants
+    valid : bool array, shape (n,)
+    """
+    if clock == "wall":
+        instants, valid = _time.texts_to_utc(cells, options, needed_by=reader)
+        return False, instants, valid
+    form, unit = clock.split("_")
+    value = cells if cells.dtype.kind == "f" else np.asarray(_lines.numbers(cells), dtype=np.float64)
+    origin = _time.origin_ns(options, needed_by=reader) if form == "relative" else 0
+    most = _FLIGHT_S if form == "relative" else _MOST_S
+    valid = np.isfinite(value) & (np.abs(value) * _SCALE_NS[unit] <= most * 1e9)
+    safe = np.where(valid, value, 0.0)
+    whole = np.floor(safe)  # the fraction apart: a float64 epoch in ns has no room for it
+    ns = whole.astype(np.int64) * int(_SCALE_NS[unit])
+    ns += np.round((safe - whole) * _SCALE_NS[unit]).astype(np.int64) + (origin or 0)
+    if form == "epoch" and options.clock in ("local", "local_as_utc"):
+        return False, _time.local_to_utc(ns, options.timezone, needed_by=reader), valid
+    none = np.zeros(len(ns), dtype=bool)
+    return origin is None, _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
+
+
+def torn(pattern: re.Pattern[bytes], text: str) -> Reason:
+    """A reason for consoles: lines that begin as a row does are rejected, all others are talk."""
+    return lambda line: text if pattern.match(line) else None
+
+
+def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
+    """SNR stream of one tower; levels at or below the floor are out of coverage."""
+    level, flag = rows.level(values)
+    return rows.stream(
+        "rss", tower, {"rss_db": level}, where=where, flag=flag, node=tower, channel="snr", unit="dB", quantity="SNR"
+    )

@@ -1,0 +1,103 @@
+"""The public face: every name of ``__all__`` is there, is documented, and does what docs/api.md says."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import aerpaw_cmp as ac
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "sample_logs"
+
+
+def test_every_public_name_exists_has_a_docstring_and_stands_in_the_page() -> None:
+    page = (ROOT / "docs" / "api.md").read_text()
+    for name in ac.__all__:
+        value = getattr(ac, name)
+        assert name == "__version__" or inspect.getdoc(value), name
+        assert f"`{name}" in page or name == "__version__", f"docs/api.md does not name {name}"
+    assert set(ac.__all__) - {"__version__"} == set(ac._HOME)
+    with pytest.raises(AttributeError, match="no attribute 'nothing'"):
+        _ = ac.nothing
+
+
+def test_using_one_name_loads_only_its_room() -> None:
+    code = (
+        "import sys, aerpaw_cmp; aerpaw_cmp.channel_rank; sys.exit('pandas' in sys.modules or 'sionna' in sys.modules)"
+    )
+    assert subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=False).returncode == 0
+
+
+@pytest.mark.parametrize(
+    "name", ["propagation.trace", "propagation.audit", "propagation.tracer", "logs.ingest", "compare.rank"]
+)
+def test_no_function_hides_a_module(name: str) -> None:
+    module = importlib.import_module(f"aerpaw_cmp.{name}")
+    package, _, last = name.partition(".")
+    assert inspect.ismodule(getattr(importlib.import_module(f"aerpaw_cmp.{package}"), last))
+    assert inspect.ismodule(module)
+
+
+def test_read_gives_frames_by_stream_with_their_account() -> None:
+    logs = ac.read(SAMPLE / "UAV", timezone="America/New_York")
+    frames = [frame for frame in logs.values() if frame.attrs["kind"] == "telemetry"]
+    assert frames
+    assert {"time", "latitude_deg", "altitude_m"} <= set(frames[0].columns)
+    lines = sum(file["lines"] for file in logs.account["files"])
+    assert lines == sum(file.result.lines for file in logs.files)
+    assert "<table>" in logs._repr_html_()
+    assert f"{len(frames[0])} records" in repr(logs)
+
+
+def test_streams_of_one_name_keep_apart() -> None:
+    paths = sorted((SAMPLE / "LW1").iterdir()) + sorted((SAMPLE / "LW2").iterdir())
+    logs = ac.read(paths, timezone="America/New_York")
+    assert len(logs) == sum(len(file.result.streams) for file in logs.files)
+
+
+def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflects() -> None:
+    from aerpaw_cmp.propagation.arrays import single_element
+
+    link = ac.Link(3.4e9, {"LW1": single_element()}, single_element(), transmit_power_dbm=40.0)
+    site = ac.load_site("lake_wheeler")
+    found = ac.trace(site, link, site.towers["LW1"].position_m + np.array([[100.0, 0.0, 60.0]]), max_depth=0)
+    metres = np.hypot(100.0, 60.0)
+    friis = 40.0 - 20 * np.log10(4 * np.pi * metres * 3.4e9 / 299_792_458.0)
+    assert found.rss_dbm[0, 0] == pytest.approx(friis, abs=1e-9)
+    data = found.to_xarray()
+    assert data.rss_dbm.sel(tower="LW1").item() == found.rss_dbm[0, 0]
+    assert (data.h_real + 1j * data.h_imag).values.tobytes() == found.h.tobytes()
+    assert "1 poses, towers LW1" in repr(found)
+    with pytest.raises(Exception, match="positions"):
+        ac.trace(site, link, [[1.0, 2.0]])
+
+
+def test_variogram_finds_the_correlation_it_was_given() -> None:
+    """Fields with correlation exp(-d / 100 m), drawn exactly, each standardised over the area.
+
+    Taking off the mean turns the covariance into J Phi J (J the centring matrix): its means per bin are expected.
+    """
+    rng = np.random.default_rng(5)
+    east, north = np.meshgrid(np.arange(20) * 30.0, np.arange(20) * 30.0)
+    points = np.column_stack([east.ravel(), north.ravel()])
+    distance = np.linalg.norm(points[:, None] - points[None], axis=-1)
+    correlation = np.exp(-distance / 100.0)
+    fields = np.linalg.cholesky(correlation + 1e-9 * np.eye(400)) @ rng.standard_normal((400, 200))
+    centring = np.eye(400) - 1.0 / 400
+    centred = centring @ correlation @ centring
+    variogram = ac.Variogram(maximum_m=300.0).fit(points, fields)
+    bins = np.floor(distance / 30.0 + 0.5)
+    expected = [centred[bins == n].mean() / np.trace(centred) * 400 for n in range(1, 11)]
+    assert variogram.binned_.correlation[1:] == pytest.approx(expected, abs=0.03)
+    at = variogram.binned_.mean_distance_m[1:7]  # beyond them the correlation is negative, which no such curve is
+    assert variogram(at) == pytest.approx(variogram.binned_.correlation[1:7], abs=0.06)
+    assert variogram.semivariance(at, 4.0) == pytest.approx(4.0 * (1 - variogram(at)))
+    estimate, _ = ac.OrdinaryKriging(variogram, radius_m=500.0).fit(points, fields[:, 0]).predict(points[:5])
+    assert estimate == pytest.approx(fields[:5, 0], abs=1e-6)

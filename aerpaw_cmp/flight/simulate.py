@@ -8,7 +8,7 @@ its ``logs`` say which files to write and in which format (by ``reader``). The s
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ import pandas as pd
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputSet
+from ..common.stages import Progress, silent
 from ..common.units import FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
@@ -174,12 +175,7 @@ class FlightSimulator:
         self.folder = folder
 
     def run(
-        self,
-        out: Path,
-        *,
-        inputs: Iterable[Path] = (),
-        force: bool = False,
-        progress: Callable[[str], None] = lambda _text: None,
+        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = silent
     ) -> list[Path]:
         """Write every log of the flight file and truth.json below ``out``; gives the paths written.
 

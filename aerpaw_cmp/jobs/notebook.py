@@ -108,7 +108,7 @@ class Flight:
 
     @cached_property
     def track(self) -> pd.DataFrame:
-        """Telemetry as poses: ``time east_m north_m up_m heading_deg attitude_known``, one row per instant of the log."""
+        """Telemetry as poses: ``time east_m north_m up_m heading_deg attitude_known``, one row per instant."""
         if self.data.track is None:
             return _together([], ["time", "east_m", "north_m", "up_m", "heading_deg", "attitude_known"])
         times = self._telemetry_times()

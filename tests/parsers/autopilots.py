@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import struct
 
 START_US = 1_740_927_600_250_000
@@ -97,7 +98,14 @@ def ulog() -> bytes:
         out += message(b"A", bytes([0]) + struct.pack("<H", i) + name)
     out += message(b"D", struct.pack("<HQf", 4, 29_000_000, 90.0))
     # roll 1.5, pitch -2.5, yaw 90 degrees as a quaternion
-    q = (0.7068892, 0.0246798, -0.0061687, 0.7066038)
+    half = [math.radians(angle) / 2 for angle in (1.5, -2.5, 90.0)]
+    (cr, cp, cy), (sr, sp, sy) = ([f(angle) for angle in half] for f in (math.cos, math.sin))
+    q = (
+        cr * cp * cy + sr * sp * sy,
+        sr * cp * cy - cr * sp * sy,
+        cr * sp * cy + sr * cp * sy,
+        cr * cp * sy - sr * sp * cy,
+    )
     for i in range(COUNT):
         now = 30_000_000 + i * 1_000_000
         out += message(b"D", struct.pack("<HQddf", 0, now, 35.73 + i * 1e-7, -78.7 - i * 1e-7, 90.0 + i))

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
-from ..logs.ingest import IngestedFile, ingest, read_bytes
+from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
 from ..logs.limits import UNSCORED, flagged
-from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
+from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
 from ..site.site import Site
 from ..site.siteyaml import load_site
@@ -100,7 +100,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     files = []
     for log in settings.logs:
         path = (logs_root or folder) / log.path
-        if not path.exists():
+        if not exists(path):
             root = logs_root or folder
             raise InputError(
                 "there is no such log",
@@ -125,8 +125,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
     """A log whose content another reader recognises, and the named one does not, is the wrong file."""
-    head = read_bytes(path)[0][:HEAD_BYTES]
-    others = [r.name for r in catalogue() if r.sniff(head)]
+    others = sniffers_of(path)
     if not others or reader.name in others:
         return
     raise InputError(

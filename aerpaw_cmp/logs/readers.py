@@ -85,6 +85,8 @@ class Reader:
         ``sniff(head: bytes) -> bool``: content only, never the file name; must not raise.
     read : callable
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
+    pieces : bool
+        Is a file of a few records a piece of the log that its folder holds?
     """
 
     name: str
@@ -93,6 +95,7 @@ class Reader:
     sample: str
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
+    pieces: bool = False
 
 
 @cache

@@ -73,4 +73,5 @@ READER = Reader(
     sample="results_3320000000_2000000_2025_01_01_12_00_07_250.mat",
     sniff=sniff,
     read=read,
+    pieces=True,
 )

@@ -244,4 +244,5 @@ READER = Reader(
     sample='{"global": {"core:datatype": "cf32_le"}, "captures": [{"measurement:values": {"mX": [], "RSS1": []}}]}',
     sniff=sniff,
     read=read,
+    pieces=True,
 )

@@ -125,6 +125,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
     """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    if reader.name == "generic_csv":
+        return  # its columns were named: no other reader knows better
     others = sniffers_of(path)
     if not others or reader.name in others:
         return

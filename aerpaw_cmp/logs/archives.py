@@ -85,11 +85,11 @@ def _unzipped(book: zipfile.ZipFile, one: zipfile.ZipInfo, path: str | Path) -> 
 
 
 def _tar(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
-    with tarfile.open(fileobj=io.BytesIO(data), mode="r:") as book:
-        found = [one for one in book.getmembers() if one.isreg() and not _hidden(one.name)]
-        _check(len(found), sum(one.size for one in found), path)
-        for one in sorted(found, key=lambda one: one.name):
-            yield one.name, lambda one=one: _untarred(book, one)  # type: ignore[misc]
+    book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
+    found = [one for one in book.getmembers() if one.isreg() and not _hidden(one.name)]
+    _check(len(found), sum(one.size for one in found), path)
+    for one in sorted(found, key=lambda one: one.name):
+        yield one.name, lambda one=one: _untarred(book, one)  # type: ignore[misc]
 
 
 def _untarred(book: tarfile.TarFile, one: tarfile.TarInfo) -> bytes:

@@ -168,9 +168,16 @@ def ingest(
     return Ingested(files, skipped)
 
 
+def _present(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False  # an impossible path: read_bytes says so
+
+
 def exists(path: Path) -> bool:
     """Whether a path names a file, a folder, or a member of an archive."""
-    return path.exists() or archives.inside(path) is not None
+    return _present(path) or archives.inside(path) is not None
 
 
 def sniffers_of(path: Path) -> list[str]:
@@ -179,7 +186,7 @@ def sniffers_of(path: Path) -> list[str]:
 
     if path.is_dir():
         return []
-    part = None if path.exists() else archives.inside(path)
+    part = None if _present(path) else archives.inside(path)
     if part is None:
         data = read_bytes(path)[0]
     else:
@@ -261,7 +268,7 @@ def _is_folder(place: Path) -> bool:
 def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
     """Read one file, or one member of an archive; see :func:`ingest`."""
     place = Path(path)
-    if (part := None if place.exists() else archives.inside(place)) is not None:
+    if (part := None if _present(place) else archives.inside(place)) is not None:
         archive, name = part
         content = dict(archives.members(read_bytes(archive)[0], archive))
         if name not in content:
@@ -270,9 +277,8 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     head = _raw(place, HEAD_BYTES)
     if head.startswith(_HDF5):
         raise InputError(
-            "an HDF5 file, such as 'ingest -o' writes",
-            expected="the logs themselves (logs.flight_file.read_flight gives back what a flight file holds)",
-            cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
+            "an HDF5 file, such as the flight file that 'ingest -o' writes",
+            expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
             path=path,
         )
     if reader is None and not head.startswith(_GZIP) and not hides_its_content(head):

@@ -188,10 +188,44 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     binary = b"\0" in head
     raise InputError(
         "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
-        expected="one of the formats of 'aerpaw-cmp formats'",
-        cause="another kind of file, or a damaged one" if binary else "a log of a kind that is not supported",
+        expected="one of the formats of 'aerpaw-cmp formats'" + ("" if binary else nearest(head)),
+        cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,
     )
+
+
+def nearest(head: bytes) -> str:
+    """The format whose sample line looks most like the first lines, in words; nothing where none is near.
+
+    Compared are shapes: digits become 0, letters a, so that what counts is how a line is built.
+    """
+    from difflib import SequenceMatcher
+
+    lines = [_shape(line.decode("utf-8", "replace")[:200]) for line in head[:4096].split(b"\n")[:6] if line.strip()]
+    best, name, sample = 0.0, "", ""
+    for reader in catalogue():
+        if not reader.kinds or not reader.sample or reader.sample.startswith("binary"):
+            continue
+        shape = _shape(reader.sample)
+        score = max((SequenceMatcher(None, line, shape, autojunk=False).ratio() for line in lines), default=0.0)
+        if score > best:
+            best, name, sample = score, reader.name, reader.sample
+    return f"; the nearest is {name!r}, with lines such as {sample!r}" if best > 0.6 else ""
+
+
+def _shape(text: str) -> str:
+    import re
+
+    return re.sub(r"a+", "a", re.sub(r"[A-Za-z]", "a", re.sub(r"\d", "0", text)))
+
+
+def _way_out(head: bytes) -> str:
+    first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
+    names = [name.strip().strip('"') for name in first.split(",")]
+    if len(names) > 1 and all(name and not name[0].isdigit() for name in names):
+        example = f"--map {names[0]!r}=time --map {names[-1]!r}=rss_db"
+        return f"a table of another kind: name what its columns hold, e.g. {example}"
+    return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
 def _excerpt(head: bytes) -> str:

@@ -53,10 +53,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         raise InputError(
             "the date in the name of the burst is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm"
         )
-    power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
+    with np.errstate(all="ignore"):  # damaged samples may be any number
+        power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
     streams = []
     for i, one in enumerate(power.tolist()):
-        level = np.array([10 * np.log10(one) if one > 0 else np.nan])
+        level = np.array([10 * np.log10(one) if 0 < one < np.inf else np.nan])
         flag = _lines.flags(1)
         instants.flag(flag)
         _lines.add_flag(flag, ~(level > options.floor_db), "out_of_coverage")

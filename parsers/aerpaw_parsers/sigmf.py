@@ -212,10 +212,11 @@ def _powers(
             piece = samples[at : min(at + size, end)].astype(np.float64) / kind[1]
             if len(piece):
                 texts.append(_later(stamp, (at - starts[i]) / rate))
-                powers.append((piece**2).sum(axis=2).mean(axis=0))
+                with np.errstate(all="ignore"):  # damaged samples may be any number
+                    powers.append((piece**2).sum(axis=2).mean(axis=0))
     if not texts:
         return [], 0
-    with np.errstate(divide="ignore"):
+    with np.errstate(all="ignore"):
         level = 10 * np.log10(np.array(powers))
     made = [
         _stream("rss", f"USRP{c + 1}", texts, {"rss_db": level[:, c]}, options, warnings, channel=f"USRP{c + 1}",

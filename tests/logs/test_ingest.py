@@ -238,8 +238,7 @@ def test_symlink_loops_end(tmp_path: Path) -> None:
 
 def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.h5", [])
-    with pytest.raises(InputError, match="read_flight"):
-        ingest(tmp_path / "flight.h5")
+    assert ingest(tmp_path / "flight.h5") == []
     with pytest.raises(InputError, match=r"no log that a reader knows \(1 file looked at\); flight.h5: an HDF5 file"):
         ingest(tmp_path)
     with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):

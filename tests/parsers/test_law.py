@@ -113,7 +113,8 @@ def test_antenna_grids_of_matlab_are_no_flight() -> None:
 @pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
 def test_cut_at_every_byte(reader: str, sample: str) -> None:
     data = SAMPLES[reader][sample][0]
-    for end in range(len(data)):
+    step = max(1, len(data) // 250)  # long samples at places spread over them, and the end byte by byte
+    for end in sorted({*range(0, len(data), step), *range(max(0, len(data) - 40), len(data))}):
         check_law(reader, data[:end])
 
 
@@ -128,7 +129,7 @@ def test_binary_files_cut_at_many_bytes(reader: str) -> None:
 @pytest.mark.parametrize(("reader", "sample"), CASES)
 def test_sniffers_stand_any_cut(reader: str, sample: str) -> None:
     data = SAMPLES[reader][sample][0]
-    for end in range(0, len(data), 5):
+    for end in range(0, len(data), 1 + len(data) // 40):
         for other in catalogue():
             assert other.sniff(data[:end]) in (True, False)
 
@@ -188,7 +189,7 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
 
 @pytest.mark.parametrize("reader", SAMPLES)
 @given(data=st.data())
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=30, deadline=None)
 def test_damaged_bytes(reader: str, data: st.DataObject) -> None:
     """Bytes overwritten, inserted and removed at random places of its own samples."""
     sample = bytearray(
@@ -203,8 +204,7 @@ def test_damaged_bytes(reader: str, data: st.DataObject) -> None:
         if not sample:
             return
     check_law(reader, bytes(sample))
-    for other in catalogue():
-        assert other.sniff(bytes(sample)) in (True, False)
+    assert all(other.sniff(bytes(sample)) in (True, False) for other in catalogue())
 
 
 @pytest.mark.parametrize("at", [600, 1500, 3000, -400])

@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .rank import RankComparison
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .serving import ServingComparison
 from .statistics import Interval
 
 
@@ -291,3 +292,4 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    serving: ServingComparison | None = None

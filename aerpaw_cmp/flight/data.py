@@ -42,6 +42,8 @@ class RssSeries:
     """Equal for series whose link settings are equal: they share a replay."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
+    serving: FloatArray | None = None
+    """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -164,10 +166,12 @@ def gather(
                 continue
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
-            elif stream.kind == "rss":
+            elif stream.kind == "rss" and not _unnamed_cell(log, stream):
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
             elif stream.kind == "rank":
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
+        if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
+            warnings.append(f"{log.path}: {len(others)} cells that 'cells' does not name are left out")
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:
             warnings.append(
@@ -331,8 +335,16 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
     return name
 
 
+def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
+    """Whether a stream is that of a cell that the flight file, which names others, does not name."""
+    pci = stream.attributes.get("pci")
+    return bool(log.cells) and pci is not None and int(pci) not in log.cells
+
+
 def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RssSeries:
-    tower = _known_tower(log.node or _text(stream, "node"), log, site)
+    pci = stream.attributes.get("pci")
+    home = log.cells.get(int(pci)) if pci is not None else None
+    tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = log.channel or _text(stream, "channel") or stream.name
     link = settings.link.channels.get(channel, settings.link.rss)
     frame, left_out = _scored(stream, log.path)
@@ -345,6 +357,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         link=link,
         settings_key=link.model_dump_json(),
         flagged=left_out,
+        serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,
     )
 
 

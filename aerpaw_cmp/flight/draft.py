@@ -328,6 +328,18 @@ def _span(stream: Stream) -> Span | None:
     return (time.min(), time.max()) if len(time) else None
 
 
+MOST_CELLS = 6
+"""Of a log's cells, those told most often are proposed; in a city a phone hears a hundred."""
+
+
+def _cells(streams: Sequence[Stream]) -> list[int]:
+    """PCIs of a log of several cells, those with a twentieth of the samples of the first and more."""
+    counts = {int(s.attributes["pci"]): len(s.frame) for s in streams if "pci" in s.attributes}
+    most = max(counts.values(), default=0)
+    kept = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
+    return sorted(pci for pci in kept if 20 * counts[pci] >= most)
+
+
 def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     """Keys of a log and a question about what had to be guessed."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
@@ -337,6 +349,11 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     near = _TOWER.findall("/".join(Path(file.path).resolve().parts[-2:]))  # of the file or its folder
     towers = near or _TOWER.findall(path)
     entry["node"] = f"LW{towers[-1]}" if towers else "LW1"
+    if cells := _cells(need):
+        entry["cells"] = dict.fromkeys(cells, entry["node"])
+        if all("pci" in stream.attributes for stream in need):
+            del entry["node"]
+        return entry, "  # which tower has which PCI?"
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
     return entry, "" if near else "  # which tower?"

@@ -71,10 +71,21 @@ def report_data(
         speed=tuple(speed),
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
+        notes=(*settings.flight.notes, *notes, *_serving_note(result)),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
         stages_s=dict(stages_s or {}),
     )
+
+
+def _serving_note(result: FlightResult) -> list[str]:
+    """How often the cell predicted strongest is the one that served, and what always naming one would hit."""
+    if result.serving is None or not result.serving.n:
+        return []
+    hits, most = 100 * result.serving.hit_share, 100 * result.serving.majority_share
+    return [
+        f"Serving cell: the one predicted strongest served in {hits:.0f} % of {result.serving.n} samples; "
+        f"always naming the most frequent one hits {most:.0f} % (confusion matrix: metrics.json, serving)."
+    ]
 
 
 # --- RSS -----------------------------------------------------------------------------------------------------------
@@ -187,6 +198,8 @@ def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
         merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
+    if result.serving is not None:
+        merge(found, {"serving": result.serving.as_dict()})
     for pair in result.pairs:
         merge(found, {"pairs": {pair.tower: {f"{pair.first} - {pair.second}": pair.score.as_dict()}}})
     return found

@@ -248,11 +248,13 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
     ax.add_collection3d(cones, autolim=False)
 
 
+def listed(points: Any) -> Any:
+    """Points as nested lists, rounded to 0.1 m."""
+    return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
+
+
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
-
-    def listed(points: Any) -> Any:
-        return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
 
     trees, pick = site.trees, canvas.spread_out(len(site.trees), TREES_IN_PAGE)
     flight: list[Any] = []

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.result import AuditResult, EngineResult
+from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
@@ -95,6 +96,7 @@ class Baseline:
     level_dbm: FloatArray
     offset_db: float
     rmse_db: float
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

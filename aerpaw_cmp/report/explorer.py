@@ -7,6 +7,7 @@ correlation and histograms of the chosen samples), by the same formulas as :mod:
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -79,7 +80,7 @@ def keep_extremes(values: Sequence[FloatArray], limit: int) -> IntArray:
     kept = [np.array([0, n - 1])]
     for array in values:
         low, high = np.nan_to_num(array, nan=np.inf), np.nan_to_num(array, nan=-np.inf)
-        for start, stop in zip(edges[:-1], edges[1:], strict=True):
+        for start, stop in itertools.pairwise(edges):
             kept.append(np.array([start + low[start:stop].argmin(), start + high[start:stop].argmax()]))
     return np.unique(np.concatenate(kept))
 

@@ -255,7 +255,6 @@ def listed(points: Any) -> Any:
 
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
-
     trees, pick = site.trees, canvas.spread_out(len(site.trees), TREES_IN_PAGE)
     flight: list[Any] = []
     if track is not None and len(track.time):

@@ -206,7 +206,7 @@ def report(
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         str,
-        typer.Option(help="What is drawn: page (what the page shows), none, or every figure as svg, png, pdf, all."),
+        typer.Option(help="What is drawn: page (what it shows), none, or every figure as svg, png, pdf, all."),
     ] = "page",
     style: Annotated[
         str, typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded).")

@@ -6,7 +6,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ..flight.data import FlightData
+from ..common.units import FloatArray
+from ..flight.data import FlightData, RankSeries, RssSeries
 from ..report.data import PosePaths
 from .replay import FlightReplay, Replayed
 
@@ -17,7 +18,8 @@ POSES = 300
 def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
     """Paths of each tower's first series at about ``limit`` of its poses, spread over the flight."""
     found: dict[str, PosePaths] = {}
-    for series, replayed in zip((*data.rss, *data.rank), replays.all, strict=True):
+    every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
+    for series, replayed in zip(every, replays.all, strict=True):
         if series.tower not in found and replayed.valid.any():
             poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
             time = series.time[replayed.valid][poses]
@@ -27,7 +29,7 @@ def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> t
     return tuple(found.values())
 
 
-def _lines(replayed: Replayed, pose: int, tower_m: np.ndarray) -> Iterator[tuple[np.ndarray, int]]:
+def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:
     paths = replayed.replay.paths
     start, stop = np.searchsorted(paths.pose, [pose, pose + 1])
     for row in range(start, stop):

@@ -169,6 +169,7 @@ def _rank(panel: RankPanel, start: np.datetime64, arrays: Arrays, limit: int) ->
         "time": arrays.add(seconds_since(panel.time, start)[pick], "f8"),
         **_place(panel, pick, arrays),
         "measured": arrays.add(panel.measured[pick]),
+        "best": _best(panel),
         "models": [{"name": f"K = {k_key(at.k)}", "rank": arrays.add(at.rank[pick])} for at in panel.simulated],
         "probability": [
             {"name": name, "values": arrays.add(np.asarray(values, dtype=np.float64)[pick])}
@@ -176,6 +177,12 @@ def _rank(panel: RankPanel, start: np.datetime64, arrays: Arrays, limit: int) ->
             if name.startswith("probability")
         ],
     }
+
+
+def _best(panel: RankPanel) -> int:
+    """Number of the K whose distribution comes nearest, shown first."""
+    distance = [np.nan_to_num(at.total_variation, nan=np.inf) for at in panel.simulated]
+    return int(np.argmin(distance)) if distance else 0
 
 
 def _track(data: ReportData, start: np.datetime64, arrays: Arrays) -> dict[str, int] | None:

@@ -84,8 +84,8 @@ def _overview_plate(data: ReportData) -> list[Plate]:
             page=True,
             section="overview",
             title="Where and when the prediction fails",
-            caption=f"{panels[0].name}. Left: the flight coloured by the residual, measured minus ray tracing after the "
-            "offset. Right: level over time.",
+            caption=f"{panels[0].name}. Left: the flight coloured by the residual, measured minus ray tracing "
+            "after the offset. Right: level over time.",
             alt=f"Map of the residual of {panels[0].name} beside its level over time.",
             draw=lambda: overview(data, panels[0]),
         )

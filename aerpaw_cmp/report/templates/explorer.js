@@ -479,7 +479,7 @@
   }
 
   const pick = (id, change) => at(id).addEventListener("change", e => { change(e.target.value); controls(); everything(); });
-  pick("choose-series", v => { state.series = +v; state.model = Math.min(state.model, (rss() ? rss().models.length : 1) - 1); state.k = 0; });
+  pick("choose-series", v => { state.series = +v; state.model = Math.min(state.model, (rss() ? rss().models.length : 1) - 1); state.k = rank() ? rank().best : 0; });
   pick("choose-model", v => { state.model = +v; });
   pick("choose-k", v => { state.k = +v; });
   pick("choose-colour", v => { state.colour = v; });
@@ -535,6 +535,7 @@
   }).observe(root);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => everything());
 
+  state.k = Math.max(0, rank() ? rank().best : 0);
   document.documentElement.classList.add("live");
   controls();
   everything();

@@ -11,7 +11,8 @@ import numpy as np
 
 from ..common.units import BoolArray, FloatArray
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.track import TrackPoses, estimate_lag
+from ..flight.lag import estimate_lag
+from ..flight.track import TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model

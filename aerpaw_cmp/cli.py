@@ -35,30 +35,62 @@ def main(arguments: list[str]) -> int:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             raise UsageError(error.format_message()) from error
         raise
+    finally:
+        _say.end()
     return result if isinstance(result, int) else 0
 
 
-def _say(text: str) -> None:
-    """Progress goes to standard error, so that standard output stays clean; "... 40 %" becomes a bar.
+class _Progress:
+    """Progress on standard error, so that standard output stays clean.
 
-    On a terminal the bar is redrawn in place; elsewhere only every quarter is a line.
+    On a terminal a share is a bar with the time left; elsewhere every quarter is a line.
     """
-    name, _, share = text.removesuffix(" %").rpartition(" ")
-    if not (text.endswith(" %") and share.isdigit()):
-        print(text, file=sys.stderr, flush=True)
-        return
-    percent = int(share)
-    if sys.stderr.isatty():
-        filled = percent * 30 // 100
-        end = "\n" if percent >= 100 else ""
-        print(f"\r\033[K{name} [{'#' * filled}{'.' * (30 - filled)}] {percent} %", end=end, file=sys.stderr, flush=True)
-    elif percent // 25 != _said.get(name, 0):
-        _said[name] = percent // 25
-        print(text, file=sys.stderr, flush=True)
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._quarters: dict[str, int] = {}
+
+    def __call__(self, text: str, fraction: float | None = None, /) -> None:
+        if fraction is None:
+            self.end()
+            print(text, file=sys.stderr, flush=True)
+        elif sys.stderr.isatty():
+            self._draw(text, fraction)
+        elif int(4 * fraction) > self._quarters.get(text, 0):
+            self._quarters[text] = int(4 * fraction)
+            print(f"{text} {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+
+    def _draw(self, text: str, fraction: float) -> None:
+        if self._bar is None or self._bar.tasks[0].description != text:
+            self.end()
+            self._bar = _bar()
+            self._bar.add_task(text, total=1.0)
+            self._bar.start()
+        self._bar.update(self._bar.tasks[0].id, completed=fraction)
+        if fraction >= 1.0:
+            self.end()
+
+    def end(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
 
 
-_said: dict[str, int] = {}
-"""Quarter that was last said of each stage."""
+def _bar() -> Any:
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+    )
+    return progress.Progress(*columns, console=Console(stderr=True))
+
+
+_say = _Progress()
 
 
 def _print_json(value: dict[str, Any]) -> None:

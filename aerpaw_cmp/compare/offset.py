@@ -103,7 +103,8 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
 
 def nearest_offset(grid_db: FloatArray, target_db: float, step_db: float = STEP_DB) -> int:
     """Index of the offset nearest to ``target_db``; a tie goes to the one nearer zero."""
-    distance = np.abs(grid_db - target_db)
+    # a target far beyond the grid is at its edge: 1e30 lies equally far from all offsets in float64
+    distance = np.abs(grid_db - np.clip(target_db, grid_db[0], grid_db[-1]))
     near = np.flatnonzero(distance <= distance.min() + _TIE * step_db)
     return int(near[np.argmin(np.abs(grid_db[near]))])
 
@@ -119,6 +120,9 @@ def _difference(measured_db: ArrayLike, simulated_db: ArrayLike) -> FloatArray:
 
 
 def _mean_and_variance(values: FloatArray) -> tuple[float, float]:
+    largest = float(np.abs(values).max())
+    if largest > 1e150:  # sums and squares would overflow
+        return float((values / largest).mean()) * largest, float("inf")
     mean = float(values.mean())
     return mean, float(np.mean((values - mean) ** 2))
 
@@ -167,7 +171,7 @@ def grid_offset(
         return OffsetFit(float("nan"), float("nan"), 0, False)
     mean, variance = _mean_and_variance(difference)
     best = nearest_offset(grid, mean, step_db)
-    rmse = float(np.sqrt(variance + (mean - grid[best]) ** 2))
+    rmse = float(np.hypot(np.sqrt(variance), mean - grid[best]))
     return OffsetFit(float(grid[best]), rmse, len(difference), best in (0, len(grid) - 1))
 
 
@@ -190,7 +194,7 @@ def offset_curve(
     if not len(difference):
         return grid, np.full(len(grid), np.nan)
     mean, variance = _mean_and_variance(difference)
-    return grid, np.sqrt(variance + (mean - grid) ** 2)
+    return grid, np.hypot(np.sqrt(variance), mean - grid)
 
 
 def identifiable_range(offsets_db: FloatArray, rmse_db: FloatArray, *, excess_db: float = 0.1) -> tuple[float, float]:

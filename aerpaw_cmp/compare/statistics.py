@@ -491,7 +491,8 @@ class PairedDifference:
         if self.verdict == "no difference shown":
             return f"no difference from {other} shown ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
         near, far = sorted((abs(low), abs(high)))
-        return f"{self.verdict} than {other} by {size} [{near:.1f}, {far:.1f}]"
+        digits = 1 if near >= 0.05 else 2
+        return f"{self.verdict} than {other} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None."""

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
 from ..logs.ingest import IngestedFile, ingest, read_bytes
+from ..logs.limits import UNSCORED, flagged
 from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
 from ..logs.records import Stream
 from ..site.site import Site
@@ -39,17 +41,21 @@ class RssSeries:
     link: LinkSettings
     settings_key: str
     """Equal for series whose link settings are equal: they share a replay."""
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """Rows of the log that are not here, because a flag voids them: how many per flag."""
 
 
 @dataclass(frozen=True, slots=True)
 class RankSeries:
-    """Reported rank at a tower: ``rank`` (n,) with NaN for no CSI, ``position_m`` (n, 3) or None (then the track)."""
+    """Reported rank at a tower: ``rank`` (n,) with NaN for no CSI, ``position_m`` (n, 3) of the log itself or None."""
 
     tower: str
     time: Times
     rank: FloatArray
     sinr_db: FloatArray
     position_m: FloatArray | None
+    flagged: Mapping[str, int] = field(default_factory=dict)
+    """As in :class:`RssSeries`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,16 +183,7 @@ def gather(
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
-    track = (
-        Track(
-            telemetry[0][1].frame,
-            site.frame,
-            maximum_gap_s=settings.rt.maximum_gap_s,
-            ground_m=site.datum.takeoff_ground_m,
-        )
-        if telemetry
-        else None
-    )
+    track = _track(settings, site, *telemetry[0], warnings) if telemetry else None
     data = FlightData(
         settings=settings,
         folder=logs_root or folder,
@@ -197,8 +194,127 @@ def gather(
         rank=_records(rank, lambda s: f"rank of {s.tower}"),
         warnings=tuple(warnings),
     )
+    _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
-    return data
+    return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings: list[str]) -> Track:
+    frame, _ = _scored(stream, path)
+    track = Track(
+        frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m
+    )  # fmt: skip
+    if not len(track):
+        raise InputError(
+            f"none of the {len(stream.frame)} telemetry rows holds a position that can be",
+            expected="latitude and longitude in degrees, altitude in metres",
+            cause="a receiver without a fix, or columns exchanged",
+            path=path,
+        )
+    warnings += [f"{path}: {text}" for text in track.account.warnings]
+    return track
+
+
+def _scored(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
+    """The rows that may be compared, and how many the others are per flag.
+
+    Raises
+    ------
+    InputError
+        If no row is left.
+    """
+    frame = stream.frame
+    void = flagged(frame)
+    if not void.any():
+        return frame, {}
+    words = Counter(w for text in frame["flag"][void] for w in str(text).split(";") if w in UNSCORED)
+    if void.all():
+        raise InputError(
+            f"every row of {stream.kind} {stream.name!r} is flagged {', '.join(words)}",
+            expected="values that can be, see docs/formats.md",
+            cause="another unit, or exchanged columns",
+            path=path,
+        )
+    return frame[~void], dict(words)
+
+
+FAR_M = 30_000.0
+"""A flight further than this from every tower [m] was not flown at this site."""
+
+DISTANT_M = 5_000.0
+"""And from here on [m] the reader is told first."""
+
+
+def _check_place(data: FlightData, telemetry: Sequence[tuple[str, Stream]]) -> None:
+    """A flight far from every tower is no flight of this site: exchanged or mirrored angles are named.
+
+    Raises
+    ------
+    InputError
+        If no position comes within :data:`FAR_M` of any tower.
+    """
+    flown = [(path, stream) for path, stream in telemetry] + [
+        (log.path, stream)
+        for log, file in zip(data.settings.logs, data.files, strict=True)
+        for stream in file.result.streams
+        if stream.kind == "rank" and stream.name not in log.skip and "latitude_deg" in stream.frame
+    ]
+    for path, stream in flown:
+        latitude, longitude = (stream.frame[name].to_numpy(np.float64) for name in ("latitude_deg", "longitude_deg"))
+        near = _nearest_m(data.site, latitude, longitude)
+        if not near > FAR_M:
+            continue
+        turned = {
+            "latitude and longitude are exchanged": (longitude, latitude),
+            "the longitude lacks its sign (west is negative)": (latitude, -longitude),
+            "the latitude lacks its sign (south is negative)": (-latitude, longitude),
+            "latitude and longitude are exchanged and a sign is missing": (longitude, -latitude),
+        }
+        causes = [why for why, angles in turned.items() if _nearest_m(data.site, *angles) <= FAR_M]
+        raise InputError(
+            f"the positions come no nearer than {near / 1000.0:.0f} km to any tower of site {data.site.name!r}",
+            expected=f"a flight within {FAR_M / 1000.0:.0f} km of a tower",
+            cause=causes[0] if causes else "another site, or a log of another flight",
+            path=path,
+        )
+
+
+def _nearest_m(site: Site, latitude_deg: FloatArray, longitude_deg: FloatArray) -> float:
+    """Least horizontal distance of positions to any tower [m]; NaN without a position."""
+    can = (np.abs(latitude_deg) <= 90.0) & (np.abs(longitude_deg) <= 180.0)
+    if not can.any():
+        return float("nan")
+    east, north = site.frame.to_local(latitude_deg[can], longitude_deg[can])
+    gaps = [np.hypot(east - t.position_m[0], north - t.position_m[1]).min() for t in site.towers.values()]
+    return float(np.min(gaps, initial=np.inf))
+
+
+def _idle_attitude(data: FlightData) -> tuple[str, ...]:
+    """What is to be told where ``rt.attitude`` cannot act, or only in part."""
+    mode = data.settings.rt.attitude
+    if mode == "ignored":
+        return ()
+    told = []
+    for kind, tower, time in [("RSS", s.tower, s.time) for s in data.rss] + [
+        ("rank", s.tower, s.time) for s in data.rank
+    ]:
+        pose = None if data.track is None else data.track.pose_at(time)
+        known = 0 if pose is None else int((pose.attitude_known if mode == "logged" else pose.valid).sum())
+        if known == 0:
+            why = (
+                "no log holds telemetry"
+                if pose is None
+                else "the telemetry holds no attitude: level flight along the course stands in"
+                if pose.valid.any()
+                else "the telemetry covers none of its instants (relative times want 'time_origin')"
+            )
+            told.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
+        elif pose is not None and kind == "rank" and not pose.valid.all():
+            told.append(
+                f"rt.attitude: {mode} acts on {known} of {len(time)} samples of {kind} of {tower}: "
+                "the telemetry covers no more."
+            )
+    return tuple(dict.fromkeys(told))
 
 
 def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
@@ -219,28 +335,30 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
     tower = _known_tower(log.node or _text(stream, "node"), log, site)
     channel = log.channel or _text(stream, "channel") or stream.name
     link = settings.link.channels.get(channel, settings.link.rss)
+    frame, left_out = _scored(stream, log.path)
     return RssSeries(
         tower=tower,
         channel=channel,
         unit=str(stream.attributes.get("unit", "dB re full scale")),
-        time=stream.frame["time"].to_numpy("datetime64[ns]"),
-        measured_db=stream.frame["rss_db"].to_numpy(np.float64),
+        time=frame["time"].to_numpy("datetime64[ns]"),
+        measured_db=frame["rss_db"].to_numpy(np.float64),
         link=link,
         settings_key=link.model_dump_json(),
+        flagged=left_out,
     )
 
 
 def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RankSeries:
     tower = _known_tower(log.node or settings.rank.tower, log, site)
-    frame = stream.frame
+    frame, left_out = _scored(stream, log.path)
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])
-        up = np.fmax(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)
+        up = np.maximum(frame["altitude_m"].to_numpy(np.float64), MINIMUM_HEIGHT_M)  # NaN stays NaN
         position = np.stack([east, north, up], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
-        tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position
+        tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position, left_out
     )
 
 
@@ -279,7 +397,8 @@ def _record(what: str, group: Sequence[tuple[str, Series]]) -> Series:
         for field in dataclasses.fields(first)
         if isinstance(getattr(first, field.name), np.ndarray)
     }
-    return dataclasses.replace(first, **arrays)
+    voided = sum((Counter(series.flagged) for _, series in parts), Counter())
+    return dataclasses.replace(first, flagged=dict(voided), **arrays)
 
 
 def _form(series: RssSeries | RankSeries) -> object:
@@ -330,9 +449,15 @@ def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.da
 
 
 def rank_positions(series: RankSeries, track: Track | None) -> tuple[FloatArray, BoolArray]:
-    """Positions (n, 3) [m] and which of them are known."""
-    if series.position_m is not None:
-        return series.position_m, np.asarray(np.isfinite(series.position_m).all(axis=1))
-    assert track is not None
-    pose = track.pose_at(series.time)
-    return pose.position_m, pose.valid
+    """Positions (n, 3) [m] and which of them are known: the log's own, and the track's where it has none."""
+    if series.position_m is None:
+        assert track is not None
+        pose = track.pose_at(series.time)
+        return pose.position_m, pose.valid
+    position = series.position_m
+    known = np.isfinite(position).all(axis=1)
+    if track is not None and not known.all():
+        pose = track.pose_at(series.time)
+        use = ~known & pose.valid
+        position, known = np.where(use[:, None], pose.position_m, position), known | use
+    return position, np.asarray(known)

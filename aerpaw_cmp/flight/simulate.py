@@ -8,7 +8,6 @@ its ``logs`` say which files to write and in which format (by ``reader``). The s
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,6 +17,7 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
+from ..common.stages import Progress, silent
 from ..common.units import FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
@@ -170,7 +170,7 @@ class FlightSimulator:
         self.site = site
         self.folder = folder
 
-    def run(self, out: Path, *, progress: Callable[[str], None] = lambda _text: None) -> list[Path]:
+    def run(self, out: Path, *, progress: Progress = silent) -> list[Path]:
         """Write every log of the flight file and truth.json below ``out``; gives the paths written.
 
         Raises

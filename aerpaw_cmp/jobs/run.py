@@ -3,42 +3,16 @@
 from __future__ import annotations
 
 import os
-import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ..common.errors import UsageError
-
-if TYPE_CHECKING:
-    from ..flight.data import FlightData
-
-Progress = Callable[[str], None]
-
-
-def _silent(_text: str) -> None:
-    """No progress."""
-
-
-@dataclass(slots=True)
-class Stages:
-    """Seconds of each named stage, in order."""
-
-    progress: Progress = _silent
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time one stage."""
-        self.progress(name)
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+from ..common.stages import Progress, Stages, silent
+from ..flight.settings import FlightFile
+from ..site.site import Site
 
 
 def run_ingest(
@@ -66,7 +40,7 @@ def run_ingest(
     return account
 
 
-def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = _silent) -> list[Path]:
+def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = silent) -> list[Path]:
     """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``."""
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
@@ -93,7 +67,7 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
 
@@ -110,37 +84,24 @@ def run_report(
         settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files, logs_root)
-    from .compare_flight import audit_replays, compare_rank_series, compare_rss_series
-    from .replay import estimate_clocks, replay_rank, replay_rss
+    from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    with stages("clocks"):
-        clocks = estimate_clocks(data, progress)
-    with stages("replay"):
-        rss_replays = replay_rss(data, progress, clocks)
-        rank_replays = replay_rank(data, progress)
-    with stages("compare"):
-        rss = [
-            compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)
-        ]
-        rank = [
-            compare_rank_series(data, series, replayed)
-            for series, replayed in zip(data.rank, rank_replays, strict=True)
-        ]
-    with stages("audit"):
-        engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    found = run_flight(data, stages)
+    replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links:
         with stages("speed"):
             from .speed_table import speed_rows
 
-            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
+            speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
     with stages("report"):
+        from ..report.build import report_data
         from ..report.export import metrics as metrics_of
         from ..report.write import write_report
 
-        notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
-        record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
+        notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
+        record = report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
         folder = out or Path("reports") / settings.flight.name
         write_report(record, folder)
         metrics = metrics_of(record)
@@ -160,45 +121,6 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
             raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
         change["audit_links"] = numbers.get(audit, int(audit) if audit.isdigit() else 0)
     return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
-
-
-def _report_data(
-    data: FlightData,
-    rss: list[Any],
-    rank: list[Any],
-    engine: Any,
-    speed: tuple[Any, ...],
-    notes: tuple[str, ...],
-    stages: Stages,
-) -> Any:
-    from ..report.data import ReportData
-    from .compare_flight import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
-
-    settings = data.settings
-    warnings = list(data.warnings)
-    warnings += [w for result in (*rss, *rank) for w in result.warnings]
-    pairs = pairs_of([r.panel for r in rss])
-    return ReportData(
-        title=settings.report.title or settings.flight.title or settings.flight.name,
-        flight=settings.flight.name,
-        site=data.site,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        versions=versions(),
-        inputs=inputs_of(data),
-        track=track_of(data),
-        waypoints=waypoints_of(data),
-        rss=tuple(r.panel for r in rss),
-        rank=tuple(r.panel for r in rank),
-        pairs=tuple(p.panel for p in pairs),
-        extra_metrics=metrics_beyond_panels([*rss, *rank, *pairs]),
-        engine=engine,
-        speed=speed,
-        synthetic=settings.flight.synthetic,
-        warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
-        settings=settings.model_dump(mode="json"),
-        stages_s=dict(stages.seconds),
-    )
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -221,7 +143,7 @@ def run_bench(
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
     ratios: bool = True,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
     from ..propagation.bench import path_search, random_scene, speed_against_error
@@ -281,7 +203,7 @@ def run_site_show(
     else:
         from ..flight.data import gather, read_logs
         from ..flight.settings import load_flight
-        from .compare_flight import track_of
+        from ..report.build import track_of
 
         settings = load_flight(flight)
         if site is not None:
@@ -290,7 +212,7 @@ def run_site_show(
         data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
         place, track = data.site, track_of(data)
         if pose is not None:
-            paths = _paths_of_pose(data, place, track, pose)
+            paths = _paths_of_pose(settings, place, track, pose)
     written = write_site_view(place, out, track=track, paths=paths)
     if export:
         from ..site.export import export_scene
@@ -299,10 +221,8 @@ def run_site_show(
     return written
 
 
-def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
+def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> Any:
     """Propagation paths of all towers to one point of the track, as polylines."""
-    import dataclasses
-
     import numpy as np
 
     from ..propagation.arrays import Link, Poses, single_element
@@ -314,13 +234,12 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
     # paths join the centres of the arrays: which elements they have does not matter
-    link = Link(data.settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
-    data = dataclasses.replace(data, site=site)
-    crowns, depth = reflecting_crowns(data), data.settings.rt.max_depth
+    link = Link(settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
+    crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
-    loss = path_loss(data, link.carrier_hz)
-    if data.settings.rt.foliage == "opaque" and loss is not None:
+    loss = path_loss(site.trees, settings.rt, link.carrier_hz)
+    if settings.rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
         found = found.select(np.isfinite(loss(found, sources, point)))
     lines = []
@@ -346,7 +265,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     from ..live.follow import TelemetryFollower
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
-    from ..propagation.tracer import replay
+    from .replay import replay_poses
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)
@@ -372,8 +291,8 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
             roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
             rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
         pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
-        result = replay(site, link, pose, engine="image", max_depth=settings.rt.max_depth)
-        rank = int(channel_rank(result.h[0, 0], k))
+        found = replay_poses(site, settings.rt, link, pose, engine="image")
+        rank = int(channel_rank(found.h[0, 0], k))
         return rank or None
 
     return predict
@@ -390,7 +309,7 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, progress: Progress = _silent, **options: Any,
+    logs_root: Path | None = None, progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -407,10 +326,10 @@ def run_map(
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
     """
+    from ..common.versions import versions
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
-    from .compare_flight import versions
     from .paper_table import paper_markdown, paper_rows
 
     given = {name: value for name, value in options.items() if value is not None}
@@ -418,17 +337,23 @@ def run_map(
     place = load_site(site)
     name = Path(site).stem
     folder = out or Path("reports") / f"map-{name}"
-    outcome = mapping.make_maps(place, settings, progress)
+    stages = Stages(progress)
+    outcome = mapping.make_maps(place, settings, stages)
     if settings.study:
         if flight is not None:
             outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
-        mapping.study_maps(outcome, progress)
+        mapping.study_maps(outcome, stages)
     generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    with outcome.stage("export", progress):
+    with stages("export"):
         files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
     progress("page")
     record = mapping.maps_record(
-        outcome, name=name, generated=generated, versions=versions(), paper=paper_rows(outcome)
+        outcome,
+        name=name,
+        generated=generated,
+        versions=versions(),
+        stages_s=stages.seconds,
+        paper=paper_rows(outcome),
     )
     written = write_maps(record, folder)
     written.append(folder / "paper.md")
@@ -442,7 +367,7 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
 
     from ..flight.data import gather, read_logs
     from ..flight.settings import load_flight
-    from .compare_flight import track_of
+    from ..report.build import track_of
 
     settings = load_flight(flight)
     track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
@@ -469,7 +394,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
 

@@ -76,11 +76,13 @@ class TelemetryFollower:
         InputError
             If the content is no telemetry.
         """
+        from ..logs import limits  # loads pandas, as any reader does
+
         data = self._new_lines()
         if not data.strip():
             return 0
         reader = self._reader = self._reader or identify(data, path=str(self.path))
-        result = reader.read(data, self._options)
+        result = limits.check(reader.read(data, self._options))
         self.rejected += len(result.rejected)
         streams = [stream for stream in result.streams if stream.kind == "telemetry"]
         if not streams:

@@ -184,10 +184,12 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
 
 
 def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
+    from . import limits  # loads pandas, as any reader does
+
     given = options(path) if callable(options) else options or ReadOptions()
     given = replace(given, file_name=path.name)
     try:
-        result = reader.read(data, given)
+        result = limits.check(reader.read(data, given))
     except (InputError, UsageError) as error:
         if error.path is None:  # readers know bytes only
             raise type(error)(

@@ -17,6 +17,8 @@ TINY = 1e-300
 class BiExponential:
     """``c1 exp(c2 d) + c3 exp(c4 d)``, d in metres; the faster decay first.
 
+    Source: arXiv 2502.10324 eq. 14.
+
     Parameters
     ----------
     c1, c2, c3, c4 : float
@@ -70,6 +72,8 @@ def fit_biexponential(
     starts: int = 6,
 ) -> BiExponential:
     """Least-squares bi-exponential by variable projection.
+
+    Source: arXiv 2502.10324 eq. 14.
 
     For given rates the best amplitudes are a bounded linear problem of two unknowns with a closed form, so only the
     logarithms of the two rates are searched: a grid over the bounds, then a trust-region search from its ``starts``

@@ -56,7 +56,10 @@ class Score:
 
 
 def score(values: ArrayLike, estimate: ArrayLike) -> Score:
-    """Score estimates (n, ...) against values (n, ...)."""
+    """Score estimates (n, ...) against values (n, ...).
+
+    Source: arXiv 2502.10324 eq. 19.
+    """
     truth, guess = np.asarray(values, dtype=np.float64), np.asarray(estimate, dtype=np.float64)
     if truth.shape != guess.shape:
         raise UsageError(f"values of shape {truth.shape}, estimates of shape {guess.shape}")

@@ -75,6 +75,8 @@ class Weights:
 class OrdinaryKriging:
     """Ordinary Kriging of one or many fields sampled at the same points.
 
+    Source: arXiv 2502.10324 eq. 15; arXiv 2502.10324 eq. 17; arXiv 2502.10324 eq. 18.
+
     Parameters
     ----------
     correlation : callable
@@ -312,7 +314,10 @@ class OrdinaryKriging:
 
 
 def _solve_bordered(gamma: FloatArray, to_target: FloatArray) -> tuple[FloatArray, FloatArray, BoolArray]:
-    """Weights, Lagrange multiplier and whether the system is well conditioned, by batched inversion."""
+    """Weights, Lagrange multiplier and whether the system is well conditioned, by batched inversion.
+
+    Source: arXiv 2502.10324 eq. 16.
+    """
     t, m = to_target.shape
     system = np.ones((t, m + 1, m + 1))
     system[:, :m, :m] = gamma

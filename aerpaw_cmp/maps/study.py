@@ -70,6 +70,8 @@ def rank_fields(
     """Altitudes and joint ranks (n, altitudes, K) to interpolate; the paper leaves 3 m out.
 
     ``out_of_coverage``: a rank of 0 becomes NaN (no sample), or stays the number 0.
+
+    Source: arXiv 2502.10324 eq. 7; arXiv 2502.10324 eq. 8.
     """
     rows = [i for i, height in enumerate(result.rank_altitudes_m) if height >= lowest_altitude_m]
     rank = np.moveaxis(result.ranks()[rows], -1, 0).astype(np.float64)

@@ -54,6 +54,8 @@ PAPER_MAXIMUM_M = 500.0
 class BinnedCorrelation:
     """Correlation (or semivariance) against distance.
 
+    Source: arXiv 2502.10324 eq. 11; arXiv 2502.10324 eq. 12; arXiv 2502.10324 eq. 13.
+
     Parameters
     ----------
     distance_m : (bins,)
@@ -91,6 +93,8 @@ def vector_correlation(
     minimum_common: int = 3,
 ) -> BinnedCorrelation:
     """Pearson correlation of the positions' vectors, binned by horizontal distance (the paper's Steps 1 to 4).
+
+    Source: arXiv 2502.10324 eq. 9; arXiv 2502.10324 eq. 10.
 
     Parameters
     ----------
@@ -296,7 +300,10 @@ class Variogram:
         return self.model_(distance_m)
 
     def semivariance(self, distance_m: ArrayLike, sill: float = 1.0) -> FloatArray:
-        """``sill * (1 - Phi(d))`` at distances [m], in the unit of the sill."""
+        """``sill * (1 - Phi(d))`` at distances [m], in the unit of the sill.
+
+        Source: arXiv 2502.10324 eq. 17.
+        """
         return np.asarray(sill * (1.0 - self.model_(distance_m)))
 
 

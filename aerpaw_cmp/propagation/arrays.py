@@ -96,6 +96,8 @@ class Link:
 def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, roll_rad: FloatArray) -> FloatArray:
     """Device-to-site rotation of 3GPP TR 38.901 eq. (7.1-4): ``Rz(yaw) Ry(pitch) Rx(roll)``.
 
+    Source: 3GPP TR 38.901 eq. 7.1-4.
+
     Parameters
     ----------
     yaw_rad, pitch_rad, roll_rad : array_like, broadcastable to (...)

@@ -14,6 +14,8 @@ def free_space_dbm(
 ) -> FloatArray:
     """Received power between isotropic antennas in empty space (Friis) [dBm].
 
+    Source: ITU-R P.525 eq. 4.
+
     Parameters
     ----------
     sources_m : (towers, 3)
@@ -40,6 +42,8 @@ def two_ray_dbm(
     polarisation: str = "vertical",
 ) -> FloatArray:
     """Line of sight plus one reflection on a flat ground, isotropic antennas [dBm].
+
+    Source: ITU-R P.2040-3 eq. 37.
 
     Parameters
     ----------

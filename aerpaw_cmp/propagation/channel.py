@@ -59,6 +59,8 @@ def channel_matrices(
 ) -> Fields:
     """Channel matrices of a path set.
 
+    Source: arXiv 2502.10324 eq. 1; arXiv 2502.10324 eq. 6.
+
     Parameters
     ----------
     paths : PathSet
@@ -175,6 +177,8 @@ def _mirror(normal: FloatArray, vector: AnyArray) -> AnyArray:
 def _radiate(array: Array, turn: FloatArray, direction: FloatArray, axis: int) -> ComplexArray:
     """Field vectors in site axes.
 
+    Source: 3GPP TR 38.901 section 7.3.2.
+
     Parameters
     ----------
     array : Array
@@ -259,6 +263,8 @@ def reflection_coefficients(
     cos_theta: FloatArray, permittivity: ComplexArray, thickness_m: FloatArray, wavelength: float
 ) -> tuple[ComplexArray, ComplexArray]:
     """Reflection coefficients (TE, TM) of a half-space or a slab in air.
+
+    Source: ITU-R P.2040-3 eq. 37; ITU-R P.2040-3 eq. 43.
 
     Parameters
     ----------

@@ -318,6 +318,8 @@ def trace_back(
 ) -> tuple[FloatArray, BoolArray]:
     """Reflection points of sequences, from the target back to the source.
 
+    Source: arXiv 2502.10324 eq. 4.
+
     Parameters
     ----------
     faces : Faces

@@ -61,7 +61,7 @@ def trace(
     Notes
     -----
     ``H[m, n] = sum_p a_p(m, n)`` over the paths p, each with its own length per pair of elements (spherical waves);
-    ``a_p`` by free space, Fresnel coefficients and the elements' patterns (ITU-R P.2040-3 eqs. (31)-(33)).
+    ``a_p`` by free space, Fresnel coefficients and the elements' patterns (ITU-R P.2040).
 
     Examples
     --------

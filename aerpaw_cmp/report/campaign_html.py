@@ -12,10 +12,12 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ..common.jsonable import json_safe
+from ..compare.result import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .canvas import Picture
-from .export import json_safe, write_atomic
+from .export import write_atomic
 from .html import CONTENT_POLICY, by_section, environment
 from .names import k_key
 from .write import remove_stale
@@ -157,13 +159,13 @@ def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
     ]
 
 
-def halves(data: CampaignData) -> list[tuple[RssRow, Any, Any]]:
+def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
     """Rows whose first and second half pass the same places: with like headings, and with any."""
     found = []
     for row in data.reference_rows:
-        same, every = (row.within.get(name) or {} for name in ("same_heading", "any_heading"))
-        if every.get("n"):
-            found.append((row, same, every))
+        every = row.within.get("any_heading")
+        if every is not None and every.n:
+            found.append((row, row.within.get("same_heading"), every))
     return found
 
 

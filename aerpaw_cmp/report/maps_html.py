@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..common.jsonable import json_safe
 from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
-from .export import json_safe, merge, write_atomic
+from .export import merge, write_atomic
 from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData
 from .names import k_key

@@ -58,7 +58,10 @@ class Isotropic:
 
 @dataclass(frozen=True, slots=True)
 class HalfWaveDipole:
-    """Half-wave dipole along z, 2.15 dBi (Balanis, Antenna Theory, eq. 4-84)."""
+    """Half-wave dipole along z, 2.15 dBi (Balanis, Antenna Theory, eq. 4-84).
+
+    Source: Balanis eq. 4-84.
+    """
 
     name: str = "hw_dipole"
 

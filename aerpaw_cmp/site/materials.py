@@ -113,12 +113,17 @@ class Material:
         )
 
     def conductivity_s_per_m(self, frequency_hz: float) -> float:
-        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's bands."""
+        """Conductivity [S/m] at a frequency [Hz]; UsageError outside the table's bands.
+
+        Source: ITU-R P.2040 table 3.
+        """
         *_, c, d = self._band(frequency_hz)
         return float(c * (frequency_hz / 1e9) ** d)
 
     def relative_permittivity(self, frequency_hz: float) -> complex:
         """Complex relative permittivity at a frequency [Hz]; the imaginary part is negative (loss).
+
+        Source: arXiv 2502.10324 eq. 5; ITU-R P.2040 table 3.
 
         Raises
         ------

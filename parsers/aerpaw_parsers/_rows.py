@@ -116,7 +116,7 @@ class Rows:
     def level(self, values: FloatArray) -> tuple[FloatArray, AnyArray]:
         """Levels with those at or below the floor as NaN, and their flags ``out_of_coverage``."""
         flag, level = self.flag.copy(), np.array(values, dtype=np.float64)
-        silent = ~(level > self.options.floor_db) | ~np.isfinite(level)
+        silent = ~(level > self.options.floor_db)  # +inf is no silence: the limits of all readers flag it
         _lines.add_flag(flag, silent, "out_of_coverage")
         level[silent] = np.nan
         return level, flag

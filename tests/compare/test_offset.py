@@ -245,3 +245,17 @@ def test_the_real_reference_table_reads():
         for g in (10, 40)
     )
     assert high - low == pytest.approx(30.0, abs=2.0)  # 30 dB more gain: full scale 30 dB lower
+
+
+@pytest.mark.parametrize("level", [1e30, -1e30, 1e18, -1e17, 1e308, -1e308, 60.0, -60.0, 50.0, 49.96])
+def test_the_edge_of_the_span_is_told_for_any_input(level: float) -> None:
+    fit = grid_offset([0.0, 0.0], [level, level])
+    assert fit.at_edge
+    assert fit.offset_db == np.sign(level) * 50.0
+    mixed = grid_offset([0.0, 0.0, 0.0], [level, 1.0, 1.0])
+    assert mixed.at_edge == (abs(level) / 3 > 50)
+
+
+def test_inside_the_span_is_not_its_edge() -> None:
+    assert not grid_offset([0.0], [49.9]).at_edge
+    assert not grid_offset([0.0, 0.0], [1e308, -1e308]).at_edge

@@ -10,6 +10,7 @@ import pytest
 import scipy.io
 
 from aerpaw_cmp.logs.ingest import Ingested, ingest
+from aerpaw_cmp.logs.limits import LIMITS, UNSCORED
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
@@ -44,11 +45,28 @@ def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:
         "modem/derived/Serving_cell_Params_ENDC.csv": ("quectel_csv", 2, 0),
         "modem/derived/Serving_cell_Params_LTE_only.csv": ("quectel_csv", 2, 0),
         "srsran/2022-06-10_19_52_35_radio_enb_log.txt": ("srsenb_log", 1690, 0),
+        "srsran/2022-12-01_12-27-19_two_ports_radio_enb_log.txt": ("srsenb_log", 1611, 0),
         "aadm/snr_log.csv": ("aadm_snr", 331, 0),
     }
     for path, account in expected.items():
         result = found[path]
         assert (result.reader, result.accepted, len(result.rejected)) == account, path
+
+
+def test_two_ports_of_srsenb_report_rank_two(everything: Ingested) -> None:
+    """`int(dl_ri)` is 0 without a report and never above the two ports that the console says it opened."""
+    (file,) = (f for f in everything if "two_ports" in f.path)
+    (stream,) = file.result.streams
+    rank = stream.frame["rank"]
+    assert ((rank == 2).sum(), (rank == 1).sum(), rank.isna().sum()) == (1277, 3, 331)
+    assert stream.attributes["ports"] == 2
+    assert not stream.frame["flag"].str.contains("rank_above_ports").any()
+
+
+def test_no_real_value_is_beyond_the_limits(everything: Ingested) -> None:
+    """Limits flag what cannot be: nothing in the real logs."""
+    flags = {w for file in everything for s in file.result.streams for t in s.frame["flag"] for w in t.split(";")}
+    assert not flags & {limit.flag for limit in LIMITS} | flags & set(UNSCORED)
 
 
 def test_other_files_are_not_taken_for_logs(everything: Ingested) -> None:

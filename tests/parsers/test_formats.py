@@ -332,11 +332,24 @@ def test_towers_of_snr_logs() -> None:
     assert stream(console, "LW2").frame["rss_db"].tolist() == [-1.25]
 
 
-def test_srsenb_counts_from_zero() -> None:
-    one = read("srsenb_log", samples.SRSENB).streams[0]
-    assert one.attributes["ri_base"] == "zero"
-    assert one.frame["rank"].fillna(-1).tolist() == [1, 2, -1]
-    assert one.frame["flag"].tolist() == ["", "", "no_csi"]
+def test_srsenb_prints_zero_for_no_report_and_one_for_rank_one() -> None:
+    result = read("srsenb_log", samples.SRSENB)
+    one = result.streams[0]
+    assert one.attributes["ri_base"] == "one"
+    assert one.frame["rank"].fillna(-1).tolist() == [-1, 1, -1]
+    assert one.frame["flag"].tolist() == ["no_csi", "", "no_csi"]
+    assert any("truncated mean" in text for text in result.warnings)
+
+
+def test_srsenb_layout_with_a_pci_column_reads_the_same_numbers() -> None:
+    """Newer versions print the cell's pci before the rnti; an rnti of decimal digits must not be taken for it."""
+    before = read("srsenb_log", samples.SRSENB).streams[0].frame
+    newer = samples.SRSENB.replace(b"rat rnti", b"rat  pci rnti").replace(b"lte   46", b"lte    1   46")
+    assert by_name("srsenb_log").sniff(newer)
+    after = read("srsenb_log", newer).streams[0].frame
+    columns = ["rank", "ri_raw", "cqi", "mcs", "flag"]
+    assert after[columns].equals(before[columns])
+    assert len(after) == 3
 
 
 def test_generic_columns() -> None:

@@ -1,0 +1,213 @@
+"""What a quantity of the record model can be at all: rows beyond it are flagged, whatever the reader.
+
+One table for all formats. A value beyond its range becomes NaN (of a position, an attitude or a velocity all three
+components do: they are one quantity), its row gets a flag, and a warning names how many there are and the first of
+them. Rows with a flag of :data:`UNSCORED` are kept in the records and left out of every comparison.
+
+The ranges are those of physics and of small aircraft, wide on purpose: they catch what cannot be (a corrupted digit, an
+overflow, a sentinel), not what is unusual.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pandas as pd
+
+from ..common.units import AnyArray, BoolArray
+from .records import ReadResult, Stream
+
+
+@dataclass(frozen=True, slots=True)
+class Limit:
+    """Possible values of one quantity.
+
+    Parameters
+    ----------
+    columns : tuple of str
+        Components that are void together.
+    ranges : tuple of (low, high)
+        One per column, both ends possible, in the unit of the column's name.
+    flag : str
+        What rows beyond it get.
+    """
+
+    columns: tuple[str, ...]
+    ranges: tuple[tuple[float, float], ...]
+    flag: str
+
+
+LIMITS: tuple[Limit, ...] = (
+    Limit(
+        ("latitude_deg", "longitude_deg", "altitude_m"),
+        ((-90.0, 90.0), (-180.0, 180.0), (-1000.0, 20_000.0)),
+        "position_out_of_range",
+    ),
+    Limit(
+        ("roll_deg", "pitch_deg", "yaw_deg"),
+        ((-180.0, 180.0), (-180.0, 180.0), (-360.0, 360.0)),
+        "attitude_out_of_range",
+    ),
+    Limit(
+        ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"),
+        ((-200.0, 200.0),) * 3,
+        "velocity_out_of_range",
+    ),
+    Limit(("rsrp_dbm",), ((-200.0, 50.0),), "rsrp_out_of_range"),
+    Limit(("sinr_db",), ((-100.0, 100.0),), "sinr_out_of_range"),
+)
+"""Quantities that mean the same in every stream. Levels (by unit) and times have their own rules below."""
+
+LEVEL_DB = {"dBm": (-200.0, 50.0), "dB": (-200.0, 200.0)}
+"""Levels by unit: thermal noise of 1 Hz is -174 dBm, 50 dBm would burn the receiver; a ratio to the noise is wider."""
+
+LEVEL_OTHER_DB = (-200.0, 100.0)
+"""Levels re full scale, gain taken off: real sounder logs reach 33 dB."""
+
+APART_S = 86_400.0
+"""A few rows further than a day from all others have a damaged stamp: no log is silent for a day and goes on."""
+
+FEW_SHARE = 0.01
+FEW_ROWS = 3
+"""At most this share, or this many, are "a few"."""
+
+UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports")
+"""Flags of rows that no comparison scores. (The other flags void the doubtful value itself.)"""
+
+
+def check(result: ReadResult) -> ReadResult:
+    """A read result with its impossible values flagged; the same object where there are none.
+
+    Parameters
+    ----------
+    result : ReadResult
+        Of any reader.
+
+    Returns
+    -------
+    ReadResult
+        Streams with flags and NaN, and one more warning per stream and flag.
+    """
+    warnings: list[str] = []
+    streams = tuple(_checked(stream, warnings) for stream in result.streams)
+    return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
+
+
+def flagged(frame: pd.DataFrame, reasons: tuple[str, ...] = UNSCORED) -> BoolArray:
+    """Rows (n,) that carry one of the flags."""
+    flag = frame["flag"].to_numpy(dtype=object)
+    out = np.zeros(len(flag), dtype=np.bool_)
+    for i in np.flatnonzero(flag != ""):
+        out[i] = any(word in reasons for word in str(flag[i]).split(";"))
+    return out
+
+
+def _checked(stream: Stream, warnings: list[str]) -> Stream:
+    frame = stream.frame
+    for limit in _limits_of(stream):
+        frame = _apply(stream, frame, limit, warnings)
+    if stream.kind == "rank":
+        frame = _within_ports(stream, frame, warnings)
+    frame = _near_in_time(stream, frame, warnings)
+    return stream if frame is stream.frame else replace(stream, frame=frame)
+
+
+def _limits_of(stream: Stream) -> tuple[Limit, ...]:
+    if stream.kind != "rss":
+        return LIMITS
+    bounds = LEVEL_DB.get(str(stream.attributes.get("unit")), LEVEL_OTHER_DB)
+    return (*LIMITS, Limit(("rss_db",), (bounds,), "level_out_of_range"))
+
+
+def _apply(stream: Stream, frame: pd.DataFrame, limit: Limit, warnings: list[str]) -> pd.DataFrame:
+    names = [name for name in limit.columns if name in frame.columns]
+    first: tuple[int, str, tuple[float, float]] | None = None
+    bad = np.zeros(len(frame), dtype=np.bool_)
+    for name, (low, high) in zip(limit.columns, limit.ranges, strict=True):
+        if name not in names:
+            continue
+        value = frame[name].to_numpy(dtype=np.float64)
+        if not len(value) or (low <= np.fmin.reduce(value) and np.fmax.reduce(value) <= high):
+            continue
+        beyond = (value < low) | (value > high)
+        if beyond.any() and (first is None or int(np.argmax(beyond)) < first[0]):
+            first = int(np.argmax(beyond)), name, (low, high)
+        bad |= beyond
+    if first is None:
+        return frame
+    row, name, (low, high) = first
+    shown = (
+        f"{name} {frame[name].iloc[row]:.6g} in line {int(frame['line'].iloc[row])}, where {low:g} .. {high:g} can be"
+    )
+    scored = "; not scored" if limit.flag in UNSCORED else "; read as missing"
+    swap = _exchanged(frame, bad) if "latitude_deg" in names else ""
+    warnings.append(_sentence(stream, int(bad.sum()), limit.flag, f"the first: {shown}{swap}{scored}"))
+    return _marked(frame, bad, limit.flag, names)
+
+
+def _exchanged(frame: pd.DataFrame, bad: BoolArray) -> str:
+    """A hint where every impossible position would be possible with its angles exchanged."""
+    latitude = np.abs(frame["latitude_deg"].to_numpy(dtype=np.float64)[bad])
+    longitude = np.abs(frame["longitude_deg"].to_numpy(dtype=np.float64)[bad])
+    fits = (latitude > 90.0) & (latitude <= 180.0) & (longitude <= 90.0)
+    return "; are latitude and longitude exchanged?" if fits.all() else ""
+
+
+def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
+    """No rank is above the number of ports that the log itself tells."""
+    ports = stream.attributes.get("ports")
+    if not isinstance(ports, (int, float)) or isinstance(ports, bool):
+        return frame
+    rank = frame["rank"].to_numpy(dtype=np.float64)
+    bad = rank > float(ports)
+    if not bad.any():
+        return frame
+    row = int(np.argmax(bad))
+    text = (
+        f"the first: rank {rank[row]:g} in line {int(frame['line'].iloc[row])}, on at most {ports:g} ports by the log "
+        "itself; a wrong base of the indicator, or another cell; not scored"
+    )
+    warnings.append(_sentence(stream, int(bad.sum()), "rank_above_ports", text))
+    return _marked(frame, bad, "rank_above_ports", ["rank"])
+
+
+def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
+    """Flag a few stamps that lie days from all the others."""
+    stamp = frame["time"].to_numpy("datetime64[ns]").astype(np.int64)
+    timed = ~np.isnat(frame["time"].to_numpy("datetime64[ns]"))
+    if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= APART_S * 1e9:
+        return frame
+    order = np.argsort(np.where(timed, stamp, np.iinfo(np.int64).max), kind="stable")[: int(timed.sum())]
+    group = np.concatenate(([0], np.cumsum(np.diff(stamp[order].astype(np.float64)) > APART_S * 1e9)))
+    size = np.bincount(group)
+    if 2 * size.max() <= len(order):
+        return frame  # no main part: two flights in one file, not a few bad stamps
+    few = size <= max(FEW_ROWS, FEW_SHARE * len(order))
+    few[int(np.argmax(size))] = False
+    bad = np.zeros(len(frame), dtype=np.bool_)
+    bad[order[few[group]]] = True
+    if not bad.any():
+        return frame
+    row = int(np.argmax(bad))
+    shown = f"the first: {np.datetime_as_string(frame['time'].to_numpy('datetime64[ns]')[row], unit='s')}"
+    text = f"{shown} in line {int(frame['line'].iloc[row])}, days from all others; not scored"
+    warnings.append(_sentence(stream, int(bad.sum()), "time_out_of_range", text))
+    return _marked(frame, bad, "time_out_of_range", [])
+
+
+def _sentence(stream: Stream, count: int, flag: str, text: str) -> str:
+    rows = "1 row is" if count == 1 else f"{count} rows are"
+    return f"{stream.kind} {stream.name!r}: {rows} flagged {flag}; {text}"
+
+
+def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: list[str]) -> pd.DataFrame:
+    column: AnyArray = frame["flag"].to_numpy(dtype=object).copy()
+    for i in np.flatnonzero(bad):
+        words = str(column[i]).split(";") if column[i] else []
+        column[i] = ";".join([*words, flag] if flag not in words else words)
+    out: pd.DataFrame = frame.copy()
+    out["flag"] = pd.Series(column, index=frame.index, dtype=object)
+    for name in void:
+        out[name] = np.where(bad, np.nan, frame[name].to_numpy(dtype=np.float64))
+    return out

@@ -1,0 +1,36 @@
+"""docs/equations.md against the code: every function is there and names its equation back."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import re
+import runpy
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+SCRIPT = runpy.run_path(str(ROOT / "tools" / "equation_lines.py"))
+ROWS = [m for m in map(SCRIPT["ROW"].match, (ROOT / "docs" / "equations.md").read_text().splitlines()) if m]
+
+
+@pytest.mark.parametrize("row", ROWS, ids=lambda row: f"{row['equation']}-{row['function']}")
+def test_the_function_exists_and_names_the_equation(row: re.Match[str]) -> None:
+    room, module, *names = row["function"].split(".")
+    thing = importlib.import_module(f"aerpaw_cmp.{room}.{module}")
+    for name in names:
+        thing = getattr(thing, name)
+    text = " ".join((inspect.getdoc(thing) or "").split())
+    assert re.search(re.escape(row["equation"]) + r"(?!\d)", text), f"the docstring does not name {row['equation']}"
+
+
+def test_all_displayed_equations_of_the_paper_are_there() -> None:
+    found = {int(n) for row in ROWS for n in re.findall(r"arXiv 2502\.10324 eq\. (\d+)", row["equation"])}
+    assert found == set(range(1, 20))
+
+
+def test_the_lines_are_those_of_the_code() -> None:
+    for row in ROWS:
+        SCRIPT["place"](row["function"])  # LookupError where a name is gone
+    assert SCRIPT["place"]("compare.rank.channel_rank").startswith("aerpaw_cmp/compare/rank.py:")

@@ -135,6 +135,16 @@ class _Prediction:
         self.terms = columns[:, 1:]
         self.term_slopes = np.gradient(self.terms, step, axis=0) if self.terms.shape[1] else self.terms
 
+    def times(self) -> FloatArray:
+        """Where it is sampled [s]."""
+        return np.asarray(self.first + self.step * np.arange(len(self.level)))
+
+    def beside(self, terms: ArrayLike) -> _Prediction:
+        """The same level with free terms (n, q) beside it."""
+        columns = np.column_stack([self.level, np.asarray(terms, dtype=np.float64)])
+        good = np.isfinite(columns).all(axis=1, keepdims=True)
+        return _Prediction(self.first, self.step, np.where(good, columns, np.nan))
+
     def terms_at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """The free terms at t, a constant first (n, 1 + terms); NaN as for :meth:`at`."""
         source = self.terms if values is None else values

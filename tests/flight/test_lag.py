@@ -163,11 +163,11 @@ def patterned_flight(seed, pattern_db=6.0):
 def test_unknown_patterns_are_fitted_while_the_lag_is_found():
     level, predictor, free_space = patterned_flight(1)
     t = np.arange(0, 600, 0.25)
-    measured = level(t - 1.7) - 30 + np.random.default_rng(2).normal(0, 3, len(t))
+    measured = level(t + 1.7) - 30 + np.random.default_rng(2).normal(0, 3, len(t))
     fit = estimate_lag(t, measured, predictor)
     assert fit.verdict == "ok", fit.reason
-    assert abs(fit.radio_minus_telemetry_s - 1.7) < 0.1
-    assert fit.ci95_s[0] <= 1.7 <= fit.ci95_s[1]
+    assert abs(fit.radio_minus_telemetry_s + 1.7) < 0.1
+    assert fit.ci95_s[0] <= -1.7 <= fit.ci95_s[1]
     assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
     # without the terms, the pattern that turns with the UAV hides the lag
     assert estimate_lag(t, measured, free_space).verdict != "ok"
@@ -178,13 +178,13 @@ def test_channels_that_share_a_clock_add_their_evidence():
     fits = []
     for seed in (3, 4):
         level, predictor, _ = patterned_flight(1, pattern_db=1.2)
-        measured = level(t + 2.2) + np.random.default_rng(seed).normal(0, 3, len(t))
+        measured = level(t - 2.2) + np.random.default_rng(seed).normal(0, 3, len(t))
         fits.append(estimate_lag(t, measured, predictor))
     both = combine_lags(fits)
-    assert abs(both.radio_minus_telemetry_s + 2.2) < 0.5
+    assert abs(both.radio_minus_telemetry_s - 2.2) < 0.5
     assert both.n == sum(fit.n for fit in fits)
     assert np.ptp(both.ci95_s) <= max(np.ptp(fit.ci95_s) for fit in fits)
-    assert both.ci95_s[0] <= -2.2 <= both.ci95_s[1]
+    assert both.ci95_s[0] <= 2.2 <= both.ci95_s[1]
     assert combine_lags(fits[:1]) is fits[0]
     failed = estimate_lag(t[:5], t[:5], predictor)
     assert combine_lags([failed, fits[0]]) is fits[0]

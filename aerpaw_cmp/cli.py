@@ -18,6 +18,7 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
+Force = Annotated[bool, typer.Option("--force", help="Replace also what this tool did not write; never an input.")]
 LogsRoot = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
@@ -148,6 +149,7 @@ def ingest(
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
     ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Read logs, account for every line, write the flight file."""
@@ -157,7 +159,7 @@ def ingest(
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
-    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, **options)
+    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
     if as_json:
         _print_json(summary)
         return
@@ -202,12 +204,15 @@ def report(
     engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
     audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
     from .jobs import run
 
-    outcome = run.run_report(flight, out=out, logs_root=logs_root, engine=engine, audit=audit, progress=_say)
+    outcome = run.run_report(
+        flight, out=out, logs_root=logs_root, engine=engine, audit=audit, force=force, progress=_say
+    )
     if as_json:
         _print_json(outcome.metrics)
     else:
@@ -271,11 +276,12 @@ def _number(value: float | None, form: str) -> str:
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
     out: Out = None,
+    force: Force = False,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
     from .jobs import run
 
-    for path in run.run_simulate(flight, out=out, progress=_say):
+    for path in run.run_simulate(flight, out=out, force=force, progress=_say):
         print(path)
 
 
@@ -311,6 +317,7 @@ def tap(
     export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
     flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
+    force: Force = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     if export is not None:
@@ -318,7 +325,7 @@ def tap(
             raise UsageError(f"--export {export!r}", expected="csv")
         from .live.export import export_csv
 
-        print(export_csv(out, out / "tap.csv"))
+        print(export_csv(out, out / "tap.csv", force=force))
         return 0
     from .live.log import LogSettings
     from .live.session import TapSettings, format_status
@@ -454,11 +461,12 @@ def site_import(
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
     base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
     untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
+    force: Force = False,
 ) -> None:
     """Import footprints."""
     from .jobs import run
 
-    for line in run.run_site_import(files, out, base=base, untagged=untagged):
+    for line in run.run_site_import(files, out, base=base, untagged=untagged, force=force):
         _say(line)
     print(out)
 
@@ -471,11 +479,13 @@ def site_show(
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+    force: Force = False,
 ) -> None:
     """Look at a site."""
     from .jobs import run
 
-    for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
+    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
+    for path in shown:
         print(path)
 
 
@@ -518,6 +528,7 @@ def map_(
         typer.Option(help="A level below it is out of coverage. Default: only no path is."),
     ] = None,
     study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
@@ -532,6 +543,7 @@ def map_(
         quick=quick,
         flight=flight,
         logs_root=logs_root,
+        force=force,
         progress=_say,
         foliage=modes,
         crown_reflections=crown_reflections,
@@ -566,13 +578,14 @@ def campaign(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Many flights and settings, with what can be said only of several flights."""
     from .jobs import run
 
     outcome = run.run_campaign(
-        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, progress=_say
+        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, force=force, progress=_say
     )
     if as_json:
         _print_json(outcome.metrics)

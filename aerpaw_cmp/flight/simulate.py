@@ -7,7 +7,8 @@ its ``logs`` say which files to write and in which format (by ``reader``). The s
 
 from __future__ import annotations
 
-import json
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
+from ..common.outputs import OutputSet
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray, IntArray
 from ..compare.rank import channel_rank
@@ -26,6 +28,8 @@ from ..propagation.tracer import replay
 from ..site.site import Site
 from .settings import FlightFile, LogSettings, PlanSettings
 
+TRUTH = "truth.json"
+"""What was planted, and the SHA-256 of every synthetic log."""
 LOWEST_DBM = -400.0
 """Below this the simulated level is no signal."""
 
@@ -170,13 +174,27 @@ class FlightSimulator:
         self.site = site
         self.folder = folder
 
-    def run(self, out: Path, *, progress: Progress = silent) -> list[Path]:
+    def run(
+        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = silent
+    ) -> list[Path]:
         """Write every log of the flight file and truth.json below ``out``; gives the paths written.
+
+        Parameters
+        ----------
+        out : Path
+            Made when missing.
+        inputs : iterable of Path
+            Files that must not be replaced: the flight file and what it names.
+        force : bool
+            Replace logs that truth.json does not list as synthetic, too.
 
         Raises
         ------
         UsageError
-            Without a plan or a time zone, for readers that have no writer, for towers the site does not have.
+            Without a plan or a time zone, for readers that have no writer, for towers the site does not have, where
+            a log that is not marked synthetic is in the way.
+        OutputError
+            If the disk does not take them.
         """
         plan = self.settings.flight.plan
         if plan is None:
@@ -189,20 +207,26 @@ class FlightSimulator:
         start = pd.Timestamp(plan.start.replace(tzinfo=None)).tz_localize(self.settings.timezone)
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
-        out.mkdir(parents=True, exist_ok=True)
-        written = []
-        for log in self.settings.logs:
-            progress(log.path)
-            data, damage = self._with_bad_lines(self._log_bytes(log))
-            path = out / log.path
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-            self.truth_.setdefault("bad_lines", {})[log.path] = damage
-            written.append(path)
-        self.truth_["plan"] = plan.model_dump(mode="json")
-        path = out / "truth.json"
-        path.write_text(json.dumps(self.truth_, indent=1) + "\n", encoding="utf-8")
-        return [*written, path]
+        names = self._names(out)
+        with OutputSet(out, listing=TRUTH, names=names, inputs=inputs, force=force) as output:
+            contents = {}
+            for log in self.settings.logs:
+                progress(log.path)
+                contents[log.path], damage = self._with_bad_lines(self._log_bytes(log))
+                self.truth_.setdefault("bad_lines", {})[log.path] = damage
+            self.truth_["plan"] = plan.model_dump(mode="json")
+            return output.write(contents, self.truth_)
+
+    def _names(self, out: Path) -> list[str]:
+        """The logs of the flight file; UsageError for those that would lie outside ``out``, or twice."""
+        names = [log.path for log in self.settings.logs]
+        for name in names:
+            place = Path(os.path.normpath(out / name))
+            if Path(name).is_absolute() or Path(os.path.normpath(out)) not in place.parents:
+                raise UsageError(f"log {name!r} lies outside the folder of the logs", expected="a path below it")
+            if names.count(name) > 1 or name == TRUTH:
+                raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
+        return names
 
     def _log_bytes(self, log: LogSettings) -> bytes:
         writers = {

@@ -54,7 +54,6 @@ from ..propagation.paths import PathSet
 from ..propagation.scene import Scene
 from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
-from ..report.export import make_folder
 from ..site.site import Site
 from .what_if import p833_note
 
@@ -631,7 +630,6 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
-    make_folder(folder)
     written = [
         export.write_csv(folder / "layers.csv", grid, site.frame, every),
         export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),

@@ -3,52 +3,75 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import UsageError
+from ..common.errors import AerpawCmpError, UsageError
+from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
 from ..site.site import Site
 
 
 def run_ingest(
-    paths: list[Path], *, out: Path | None = None, draft: Path | None = None, reader: str | None = None, **options: Any
+    paths: list[Path],
+    *,
+    out: Path | None = None,
+    draft: Path | None = None,
+    reader: str | None = None,
+    force: bool = False,
+    **options: Any,
 ) -> dict[str, Any]:
     """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3.
 
     With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
+    With ``force``, the two may replace files that this tool did not write, but no input.
     """
-    from ..logs.flight_file import write_flight
+    from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
     from ..logs.readers import ReadOptions
 
-    if draft is not None:
-        from ..flight.draft import check_target, write_draft
+    if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
+        raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
+    with ExitStack() as outputs:  # a wrong name is told before the logs are read
+        target = None
+        if out is not None:
+            target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
+        if draft is not None:
+            from ..flight.draft import draft as draft_of
 
-        check_target(draft)
-    files = ingest(paths, options=ReadOptions(**options), reader=reader)
-    if out is not None:
-        write_flight(out, files)
-    account = summary(files)
-    if draft is not None:
-        told = {key: options.get(key) for key in ("timezone", "time_origin")}
-        account["draft"] = write_draft(files, draft, **told)
+            drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
+        files = ingest(paths, options=ReadOptions(**options), reader=reader)
+        account = summary(files)
+        if draft is not None:
+            told = {key: options.get(key) for key in ("timezone", "time_origin")}
+            text, account["draft"] = draft_of(files, drafted.target.parent, **told)
+            drafted.write(sealed(text))
+        if target is not None:
+            target.write(flight_bytes(files))
     return account
 
 
-def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = silent) -> list[Path]:
-    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``."""
+def run_simulate(
+    flight: Path, *, out: Path | None = None, force: bool = False, progress: Progress = silent
+) -> list[Path]:
+    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``.
+
+    A log that is not marked as synthetic (in truth.json) is replaced with ``force`` only.
+    """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
     from ..flight.simulate import FlightSimulator
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)
-    return FlightSimulator(settings, site, flight.parent).run(out or flight.parent, progress=progress)
+    simulator = FlightSimulator(settings, site, flight.parent)
+    inputs = [flight, flight.parent / settings.site.file]
+    return simulator.run(out or flight.parent, inputs=inputs, force=force, progress=progress)
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +90,7 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
+    force: bool = False,
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
@@ -76,12 +100,45 @@ def run_report(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    from ..flight.data import gather, read_logs
     from ..flight.settings import load_flight
+    from ..report.export import metrics as metrics_of
+    from ..report.write import write_report
 
-    stages = Stages(progress)
+    settings = _overridden(load_flight(flight), engine, audit)
+    inputs = input_files(settings, flight, logs_root)
+    folder = out or Path("reports") / settings.flight.name
+    with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
+        record = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+        with output.filling() as place:
+            write_report(record, place)
+    metrics = metrics_of(record)
+    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
+    """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
+    roots = [path.parent] if logs_root is None else [path.parent, logs_root]
+    named = [root / text for text in _texts(settings.model_dump()) for root in roots if text and "\0" not in text]
+    return [path, *(file for file in dict.fromkeys(named) if os.path.isfile(file))]  # noqa: PTH113  never raises
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in nested settings."""
+    if isinstance(value, (str, Path)):
+        yield str(value)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item)
+
+
+def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
+    """The record of a report: read, replay, compare, audit."""
+    from ..flight.data import gather, read_logs
+
     with stages("read"):
-        settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files, logs_root)
     from .flight_run import run_flight
@@ -95,17 +152,11 @@ def run_report(
             from .speed_table import speed_rows
 
             speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
-    with stages("report"):
-        from ..report.build import report_data
-        from ..report.export import metrics as metrics_of
-        from ..report.write import write_report
+    stages.progress("report")
+    from ..report.build import report_data
 
-        notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-        record = report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
-        folder = out or Path("reports") / settings.flight.name
-        write_report(record, folder)
-        metrics = metrics_of(record)
-    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+    notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
+    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -169,13 +220,15 @@ def run_bench(
 
 
 def run_site_import(
-    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None
+    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
 ) -> list[str]:
     """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
-    from ..site.footprints import import_site, write_site_yaml
+    from ..site.footprints import import_site, site_yaml
 
-    model, actions = import_site(files, base=base, untagged=untagged)
-    write_site_yaml(model, out, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+    with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
+        model, actions = import_site(files, base=base, untagged=untagged)
+        text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+        output.write(sealed(text))
     return actions
 
 
@@ -187,6 +240,7 @@ def run_site_show(
     logs_root: Path | None = None,
     pose: int | None = None,
     export: bool = False,
+    force: bool = False,
 ) -> list[Path]:
     """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
 
@@ -197,28 +251,34 @@ def run_site_show(
 
     if pose is not None and flight is None:
         raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
-    track, paths = None, ()
-    if flight is None:
-        place = load_site(site or "lake_wheeler")
-    else:
-        from ..flight.data import gather, read_logs
+    settings, inputs = None, [Path(site)] if site is not None else []
+    if flight is not None:
         from ..flight.settings import load_flight
-        from ..report.build import track_of
 
         settings = load_flight(flight)
         if site is not None:
             file = str(Path(site).resolve()) if Path(site).is_file() else site
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
-        data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
-        place, track = data.site, track_of(data)
-        if pose is not None:
-            paths = _paths_of_pose(settings, place, track, pose)
-    written = write_site_view(place, out, track=track, paths=paths)
-    if export:
-        from ..site.export import export_scene
+        inputs += input_files(settings, flight, logs_root)
+    track, paths = None, ()
+    with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
+        if flight is None or settings is None:
+            place = load_site(site or "lake_wheeler")
+        else:
+            from ..flight.data import gather, read_logs
+            from ..report.build import track_of
 
-        written += export_scene(place, out / "scene")
-    return written
+            data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+            place, track = data.site, track_of(data)
+            if pose is not None:
+                paths = _paths_of_pose(settings, place, track, pose)
+        with output.filling() as folder:
+            written = write_site_view(place, folder, track=track, paths=paths)
+            if export:
+                from ..site.export import export_scene
+
+                written += export_scene(place, folder / "scene")
+    return [out / path.relative_to(folder) for path in written]
 
 
 def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> Any:
@@ -309,7 +369,7 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, progress: Progress = silent, **options: Any,
+    logs_root: Path | None = None, force: bool = False, progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -337,28 +397,32 @@ def run_map(
     place = load_site(site)
     name = Path(site).stem
     folder = out or Path("reports") / f"map-{name}"
+    inputs = [Path(site), *([] if flight is None else [flight])]
     stages = Stages(progress)
-    outcome = mapping.make_maps(place, settings, stages)
-    if settings.study:
-        if flight is not None:
-            outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
-        mapping.study_maps(outcome, stages)
-    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    with stages("export"):
-        files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
-    progress("page")
-    record = mapping.maps_record(
-        outcome,
-        name=name,
-        generated=generated,
-        versions=versions(),
-        stages_s=stages.seconds,
-        paper=paper_rows(outcome),
-    )
-    written = write_maps(record, folder)
-    written.append(folder / "paper.md")
-    written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
-    return MapsOutcome(folder, (*written, *files), maps_metrics(record))
+    with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
+        outcome = mapping.make_maps(place, settings, stages)
+        if settings.study:
+            if flight is not None:
+                outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
+            mapping.study_maps(outcome, stages)
+        generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        with output.filling() as part:
+            with stages("export"):
+                files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
+            progress("page")
+            record = mapping.maps_record(
+                outcome,
+                name=name,
+                generated=generated,
+                versions=versions(),
+                stages_s=stages.seconds,
+                paper=paper_rows(outcome),
+            )
+            written = write_maps(record, part)
+            written.append(part / "paper.md")
+            written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
+    results = tuple(folder / path.relative_to(part) for path in (*written, *files))
+    return MapsOutcome(folder, results, maps_metrics(record))
 
 
 def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
@@ -394,6 +458,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
@@ -405,23 +470,30 @@ def run_campaign(
     """
     from dataclasses import replace
 
+    from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
     from .campaign import load_campaign
     from .campaign import run as run_all
 
     stages = Stages(progress)
-    data = run_all(
-        load_campaign(path),
-        path.parent,
-        logs_root=logs_root,
-        workers=workers,
-        cluster=cluster,
-        stage=stages,
-        progress=progress,
-    )
-    folder = out or Path("reports") / data.name
-    with stages("report"):
-        write_campaign(replace(data, stages_s=dict(stages.seconds)), folder)
+    campaign = load_campaign(path)
+    inputs = input_files(campaign, path)
+    for entry in campaign.flights:
+        with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
+            inputs += input_files(load_flight(path.parent / entry), path.parent / entry, logs_root)
+    folder = out or Path("reports") / campaign.campaign
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output:
+        data = run_all(
+            campaign,
+            path.parent,
+            logs_root=logs_root,
+            workers=workers,
+            cluster=cluster,
+            stage=stages,
+            progress=progress,
+        )
+        with stages("report"), output.filling() as place:
+            write_campaign(replace(data, stages_s=dict(stages.seconds)), place)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:

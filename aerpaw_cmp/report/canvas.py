@@ -20,7 +20,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
-from .export import write_atomic
+from .export import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -150,8 +150,8 @@ def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], 
     for plate in plates:
         picture = render(plate)
         drawn.append(picture)
-        written.append(write_atomic(folder / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / f"{picture.name}.png", picture.png))
+        written.append(write_file(folder / f"{picture.name}.svg", picture.svg))
+        written.append(write_file(folder / f"{picture.name}.png", picture.png))
     return drawn, written
 
 

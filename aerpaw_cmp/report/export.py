@@ -8,8 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.files import write_whole
 from ..common.jsonable import json_safe
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
@@ -244,18 +242,11 @@ def _times(time: Any) -> dict[str, Any]:
     return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
 
 
-def make_folder(folder: Path) -> Path:
-    """The folder, made when missing; UsageError where it cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        cause = "a file is in the way, or there is no right to write here"
-        raise UsageError(f"the folder cannot be made ({error.strerror})", cause=cause, path=folder) from None
-    return folder
+def write_file(path: Path, content: str | bytes) -> Path:
+    """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
 
-
-def write_atomic(path: Path, content: str | bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
-    make_folder(path.parent)
-    write_whole(path, content)
+    The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
+    """
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     return path

@@ -87,7 +87,8 @@ def rss_verdict(panel: RssPanel) -> str:
     best = min(scored, key=lambda b: b.rmse_db)
     if best.paired is None:
         return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
-    words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than").replace("-", "\u2212")
+    words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
+    words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
     return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
 
 

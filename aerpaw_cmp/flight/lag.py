@@ -45,7 +45,7 @@ FEWEST = 30
 """Fewer samples tell nothing about a lag."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LagFit:
     """Offset and drift between the radio and the telemetry clock.
 
@@ -304,20 +304,20 @@ def no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
     """A failed fit."""
     nan = float("nan")
     return LagFit(
-        nan,
-        (-window_s, window_s),
-        0.0,
-        (nan, nan),
-        "failed",
-        reason,
-        0.0,
-        n,
-        nan,
-        nan,
-        window_s,
-        lags,
-        np.full(len(lags), nan),
-        np.zeros(len(lags)),
+        radio_minus_telemetry_s=nan,
+        ci95_s=(-window_s, window_s),
+        drift_s_per_s=0.0,
+        drift_interval_s_per_s=(nan, nan),
+        verdict="failed",
+        reason=reason,
+        reference=0.0,
+        n=n,
+        rmse_db=nan,
+        rmse_unshifted_db=nan,
+        window_s=window_s,
+        curve_lag_s=lags,
+        curve_rmse_db=np.full(len(lags), nan),
+        evidence=np.zeros(len(lags)),
     )
 
 
@@ -424,9 +424,21 @@ def fit_lag(
         verdict, reason = "ambiguous", "at its best lag the prediction explains no more than a constant"
     nan = float("nan")
     return LagFit(
-        lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
-        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain), ratio[:-1],
-    )  # fmt: skip
+        radio_minus_telemetry_s=lag,
+        ci95_s=interval,
+        drift_s_per_s=rate,
+        drift_interval_s_per_s=(rate - rate_width, rate + rate_width) if drifting else (nan, nan),
+        verdict=verdict,
+        reason=reason,
+        reference=middle,
+        n=len(t),
+        rmse_db=rmse,
+        rmse_unshifted_db=float(np.sqrt(plain[len(lags) // 2])),
+        window_s=float(lags[-1]),
+        curve_lag_s=lags,
+        curve_rmse_db=np.sqrt(plain),
+        evidence=ratio[:-1],
+    )
 
 
 def _between(cost: FloatArray, lags: FloatArray, cost_at: Callable[[float], float]) -> float:
@@ -582,7 +594,10 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
     total = total - total.min()
     sharp = min(heard, key=lambda fit: fit.ci95_s[1] - fit.ci95_s[0])
     best = float(lags[best_of(np.where(total > 0, total, 0.0) + 1.0, lags)])
-    near = abs(sharp.radio_minus_telemetry_s - best) <= lags[1] - lags[0]  # the sharpest fit is finer than the grid
+    step = float(lags[1] - lags[0])
+    near = abs(sharp.radio_minus_telemetry_s - best) <= step  # the sharpest fit is finer than the grid
+    # valleys narrower than a step fall between its points: fits that agree among themselves are believed
+    near |= all(abs(fit.radio_minus_telemetry_s - sharp.radio_minus_telemetry_s) <= 0.5 * step for fit in heard)
     lag = sharp.radio_minus_telemetry_s if near else best
     width = 0.5 * float(lags[1] - lags[0])
     if near and sharp.verdict == "ok":
@@ -595,6 +610,18 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
 
     curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in heard], axis=0) / count)
     return LagFit(
-        lag, interval, sharp.drift_s_per_s, sharp.drift_interval_s_per_s, verdict, reason, sharp.reference, count,
-        pooled("rmse_db"), pooled("rmse_unshifted_db"), heard[0].window_s, lags, curve, total,
-    )  # fmt: skip
+        radio_minus_telemetry_s=lag,
+        ci95_s=interval,
+        drift_s_per_s=sharp.drift_s_per_s,
+        drift_interval_s_per_s=sharp.drift_interval_s_per_s,
+        verdict=verdict,
+        reason=reason,
+        reference=sharp.reference,
+        n=count,
+        rmse_db=pooled("rmse_db"),
+        rmse_unshifted_db=pooled("rmse_unshifted_db"),
+        window_s=heard[0].window_s,
+        curve_lag_s=lags,
+        curve_rmse_db=curve,
+        evidence=total,
+    )

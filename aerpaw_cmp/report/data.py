@@ -90,6 +90,8 @@ class Baseline:
         Received power at the samples of the panel.
     offset_db, rmse_db : float
         Best offset of the measurement against this model, and what it leaves.
+    paired : PairedDifference, optional
+        The ray tracing against this model on the same samples.
     """
 
     name: str

@@ -20,6 +20,7 @@ from ..site.site import Site
 from .canvas import seconds_since, spread_out, start_of
 from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel
 from .names import k_key
+from .shapes import listed, outline, walls
 from .words import pretty
 
 POINTS = 50_000
@@ -209,8 +210,6 @@ def _paths(paths: PosePaths, start: np.datetime64) -> dict[str, Any]:
 
 def scene(site: Site) -> dict[str, Any]:
     """Towers, buildings, trees and forests as plain lists, rounded to 0.1 m."""
-    from .site_view import listed, outline, walls
-
     trees, pick = site.trees, spread_out(len(site.trees), TREES)
     columns = ("east_m", "north_m", "ground_m", "height_m", "crown_diameter_m", "crown_base_m")
     return {

@@ -18,6 +18,7 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
+Force = Annotated[bool, typer.Option("--force", help="Replace also what this tool did not write; never an input.")]
 LogsRoot = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
@@ -35,30 +36,62 @@ def main(arguments: list[str]) -> int:
         if hasattr(error, "format_message") and hasattr(error, "exit_code"):
             raise UsageError(error.format_message()) from error
         raise
+    finally:
+        _say.end()
     return result if isinstance(result, int) else 0
 
 
-def _say(text: str) -> None:
-    """Progress goes to standard error, so that standard output stays clean; "... 40 %" becomes a bar.
+class _Progress:
+    """Progress on standard error, so that standard output stays clean.
 
-    On a terminal the bar is redrawn in place; elsewhere only every quarter is a line.
+    On a terminal a share is a bar with the time left; elsewhere every quarter is a line.
     """
-    name, _, share = text.removesuffix(" %").rpartition(" ")
-    if not (text.endswith(" %") and share.isdigit()):
-        print(text, file=sys.stderr, flush=True)
-        return
-    percent = int(share)
-    if sys.stderr.isatty():
-        filled = percent * 30 // 100
-        end = "\n" if percent >= 100 else ""
-        print(f"\r\033[K{name} [{'#' * filled}{'.' * (30 - filled)}] {percent} %", end=end, file=sys.stderr, flush=True)
-    elif percent // 25 != _said.get(name, 0):
-        _said[name] = percent // 25
-        print(text, file=sys.stderr, flush=True)
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._quarters: dict[str, int] = {}
+
+    def __call__(self, text: str, fraction: float | None = None, /) -> None:
+        if fraction is None:
+            self.end()
+            print(text, file=sys.stderr, flush=True)
+        elif sys.stderr.isatty():
+            self._draw(text, fraction)
+        elif int(4 * fraction) > self._quarters.get(text, 0):
+            self._quarters[text] = int(4 * fraction)
+            print(f"{text} {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+
+    def _draw(self, text: str, fraction: float) -> None:
+        if self._bar is None or self._bar.tasks[0].description != text:
+            self.end()
+            self._bar = _bar()
+            self._bar.add_task(text, total=1.0)
+            self._bar.start()
+        self._bar.update(self._bar.tasks[0].id, completed=fraction)
+        if fraction >= 1.0:
+            self.end()
+
+    def end(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
 
 
-_said: dict[str, int] = {}
-"""Quarter that was last said of each stage."""
+def _bar() -> Any:
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+    )
+    return progress.Progress(*columns, console=Console(stderr=True))
+
+
+_say = _Progress()
 
 
 def _print_json(value: dict[str, Any]) -> None:
@@ -116,6 +149,7 @@ def ingest(
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
     ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Read logs, account for every line, write the flight file."""
@@ -125,7 +159,7 @@ def ingest(
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
-    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, **options)
+    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
     if as_json:
         _print_json(summary)
         return
@@ -170,12 +204,15 @@ def report(
     engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
     audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
     from .jobs import run
 
-    outcome = run.run_report(flight, out=out, logs_root=logs_root, engine=engine, audit=audit, progress=_say)
+    outcome = run.run_report(
+        flight, out=out, logs_root=logs_root, engine=engine, audit=audit, force=force, progress=_say
+    )
     if as_json:
         _print_json(outcome.metrics)
     else:
@@ -239,11 +276,12 @@ def _number(value: float | None, form: str) -> str:
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
     out: Out = None,
+    force: Force = False,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
     from .jobs import run
 
-    for path in run.run_simulate(flight, out=out, progress=_say):
+    for path in run.run_simulate(flight, out=out, force=force, progress=_say):
         print(path)
 
 
@@ -279,6 +317,7 @@ def tap(
     export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
     flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
+    force: Force = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     if export is not None:
@@ -286,8 +325,9 @@ def tap(
             raise UsageError(f"--export {export!r}", expected="csv")
         from .live.export import export_csv
 
-        print(export_csv(out, out / "tap.csv"))
+        print(export_csv(out, out / "tap.csv", force=force))
         return 0
+    _needs_posix("tap")
     from .live.log import LogSettings
     from .live.session import TapSettings, format_status
     from .live.tap import run_tap
@@ -331,6 +371,21 @@ def tap(
     return int(summary.exit_code)
 
 
+def _needs_posix(command: str) -> None:
+    """Ports are opened with termios and locked with fcntl, which not every system has."""
+    import importlib
+
+    for name in ("fcntl", "termios", "pty"):
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            raise UsageError(
+                f"'{command}' needs Python's {name}, which this system does not have",
+                expected="Linux (another POSIX system may do)",
+                cause="Windows; logs of a tap can be read, reported and exported on every system",
+            ) from None
+
+
 @app.command("modem-sim", help=COMMANDS["modem-sim"])
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
@@ -341,6 +396,7 @@ def modem_sim(
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
+    _needs_posix("modem-sim")
     from .live.simulator import ModemSimSettings, run_modem_sim
 
     settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there
@@ -422,11 +478,12 @@ def site_import(
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
     base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
     untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
+    force: Force = False,
 ) -> None:
     """Import footprints."""
     from .jobs import run
 
-    for line in run.run_site_import(files, out, base=base, untagged=untagged):
+    for line in run.run_site_import(files, out, base=base, untagged=untagged, force=force):
         _say(line)
     print(out)
 
@@ -439,11 +496,13 @@ def site_show(
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+    force: Force = False,
 ) -> None:
     """Look at a site."""
     from .jobs import run
 
-    for path in run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export):
+    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
+    for path in shown:
         print(path)
 
 
@@ -486,6 +545,7 @@ def map_(
         typer.Option(help="A level below it is out of coverage. Default: only no path is."),
     ] = None,
     study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Coverage and rank maps of a site, Kriging of rank."""
@@ -500,6 +560,7 @@ def map_(
         quick=quick,
         flight=flight,
         logs_root=logs_root,
+        force=force,
         progress=_say,
         foliage=modes,
         crown_reflections=crown_reflections,
@@ -534,13 +595,14 @@ def campaign(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
+    force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Many flights and settings, with what can be said only of several flights."""
     from .jobs import run
 
     outcome = run.run_campaign(
-        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, progress=_say
+        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, force=force, progress=_say
     )
     if as_json:
         _print_json(outcome.metrics)

@@ -20,22 +20,20 @@ from typing import Any
 import field_models
 import numpy as np
 
+from aerpaw_cmp.common.jsonable import json_safe
+from aerpaw_cmp.common.versions import versions
+from aerpaw_cmp.compare.result import FlightResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
-from aerpaw_cmp.jobs.compare_flight import audit_replays, compare_rank_series, compare_rss_series, pairs_of, versions
-from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.report import build
 from aerpaw_cmp.report.canvas import figure, save, style
-from aerpaw_cmp.report.export import json_safe
 
 ROOT = Path(__file__).parents[1]
 FOLDER = ROOT / "tests" / "field"
 RSS = ("dataset12_40m", "dataset12_70m", "dataset12_40m_mount", "dataset12_70m_mount")
 RANK = ("nr_rank_flight1", "nr_rank_flight3")
 ELEMENTS = ("slanted", "vertical")
-
-
-def silent(_text: str) -> None:
-    """No progress."""
 
 
 def gathered(name: str, root: Path, replicates: int, change: Callable[[FlightFile], FlightFile]) -> FlightData:
@@ -57,9 +55,8 @@ def vertical(settings: FlightFile) -> FlightFile:
 
 def rss_rows(name: str, root: Path, replicates: int) -> tuple[dict[str, Any], dict[str, Any]]:
     """Numbers per channel, and the residuals' histogram (shares per 1 dB) for the figure."""
-    data = gathered(name, root, replicates, lambda settings: settings)
-    replays = replay_rss(data, silent, estimate_clocks(data, silent))
-    panels = [compare_rss_series(data, s, r).panel for s, r in zip(data.rss, replays, strict=True)]
+    result = run_flight(gathered(name, root, replicates, lambda settings: settings)).result
+    panels = [build.rss_panel(one) for one in result.rss]
     rows, shares = {}, {}
     edges = np.arange(-25.5, 26.5)
     for panel in panels:
@@ -85,16 +82,16 @@ def rss_rows(name: str, root: Path, replicates: int) -> tuple[dict[str, Any], di
         residual = panel.residual_db[np.isfinite(panel.residual_db)]
         shares[panel.channel] = np.histogram(np.clip(residual, -25, 25), edges)[0] / len(residual)
     pairs: dict[str, Any] = {}
-    for found in pairs_of(panels):
-        for channels in found.metrics["pairs"].values():
-            # places and instants are data, not results
-            pairs |= {name: {k: v for k, v in pair.items() if k != "spans"} for name, pair in channels.items()}
-    return {"channels": rows, "pairs": pairs, "engine": engine(data, replays)}, shares
+    for pair in result.pairs:
+        # places and instants are data, not results
+        numbers = {k: v for k, v in pair.score.as_dict().items() if k != "spans"}
+        pairs[f"{pair.first} - {pair.second}"] = numbers
+    return {"channels": rows, "pairs": pairs, "engine": engine(result)}, shares
 
 
-def engine(data: FlightData, replays: list[Any]) -> dict[str, Any]:
+def engine(result: FlightResult) -> dict[str, Any]:
     """The audit in short."""
-    audit = audit_replays(data, replays, silent).audit
+    audit = result.engine.audit
     return {
         "reference": audit.reference,
         "links": audit.links,
@@ -108,8 +105,8 @@ def rank_panel(name: str, elements: str, root: Path, replicates: int) -> Any:
     """The rank panel of a flight with slanted or vertical elements."""
     change = vertical if elements == "vertical" else (lambda settings: settings)
     data = gathered(name, root, replicates, change)
-    (replayed,) = replay_rank(data, silent)
-    return compare_rank_series(data, data.rank[0], replayed).panel
+    (found,) = run_flight(data, audit=False).result.rank
+    return build.rank_panel(found)
 
 
 def rank_rows(panel: Any) -> dict[str, Any]:
@@ -332,7 +329,7 @@ def rss_table(found: dict[str, Any]) -> str:
                     f"{num(two['rmse_db'])}{between(two['rmse_ci95_db'])}",
                     f"{num(row['correlation'])}{between(row['correlation_ci95'])}",
                     f"{row['n']} ({num(row['n_effective'], 0)})",
-                    f"{clock['verdict']}, {num(clock['shift_s'], 1)} s{between(clock['shift_ci95_s'], 1)}",
+                    f"{clock['verdict']}, {num(clock['radio_minus_telemetry_s'], 1)} s{between(clock['ci95_s'], 1)}",
                     f"{num(repeat['rmse_db'])}{between(repeat['rmse_ci95_db'])}, n {repeat['n']}",
                 ]
             )  # fmt: skip

@@ -63,7 +63,7 @@ def flights(data: Path, names: list[str]) -> list[Places]:
         settings = load_flight(path)
         flight = gather(settings, path.parent, read_logs(settings, path.parent, data), data)
         if flight.rss:
-            for series, replayed in zip(flight.rss, replay_rss(flight, lambda _: None), strict=True):
+            for series, replayed in zip(flight.rss, replay_rss(flight), strict=True):
                 position = flight.track.pose_at(series.time).position_m
                 trend = replayed.spread(replayed.replay.rss_power_dbm[:, 0])
                 found.append(places(f"{name} RSS {series.channel} [dB]", position, series.measured_db, trend))

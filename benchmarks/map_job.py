@@ -30,12 +30,13 @@ def whole(quick: bool) -> dict:
 
 def maps_only(heights: int, spacing_m: float) -> dict:
     """The maps alone at some number of heights."""
+    from aerpaw_cmp.common.stages import Stages
     from aerpaw_cmp.jobs import coverage_map as mapping
     from aerpaw_cmp.site.siteyaml import load_site
 
     levels = tuple(30.0 + 5.0 * i for i in range(heights))
     settings = mapping.MapSettings(spacing_m=spacing_m, rank_altitudes_m=levels, rss_altitudes_m=(30.0,))
-    return {"paths": mapping.make_maps(load_site("lake_wheeler"), settings, lambda _: None).paths}
+    return {"paths": mapping.make_maps(load_site("lake_wheeler"), settings, Stages()).paths}
 
 
 def _child(pipe, job, arguments) -> None:

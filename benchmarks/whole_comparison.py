@@ -9,6 +9,7 @@ optional parts (alternatives of measured-like antennas, paired foliage, pairs of
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import resource
@@ -17,11 +18,12 @@ from pathlib import Path
 
 import numpy as np
 
+from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries, choose_site
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.flight.track import Track
-from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, metrics_beyond_panels, pairs_of
-from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
+from aerpaw_cmp.jobs.flight_run import replay_flight
 
 ANTENNA = {"model": "tr38901", "installed_db": [1.0, 0.0]}
 
@@ -63,10 +65,18 @@ def made_up(samples: int, towers: int) -> FlightData:
         for channel in ("USRP1", "USRP2"):
             level = -20 * np.log10(distance) - 20 + rng.normal(0, 3, samples)
             own = settings.link.rss
-            rss.append(RssSeries(name, channel, "dBm", time_stamp, level, own, own.model_dump_json()))
-    rank = RankSeries(names[0], time_stamp, rng.integers(1, 4, samples).astype(float), flat + 20, None)
+            rss.append(
+                RssSeries(
+                    tower=name, channel=channel, unit="dBm", time=time_stamp, measured_db=level, link=own,
+                    settings_key=own.model_dump_json(),
+                )
+            )  # fmt: skip
+    ri = rng.integers(1, 4, samples).astype(float)
+    rank = RankSeries(tower=names[0], time=time_stamp, rank=ri, sinr_db=flat + 20, position_m=None)
     track = Track(frame, site.frame)
-    return FlightData(settings, None, site, (), track, tuple(rss), (rank,), ())  # type: ignore[arg-type]
+    return FlightData(
+        settings=settings, folder=Path(), site=site, files=(), track=track, rss=tuple(rss), rank=(rank,), warnings=()
+    )
 
 
 def run(samples: int, towers: int, replicates: int) -> dict[str, float]:
@@ -74,26 +84,17 @@ def run(samples: int, towers: int, replicates: int) -> dict[str, float]:
     data = made_up(samples, towers)
     rss = data.settings.rss.model_copy(update={"bootstrap": replicates})
     rank = data.settings.rank.model_copy(update={"bootstrap": replicates})
-    data = FlightData(
-        data.settings.model_copy(update={"rss": rss, "rank": rank}), data.folder, data.site, (), data.track, data.rss,
-        data.rank, (),
-    )  # fmt: skip
-    spent = {}
-    begin = time.perf_counter()
-    clocks = estimate_clocks(data, str)
-    spent["clocks_s"] = time.perf_counter() - begin
-    begin = time.perf_counter()
-    replays, ranked = replay_rss(data, str, clocks), replay_rank(data, str)
-    spent["replay_s"] = time.perf_counter() - begin
-    begin = time.perf_counter()
-    compared = [compare_rss_series(data, s, r) for s, r in zip(data.rss, replays, strict=True)]
-    spent["rss_s"] = time.perf_counter() - begin
-    begin = time.perf_counter()
-    compared += [compare_rank_series(data, s, r) for s, r in zip(data.rank, ranked, strict=True)]
-    spent["rank_s"] = time.perf_counter() - begin
-    begin = time.perf_counter()
-    metrics_beyond_panels([*compared, *pairs_of([c.panel for c in compared[:-1]])])
-    spent["pairs_s"] = time.perf_counter() - begin
+    data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rss": rss, "rank": rank}))
+    stages = Stages()
+    replays = replay_flight(data, stages)
+    with stages("rss"):
+        compared = [compare_rss_series(data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
+    with stages("rank"):
+        for series, replayed in zip(data.rank, replays.rank, strict=True):
+            compare_rank_series(data, series, replayed)
+    with stages("pairs"):
+        pairs_of(compared)
+    spent = {f"{name}_s": seconds for name, seconds in stages.seconds.items()}
     spent["comparison_s"] = spent["rss_s"] + spent["rank_s"] + spent["pairs_s"]
     return spent
 

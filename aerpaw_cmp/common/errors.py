@@ -6,6 +6,7 @@ class                   exit code  meaning
 :class:`CheckError`     1          the job ran, a stated check failed
 :class:`UsageError`     2          wrong usage or configuration
 :class:`InputError`     3          an input could not be read
+:class:`OutputError`    3          an output could not be written
 ======================  =========  =====================================
 
 A message says what was found, what was expected, the likely cause and the place.
@@ -96,5 +97,11 @@ class UsageError(AerpawCmpError):
 
 class InputError(AerpawCmpError):
     """An input file or device could not be read."""
+
+    exit_code = 3
+
+
+class OutputError(AerpawCmpError):
+    """The disk does not take an output: it is full, fails, or may not be written."""
 
     exit_code = 3

@@ -8,7 +8,7 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import UsageError
+from .errors import OutputError
 
 
 @contextlib.contextmanager
@@ -37,33 +37,35 @@ def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
     part = Path(name)
     try:
         yield part
-        part.chmod(0o666 & ~_umask())  # mkstemp makes files private; these are ordinary ones
+        part.chmod(plain_mode())  # mkstemp makes files private; these are ordinary ones
         if durable:
-            _sync(part)
+            sync(part)
         part.replace(target)
         if durable:
             with contextlib.suppress(OSError):  # not every system lets folders be synced
-                _sync(target.parent)
+                sync(target.parent)
     finally:
         part.unlink(missing_ok=True)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:
-    """Write a file whole or not at all; UsageError where it cannot be written."""
+    """Write a file whole or not at all; OutputError where it cannot be written."""
     try:
         with whole(path) as part:
             part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     except OSError as error:
-        raise UsageError(f"cannot be written ({error.strerror or error})", path=path) from None
+        raise OutputError(f"cannot be written ({error.strerror or error})", path=path) from None
 
 
-def _umask() -> int:
+def plain_mode() -> int:
+    """Rights of an ordinary new file."""
     mask = os.umask(0)
     os.umask(mask)
-    return mask
+    return 0o666 & ~mask
 
 
-def _sync(path: Path) -> None:
+def sync(path: Path) -> None:
+    """Bring a file or folder to the disk."""
     handle = os.open(path, os.O_RDONLY)
     try:
         os.fsync(handle)

@@ -13,7 +13,6 @@ import numpy as np
 import yaml
 
 from ..common.errors import UsageError, one_line
-from ..common.files import write_whole
 from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream, has_wall_clock
@@ -37,48 +36,30 @@ RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.r
 Span = tuple[np.datetime64, np.datetime64]
 
 
-def check_target(target: Path) -> None:
-    """UsageError unless a new file can stand there; asked before logs are read."""
-    if target.exists() or target.is_symlink():
-        raise UsageError("the file exists", expected="the name of a new flight.yaml", path=target)
-    if not target.absolute().parent.is_dir():
-        raise UsageError("there is no such folder", expected="--draft in a folder that exists", path=target.parent)
-
-
-def write_draft(
-    files: Sequence[IngestedFile], target: Path, *, timezone: str | None = None, time_origin: str | None = None
-) -> list[str]:
-    """Write a flight.yaml that names the logs.
+def draft(
+    files: Sequence[IngestedFile], folder: Path, *, timezone: str | None = None, time_origin: str | None = None
+) -> tuple[str, list[str]]:
+    """The text of a flight.yaml that names the logs.
 
     Parameters
     ----------
     files : sequence of IngestedFile
         As ``ingest`` read them.
-    target : Path
-        The flight.yaml; the paths in it are relative to its folder.
+    folder : Path
+        Of the flight.yaml; the paths in it are relative to it.
     timezone, time_origin : str, optional
         What zone-less clocks and relative times were read with.
 
     Returns
     -------
-    list of str
-        What is left to check or was left out.
+    str, list of str
+        The text, and what is left to check or was left out.
 
     Raises
     ------
     UsageError
-        If the file exists, cannot be written, or no log has what a flight needs.
+        If no log has what a flight needs.
     """
-    check_target(target)
-    text, remarks = draft(files, target.resolve().parent, timezone=timezone, time_origin=time_origin)
-    write_whole(target, text)
-    return remarks
-
-
-def draft(
-    files: Sequence[IngestedFile], folder: Path, *, timezone: str | None = None, time_origin: str | None = None
-) -> tuple[str, list[str]]:
-    """The text of the flight.yaml in ``folder``, and the remarks; see :func:`write_draft`."""
     flown = _flown(files)
     entries = _Entries(folder, flown, _has_level(files, flown), time_origin)
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest

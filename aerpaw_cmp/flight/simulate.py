@@ -7,9 +7,10 @@ its ``logs`` say which files to write and in which format (by ``reader``). The s
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable
+import os
+from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,9 @@ import pandas as pd
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
-from ..common.units import FloatArray, IntArray
+from ..common.outputs import OutputSet
+from ..common.stages import Progress, silent
+from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
@@ -26,6 +29,8 @@ from ..propagation.tracer import replay
 from ..site.site import Site
 from .settings import FlightFile, LogSettings, PlanSettings
 
+TRUTH = "truth.json"
+"""What was planted, and the SHA-256 of every synthetic log."""
 LOWEST_DBM = -400.0
 """Below this the simulated level is no signal."""
 
@@ -56,6 +61,10 @@ class Trajectory:
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
 
+MAXIMUM_SAMPLES = 5_000_000
+"""Of one simulated log: 140 h at ten a second."""
+
+
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
     """Corner times from speeds, climb rates and waiting times.
 
@@ -81,6 +90,13 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
         if point.hold_s > 0:
             times.append(times[-1] + point.hold_s)
             positions.append(here)
+    shortest = min(plan.telemetry_interval_s, plan.rss_interval_s, plan.rank_interval_s)
+    if times[-1] / shortest > MAXIMUM_SAMPLES:
+        raise UsageError(
+            f"the plan lasts {times[-1]:.3g} s, with a sample every {shortest:g} s",
+            expected=f"at most {MAXIMUM_SAMPLES} samples of a log",
+            cause="a misplaced waypoint, a speed or an interval with too few digits",
+        )
     if len(times) < 2:
         raise UsageError("the plan does not move and does not wait", expected="waypoints that differ, or hold_s")
     return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
@@ -147,6 +163,23 @@ def correlated_noise(
     return np.asarray(lfilter([1.0], [1.0, -keep], white) * standard_deviation)
 
 
+def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
+    """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
+    try:
+        local: pd.Timestamp = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(
+            timezone, ambiguous="NaT", nonexistent="NaT"
+        )
+        if not 1980 <= start.year <= 2200:
+            why = "a clock that nothing flew by"
+        elif not pd.isna(local):
+            return local
+        else:
+            why = "the clocks changed then: it never was, or it was twice"
+    except (ValueError, OverflowError) as error:
+        why = str(error)
+    raise UsageError(f"flight.plan.start {start} in {timezone}", expected="a wall time", cause=why)
+
+
 class FlightSimulator:
     """Writes the logs of one planned flight.
 
@@ -170,13 +203,27 @@ class FlightSimulator:
         self.site = site
         self.folder = folder
 
-    def run(self, out: Path, *, progress: Callable[[str], None] = lambda _text: None) -> list[Path]:
+    def run(
+        self, out: Path, *, inputs: Iterable[Path] = (), force: bool = False, progress: Progress = silent
+    ) -> list[Path]:
         """Write every log of the flight file and truth.json below ``out``; gives the paths written.
+
+        Parameters
+        ----------
+        out : Path
+            Made when missing.
+        inputs : iterable of Path
+            Files that must not be replaced: the flight file and what it names.
+        force : bool
+            Replace logs that truth.json does not list as synthetic, too.
 
         Raises
         ------
         UsageError
-            Without a plan or a time zone, for readers that have no writer, for towers the site does not have.
+            Without a plan or a time zone, for readers that have no writer, for towers the site does not have, where
+            a log that is not marked synthetic is in the way.
+        OutputError
+            If the disk does not take them.
         """
         plan = self.settings.flight.plan
         if plan is None:
@@ -186,23 +233,29 @@ class FlightSimulator:
         self.plan = plan
         self.generator = np.random.default_rng(plan.seed)
         self.trajectory = plan_trajectory(plan)
-        start = pd.Timestamp(plan.start.replace(tzinfo=None)).tz_localize(self.settings.timezone)
+        start = _local_start(plan.start, self.settings.timezone)
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
-        out.mkdir(parents=True, exist_ok=True)
-        written = []
-        for log in self.settings.logs:
-            progress(log.path)
-            data, damage = self._with_bad_lines(self._log_bytes(log))
-            path = out / log.path
-            path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_bytes(data)
-            self.truth_.setdefault("bad_lines", {})[log.path] = damage
-            written.append(path)
-        self.truth_["plan"] = plan.model_dump(mode="json")
-        path = out / "truth.json"
-        path.write_text(json.dumps(self.truth_, indent=1) + "\n", encoding="utf-8")
-        return [*written, path]
+        names = self._names(out)
+        with OutputSet(out, listing=TRUTH, names=names, inputs=inputs, force=force) as output:
+            contents = {}
+            for log in self.settings.logs:
+                progress(log.path)
+                contents[log.path], damage = self._with_bad_lines(self._log_bytes(log))
+                self.truth_.setdefault("bad_lines", {})[log.path] = damage
+            self.truth_["plan"] = plan.model_dump(mode="json")
+            return output.write(contents, self.truth_)
+
+    def _names(self, out: Path) -> list[str]:
+        """The logs of the flight file; UsageError for those that would lie outside ``out``, or twice."""
+        names = [log.path for log in self.settings.logs]
+        for name in names:
+            place = Path(os.path.normpath(out / name))
+            if Path(name).is_absolute() or Path(os.path.normpath(out)) not in place.parents:
+                raise UsageError(f"log {name!r} lies outside the folder of the logs", expected="a path below it")
+            if names.count(name) > 1 or name == TRUTH:
+                raise UsageError(f"two files of this flight are named {name!r}", expected="a name of its own for each")
+        return names
 
     def _log_bytes(self, log: LogSettings) -> bytes:
         writers = {
@@ -222,6 +275,8 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
+        # as the replay does: on the ground itself the two rays cancel
+        position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
         roll, pitch, yaw = plan_attitude(self.trajectory, time_s)

@@ -22,13 +22,16 @@ import numpy as np
 from pydantic import Field
 
 from ..common.errors import AerpawCmpError, UsageError
-from ..common.units import FloatArray
+from ..common.stages import Progress, silent
+from ..common.units import AnyArray, FloatArray
+from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare.offset import Pooling, pooled_offsets
+from ..compare.result import FlightResult, RankResult, RssResult
 from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
-from ..flight.settings import FlightFile, Positive, Settings, load_flight
+from ..flight.settings import FlightFile, Positive, RssSettings, Settings, load_flight
 from ..report.campaign_data import (
     CampaignData,
     Failure,
@@ -41,10 +44,8 @@ from ..report.campaign_data import (
     place_means,
 )
 from .campaign_fit import fit_all
-from .compare_flight import compare_rank_series, compare_rss_series, versions
-from .replay import estimate_clocks, replay_rank, replay_rss
+from .flight_run import run_flight
 
-Progress = Callable[[str], None]
 Stage = Callable[[str], Any]
 
 AS_WRITTEN = "as written"
@@ -170,81 +171,84 @@ def run_task(task: Task) -> Outcome:
 
     This runs in worker processes: it takes and gives plain data.
     """
-
-    def silent(_text: str) -> None:
-        pass
-
     try:
-        data = flight_data(task)
-        clocks = estimate_clocks(data, silent)
-        pairs = zip(data.rss, replay_rss(data, silent, clocks), strict=True)
-        rss = [compare_rss_series(data, s, r).panel for s, r in pairs]
-        ranked = zip(data.rank, replay_rank(data, silent), strict=True)
-        rank = [compare_rank_series(data, s, r).panel for s, r in ranked]
+        found = run_flight(flight_data(task), audit=False)
     except AerpawCmpError as error:
         return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=str(error)))
     except Exception as error:  # one flight's fault must not cost the others their numbers
         text = f"a fault of the program itself: {type(error).__name__}: {error}"
         return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
     return Outcome(
-        tuple(_rss_row(task, data, panel) for panel in rss),
-        tuple(row for panel in rank for row in _rank_rows(task, panel)),
-        track=_flown(task, [*rss, *rank][0]),
+        rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
+        rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
+        track=_flown(task, found.result),
     )
 
 
-def _flown(task: Task, panel: Any) -> FlownTrack:
-    return FlownTrack(flight=task.flight, time_s=_elapsed_s(panel.time), position_m=_positions_m(panel))
+def _flown(task: Task, result: FlightResult) -> FlownTrack:
+    first = result.rss[0] if result.rss else result.rank[0]
+    return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
 
 
-def _elapsed_s(time: Any) -> FloatArray:
+def _elapsed_s(time: AnyArray) -> FloatArray:
     return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-def _positions_m(panel: Any) -> FloatArray:
-    return np.stack([panel.east_m, panel.north_m, panel.up_m], axis=-1)
-
-
-def _rss_row(task: Task, data: FlightData, panel: Any) -> RssRow:
-    names = (
-        "tower", "channel", "unit", "offset_db", "rmse_db", "correlation", "n", "n_out_of_coverage", "at_search_edge",
-        "rmse_ci95_db", "offset_ci95_db", "correlation_ci95", "n_effective", "lag_s", "lag_verdict", "fitted",
-        "measured_db", "simulated_dbm",
-    )  # fmt: skip
+def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
+    score, clock = found.score, found.further.clock
     return RssRow(
         flight=task.flight,
         setting=task.setting,
-        **{name: getattr(panel, name) for name in names},
-        baselines={b.name: b.rmse_db for b in panel.baselines},
-        step_db=data.settings.rss.step_db,
-        span_db=data.settings.rss.span_db,
-        time_s=_elapsed_s(panel.time) if task.reference else np.zeros(0),
-        position_m=_positions_m(panel) if task.reference else np.zeros((0, 3)),
-        distance_m=panel.geometry["distance_m"] if task.reference else np.zeros(0),
-        heading_deg=panel.geometry.get("heading_deg") if task.reference else None,
-        within=panel.extra.get("repeatability", {}),
+        tower=found.tower,
+        channel=found.channel,
+        unit=found.unit,
+        offset_db=score.offset_db,
+        rmse_db=score.rmse_db,
+        correlation=score.correlation,
+        n=score.n,
+        n_out_of_coverage=score.n_out_of_coverage,
+        at_search_edge=score.at_edge,
+        rmse_ci95_db=score.rmse_ci95_db,
+        offset_ci95_db=score.intervals.offset_db,
+        correlation_ci95=score.intervals.correlation,
+        n_effective=score.intervals.memory.n_effective,
+        lag_s=score.lag_s,
+        lag_verdict="" if clock is None else clock.verdict,
+        fitted=score.fitted_on_scored,
+        baselines={name: model.rmse_db for name, model in found.baselines.items()},
+        step_db=rules.step_db,
+        span_db=rules.span_db,
+        measured_db=found.measured_db,
+        simulated_dbm=found.simulated_dbm,
+        time_s=_elapsed_s(found.time) if task.reference else np.zeros(0),
+        position_m=found.position_m if task.reference else np.zeros((0, 3)),
+        distance_m=found.geometry["distance_m"] if task.reference else np.zeros(0),
+        heading_deg=found.geometry.get("heading_deg") if task.reference else None,
+        within=found.further.repeatability,
     )
 
 
-def _rank_rows(task: Task, panel: Any) -> list[RankRow]:
+def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
+    score = found.score
     return [
         RankRow(
             flight=task.flight,
             setting=task.setting,
-            tower=panel.tower,
-            n=int(np.isfinite(panel.measured).sum()),
-            best_k=panel.best_k,
-            best_k_ci95=panel.best_k_ci95,
-            **{
-                name: getattr(at, name)
-                for name in (
-                    "k", "n_out_of_coverage", "agreement", "agreement_ci95", "kappa", "total_variation",
-                    "total_variation_ci95", "wasserstein",
-                )
-            },
+            tower=found.tower,
+            n=score.n,
+            best_k=score.best_k,
+            best_k_ci95=score.curve.best_k_interval,
+            k=k,
+            n_out_of_coverage=fit.out_of_coverage,
+            agreement=fit.agreement,
+            agreement_ci95=fit.agreement_ci95,
+            kappa=fit.kappa,
+            total_variation=fit.total_variation,
+            total_variation_ci95=fit.total_variation_ci95,
+            wasserstein=fit.wasserstein,
         )
-        for at in panel.simulated
-    ]  # fmt: skip
+        for k, fit in score.simulated.items()
+    ]
 
 
 def cluster_executor(address: str) -> Executor:
@@ -448,7 +452,7 @@ def run(
     workers: int = 1,
     cluster: str | None = None,
     stage: Stage = lambda _name: nullcontext(),
-    progress: Progress = lambda _text: None,
+    progress: Progress = silent,
 ) -> CampaignData:
     """All flights under all settings, and what can be said only of several flights.
 

@@ -3,24 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import InputError, UsageError
+from ..common.stages import Progress, silent
 from ..common.units import FloatArray
-from ..compare import rss
 from ..compare.heldout import fit_held_out, goes_round, rmse
 from ..compare.offset import grid_offset
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..flight.settings import FlightFile
 from ..report.campaign_data import HeldOutFold, HeldOutRow
+from .levels import levels_of
 from .replay import Clock, estimate_clocks, replay_rss
 
-Progress = Callable[[str], None]
 Point = Mapping[str, float]
 
 LARGEST_PRODUCT = 500
@@ -60,9 +60,9 @@ class Bench:
         if new:
             data = self._changed(settings, [series[i] for i in new])
             # a lag that is tried stands in place of what the flight file says
-            clocks = estimate_clocks(data, _silent) if "rss.lag" in point else [self.clocks[i] for i in new]
-            for i, replayed in zip(new, replay_rss(data, _silent, clocks), strict=True):
-                self.kept[keys[i]] = _level(settings, replayed, series[i].time)
+            clocks = estimate_clocks(data, silent) if "rss.lag" in point else [self.clocks[i] for i in new]
+            for i, replayed in zip(new, replay_rss(data, silent, clocks), strict=True):
+                self.kept[keys[i]] = levels_of(series[i], replayed, settings.rss).simulated_db
         return [self.kept[key] for key in keys]
 
     def _changed(self, settings: FlightFile, series: list[Any]) -> FlightData:
@@ -93,19 +93,6 @@ class Bench:
         return Bench(dataclasses.replace(self.data, rss=tuple(series)), clocks, measured)
 
 
-def _silent(_text: str) -> None:
-    """No progress."""
-
-
-def _level(settings: FlightFile, replayed: Any, time: Any) -> FloatArray:
-    """The simulated RSS that the flight's settings compare."""
-    chosen = replayed.replay.rss_power_dbm if settings.rss.field == "power" else replayed.replay.rss_dbm
-    level: FloatArray = replayed.spread(chosen[:, 0])
-    if settings.rss.field == "local_mean" and settings.rss.window_s > 0:
-        level = rss.local_mean_db(time, level, settings.rss.window_s)
-    return level
-
-
 def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, settings: FlightFile) -> FloatArray:
     """Measured minus simulated after the best offset of these very samples (n,)."""
     fit = grid_offset(measured_db, simulated_db, step_db=settings.rss.step_db, span_db=settings.rss.span_db)
@@ -116,16 +103,9 @@ def bench_of(data: FlightData) -> Bench:
     """Prepare a flight: clocks once, samples that are too low or without a pose left out."""
     settings = data.settings.rss
     applies = settings.lag == "apply" or isinstance(settings.lag, float)
-    clocks: list[Clock | None] = estimate_clocks(data, _silent) if applies else [None] * len(data.rss)
-    measured = []
-    for series, replayed in zip(data.rss, replay_rss(data, _silent, clocks), strict=True):
-        level = series.measured_db
-        if settings.window_s > 0:
-            level = rss.local_mean_db(series.time, level, settings.window_s)
-        high = replayed.valid.copy()
-        if settings.minimum_height_m is not None:
-            high[replayed.valid] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
-        measured.append(np.where(high, level, np.nan))
+    clocks: list[Clock | None] = estimate_clocks(data, silent) if applies else [None] * len(data.rss)
+    replays = zip(data.rss, replay_rss(data, silent, clocks), strict=True)
+    measured = [levels_of(series, replayed, settings).measured_db for series, replayed in replays]
     return Bench(data, clocks, measured)
 
 
@@ -137,7 +117,7 @@ def fit_all(
     setting: str = "",
     samples: int = 1000,
     refine: bool = False,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> list[HeldOutFold]:
     """Fit on the named flights, or leave each flight out once.
 
@@ -293,7 +273,7 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
 
 def _own_lag(clock: Clock | None, point: Point) -> tuple[str, ...]:
     """``lag_s`` where a lag that was estimated on these very samples has been applied."""
-    estimated = clock is not None and clock.applied == "estimated and applied" and "rss.lag" not in point
+    estimated = clock is not None and clock.found.applied == "estimated and applied" and "rss.lag" not in point
     return ("lag_s",) if estimated else ()
 
 

@@ -8,9 +8,7 @@ the links that foliage touches.
 from __future__ import annotations
 
 import itertools
-import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -18,6 +16,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.stages import Progress, Stages, share_of
 from ..common.units import AnyArray, ComplexArray, FloatArray, wavelength_m
 from ..compare.rank import singular_values
 from ..maps import export
@@ -55,7 +54,6 @@ from ..propagation.paths import PathSet
 from ..propagation.scene import Scene
 from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
-from ..report.export import make_folder
 from ..site.site import Site
 from .what_if import p833_note
 
@@ -65,8 +63,6 @@ FOLIAGE = ("none", "attenuating", "opaque")
 RATIO_LIMIT_DB = 180.0
 """Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
 RATIOS = ("spread", "condition")
-
-Report = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -282,17 +278,6 @@ class MapOutcome:
     paths_off_crowns: int = 0
     trajectory_m: FloatArray | None = None
     trajectory_name: str = ""
-    stages_s: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def stage(self, name: str, report: Report) -> Iterator[None]:
-        """Time one stage."""
-        report(name)
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.stages_s[name] = self.stages_s.get(name, 0.0) + time.perf_counter() - start
 
     @property
     def shown(self) -> MapResult:
@@ -304,31 +289,24 @@ class MapOutcome:
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
 
-def make_maps(site: Site, settings: MapSettings, report: Report) -> MapOutcome:
+def make_maps(site: Site, settings: MapSettings, stages: Stages) -> MapOutcome:
     """Evaluate the grid of a site in every foliage mode."""
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
     channels = SiteChannels(site, settings)
     towers = {name: tower.position_m for name, tower in site.towers.items()}
-    with outcome.stage("maps", report):
+    with stages("maps"):
         for mode in settings.foliage:
-            last = [0.0]
-
-            def progress(share: float, last: list[float] = last) -> None:
-                if share >= last[0] + 0.2:
-                    last[0] = share
-                    report(f"maps {100 * share:.0f} %")
-
             outcome.maps[mode] = map_job(
                 grid, towers, channels.of(mode), rss_altitudes_m=settings.rss_altitudes_m,
                 rank_altitudes_m=settings.rank_altitudes_m, ks=settings.ks,
-                progress=progress if mode == settings.foliage[0] else None,
+                progress=share_of(stages.progress, "maps") if mode == settings.foliage[0] else None,
             )  # fmt: skip
     outcome.paths, outcome.paths_off_crowns = channels.paths, channels.paths_off_crowns
     return outcome
 
 
-def study_maps(outcome: MapOutcome, report: Report) -> None:
+def study_maps(outcome: MapOutcome, stages: Stages) -> None:
     """Correlation, interpolation and its errors, on the maps of the paper's foliage mode."""
     s, result = outcome.settings, outcome.shown
     heights, rank = rank_fields(result)
@@ -337,11 +315,11 @@ def study_maps(outcome: MapOutcome, report: Report) -> None:
             f"{len(heights)} rank height at or above 30 m", expected="two or more for the study, or --no-study"
         )
     local: dict[str, Any] = {"neighbours": s.neighbours, "radius_m": s.reach_m, "seed": s.seed}
-    with outcome.stage("leave one out", report):
+    with stages("leave one out"):
         outcome.studies["missing"] = rank_study(result, **local)
         outcome.studies["zero"] = rank_study(result, out_of_coverage="zero", **local)
         outcome.studies["random"] = rank_study(result, out_of_coverage="zero", selection="random", **local)
-    with outcome.stage("correlation", report):
+    with stages("correlation"):
         points, width = result.grid.points_m, s.spacing_m
         outcome.correlations = {
             "horizontal": field_correlation(points, rank, width_m=width),
@@ -350,7 +328,7 @@ def study_maps(outcome: MapOutcome, report: Report) -> None:
         }
     if outcome.trajectory_m is None:
         outcome.trajectory_m, outcome.trajectory_name = tower_round(outcome.site)
-    with outcome.stage("honest tests", report):
+    with stages("honest tests"):
         fit, line = outcome.studies["missing"].fit, outcome.trajectory_m
         outcome.honest = honest_study(
             result.grid, heights, rank, fit, trajectory_m=line, block_m=s.block_m, neighbours=s.neighbours, seed=s.seed
@@ -386,9 +364,27 @@ def tower_round(site: Site) -> tuple[FloatArray, str]:
 
 
 def maps_record(
-    outcome: MapOutcome, *, name: str, generated: str, versions: Mapping[str, str], paper: Iterable[page.PaperRow] = ()
+    outcome: MapOutcome,
+    *,
+    name: str,
+    generated: str,
+    versions: Mapping[str, str],
+    stages_s: Mapping[str, float],
+    paper: Iterable[page.PaperRow] = (),
 ) -> page.MapsData:
-    """The record that :func:`~aerpaw_cmp.report.maps_html.write_maps` turns into files; ``paper``: its table."""
+    """The record that :func:`aerpaw_cmp.report.maps_html.write_maps` turns into files.
+
+    Parameters
+    ----------
+    outcome : MapOutcome
+    name, generated : str
+        Of the maps; UTC, ISO 8601.
+    versions : mapping of str to str
+    stages_s : mapping of str to float
+        Seconds per stage.
+    paper : iterable of PaperRow
+        The table of what the paper states.
+    """
     s, result = outcome.settings, outcome.shown
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))
     rank = tuple(one for mode, maps in outcome.ordered() for one in _rank_maps(maps, mode))
@@ -411,7 +407,7 @@ def maps_record(
         notes=_notes(outcome),
         versions=versions,
         settings=asdict(s),
-        stages_s=dict(outcome.stages_s),
+        stages_s=dict(stages_s),
         metrics=_metrics(outcome),
     )
 
@@ -625,7 +621,7 @@ def _mean(values: AnyArray) -> float:
 # --- files beside the page -----------------------------------------------------------------------------------------
 
 
-def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], report: Report) -> list[Path]:
+def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], progress: Progress) -> list[Path]:
     """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed."""
     site, grid = outcome.site, outcome.shown.grid
     joint, every = _all_layers(outcome, towers_too=False), _all_layers(outcome, towers_too=True)
@@ -634,7 +630,6 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
     shown = [layer for layer in joint if not layer.name.startswith(RATIOS)]
     towers = {name: tower.position_m.tolist() for name, tower in site.towers.items()}
     borders = outcome.shown.borders
-    make_folder(folder)
     written = [
         export.write_csv(folder / "layers.csv", grid, site.frame, every),
         export.write_geojson(folder / "layers.geojson", grid, site.frame, shown, towers, borders),
@@ -645,7 +640,7 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], r
         written.append(export.write_netcdf(folder / "maps.nc", grid, site.frame, every, site.name))
         written.append(export.write_geotiff(folder / "maps.tif", grid, site.frame, joint))
     except UsageError as missing:
-        report(str(missing))
+        progress(str(missing))
     return written
 
 

@@ -3,45 +3,43 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray
+from ..compare.result import ClockResult
+from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.track import TrackPoses, estimate_lag
+from ..flight.lag import direction_terms
+from ..flight.settings import RtSettings
+from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
-from ..propagation.tracer import Loss, Replay, replay
-
-Progress = Callable[[str], None]
+from ..propagation.tracer import Engine, Loss, Replay, replay
+from ..site.site import Site, Trees
 
 COHERENT_STEP_S = 0.02
 """Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""
 
+POWER_STEP_S = 0.1
+"""Sampling of its power sum, which is smooth."""
 
-@dataclass(frozen=True, slots=True)
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Clock:
-    """Radio clock against telemetry clock of one series.
+    """Radio clock of one series: what was found, and ``applied_s`` (n,), taken off the radio times for the replay."""
 
-    ``shift_s`` is how much more the radio clock shows, ``shift_ci95_s`` its interval; ``drift`` in s/s; ``applied_s``
-    (n,) is what was taken off the radio times before the replay.
-    """
-
-    shift_s: float
-    shift_ci95_s: tuple[float, float]
-    drift_s_per_s: float
-    verdict: str
-    reason: str
-    applied: str
+    found: ClockResult
     applied_s: FloatArray
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
     """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
 
@@ -49,7 +47,7 @@ class Replayed:
     poses: Poses
     valid: BoolArray
     replay: Replay
-    track: TrackPoses | None
+    track: TrackPoses | None = None
     clock: Clock | None = None
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
@@ -63,25 +61,47 @@ def _spread(valid: BoolArray, values: FloatArray, fill: float = np.nan) -> Float
     return out
 
 
-def replay_rss(data: FlightData, progress: Progress, clocks: list[Clock | None] | None = None) -> list[Replayed]:
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightReplay:
+    """All series of a flight, replayed, in the order of the flight."""
+
+    rss: tuple[Replayed, ...]
+    rank: tuple[Replayed, ...]
+
+    @property
+    def all(self) -> tuple[Replayed, ...]:
+        """RSS first, then rank."""
+        return (*self.rss, *self.rank)
+
+
+def replay_rss(
+    data: FlightData, progress: Progress = silent, clocks: Sequence[Clock | None] | None = None
+) -> list[Replayed]:
     """Replay every RSS series; series of one tower with equal links are replayed together."""
     groups: dict[tuple[str, str], list[int]] = {}
     for index, series in enumerate(data.rss):
         groups.setdefault((series.tower, series.settings_key), []).append(index)
     shifts = clocks or [None] * len(data.rss)
-    out: dict[int, Replayed] = {}
+    rt, out = data.settings.rt, dict[int, Replayed]()
     for members in groups.values():
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
-        tracks = [_track_poses(data, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
-        poses = [_poses(data, track) for track in tracks]
+        tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
+        poses = [_poses(track, rt.attitude) for track in tracks]
         joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
         progress(f"replay RSS {tower}: {len(joined)} poses")
-        whole = _replay(data, link, joined, progress)
+        whole = replay_poses(data.site, rt, link, joined, progress=progress)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
             stop = start + len(part)
-            out[index] = Replayed(link, part, track.valid, part_of(whole, start, stop), track, shifts[index])
+            out[index] = Replayed(
+                link=link,
+                poses=part,
+                valid=track.valid,
+                replay=part_of(whole, start, stop),
+                track=track,
+                clock=shifts[index],
+            )
             start = stop
     return [out[i] for i in range(len(data.rss))]
 
@@ -93,24 +113,35 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress) -> list[Clock | None]:
-    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks.
+def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
     Predictions are the image engine's RSS along the track with at most one reflection.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
         return [None] * len(data.rss)
-    out: list[Clock | None] = []
-    predict = _Predictions(data)
-    for series in data.rss:
-        if isinstance(wanted, float):
-            applied = np.full(len(series.time), wanted)
-            out.append(Clock(wanted, (wanted, wanted), 0.0, "given", "", "given in flight.yaml", applied))
-            continue
-        progress(f"clock {series.tower} {series.channel}")
-        out.append(_estimated_clock(data, series, predict, apply=wanted == "apply"))
-    return out
+    if isinstance(wanted, float):
+        return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
+    predict, found = _Predictions(data), dict[str, ClockEstimate]()
+    for tower in dict.fromkeys(series.tower for series in data.rss):
+        progress(f"clock {tower}")
+        found[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+    return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
+
+
+def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
+    """The clock of a flight file that states it."""
+    found = ClockResult(
+        receiver=receiver,
+        radio_minus_telemetry_s=radio_minus_telemetry_s,
+        ci95_s=(radio_minus_telemetry_s, radio_minus_telemetry_s),
+        drift_s_per_s=0.0,
+        verdict="given",
+        reason="",
+        applied="given in flight.yaml",
+    )
+    return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
 
 
 class _Predictions:
@@ -124,8 +155,8 @@ class _Predictions:
         """Level ``rss_dbm`` or ``rss_power_dbm`` at instants (n,) [dBm]; NaN without a pose or path."""
         key = (series.tower, series.settings_key, np.asarray(times).tobytes())
         if key not in self._kept:
-            data, track = self._data, _track_poses(self._data, times)
-            link, poses = series.link.build([series.tower], data.folder), _poses(data, track)
+            data, track = self._data, _track_poses(self._data.track, times)
+            link, poses = series.link.build([series.tower], data.folder), _poses(track, data.settings.rt.attitude)
             found = replay(data.site, link, poses, engine="image", max_depth=min(data.settings.rt.max_depth, 1))
             self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
             levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
@@ -133,44 +164,74 @@ class _Predictions:
         return self._kept[key][field]
 
 
-def _estimated_clock(data: FlightData, series: RssSeries, predictions: _Predictions, *, apply: bool) -> Clock:
-    """Lag by the coherent replay and by its power sum; the one that leaves the smaller residual decides.
+def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], predictions: _Predictions) -> ClockEstimate:
+    """Clock of one receiver by the coherent replay and by its power sum; the one that explains more decides.
 
     Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
     (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
     """
+    place = data.site.towers[channels[0].tower].position_m
 
-    def predictor(field: str) -> Callable[[Any], FloatArray]:
-        return lambda times: predictions(series, field, times)
+    def terms(times: Any) -> FloatArray:
+        track = _track_poses(data.track, times)
+        line = track.position_m - place
+        azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+        elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
+        return direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
 
-    measured = series.measured_db
-    if data.settings.rss.minimum_height_m is not None:
-        with np.errstate(invalid="ignore"):
-            low = ~(_track_poses(data, series.time).position_m[:, 2] >= data.settings.rss.minimum_height_m)
-        measured = np.where(low, np.nan, measured)
-    window = data.settings.rss.lag_window_s
-    fits = {
-        name: estimate_lag(series.time, measured, predictor(field), window_s=window, resolution_s=resolution)
-        for name, field, resolution in (
-            ("coherent replay", "rss_dbm", COHERENT_STEP_S),
-            ("power sum of the replay", "rss_power_dbm", 0.1),
+    def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
+        return ClockChannel(
+            name=series.channel,
+            times=series.time,
+            measured_db=_high_enough(data, series),
+            predictor=lambda times: predictions(series, field, times),
+            terms=terms,
+            resolution_s=resolution_s,
         )
-    }
-    by = min(fits, key=lambda name: np.nan_to_num(fits[name].rmse_db, nan=np.inf))
-    fit = fits[by]
-    elapsed = (series.time - series.time.min()) / np.timedelta64(1, "s") if len(series.time) else np.zeros(0)
-    used = apply and fit.verdict == "ok"
-    # the fit's lag is added to radio times; users think of how much the radio clock shows too much
-    shift = -(fit.lag_s + fit.drift_s_per_s * (elapsed - fit.reference))
-    return Clock(
-        shift_s=-fit.lag_s,
-        shift_ci95_s=(-fit.interval_s[1], -fit.interval_s[0]),
-        drift_s_per_s=-fit.drift_s_per_s,
-        verdict=fit.verdict,
-        reason=f"by the {by}" + (f": {fit.reason}" if fit.reason else ""),
-        applied="estimated and applied" if used else "estimated, not applied",
-        applied_s=shift if used else np.zeros(len(series.time)),
+
+    models = (
+        ("coherent replay", "rss_dbm", COHERENT_STEP_S),
+        ("power sum of the replay", "rss_power_dbm", POWER_STEP_S),
     )
+    fits = [
+        judge_clock(
+            [channel(series, field, resolution) for series in channels],
+            model=name,
+            window_s=data.settings.rss.lag_window_s,
+        )
+        for name, field, resolution in models
+    ]
+    return max(fits, key=lambda fit: np.nan_to_num(fit.explained, nan=-np.inf))
+
+
+def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
+    """Levels (n,), NaN below ``rss.minimum_height_m``."""
+    least = data.settings.rss.minimum_height_m
+    if least is None:
+        return series.measured_db
+    with np.errstate(invalid="ignore"):
+        low = ~(_track_poses(data.track, series.time).position_m[:, 2] >= least)
+    return np.where(low, np.nan, series.measured_db)
+
+
+def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
+    """The clock of a receiver as that of one of its series; only a verdict "ok" is applied."""
+    used = apply and fit.verdict == "ok"
+    found = ClockResult(
+        receiver=series.tower,
+        radio_minus_telemetry_s=fit.radio_minus_telemetry_s,
+        ci95_s=fit.ci95_s,
+        drift_s_per_s=fit.drift_s_per_s,
+        verdict=fit.verdict,
+        reason=f"by the {fit.model}" + (f": {fit.reason}" if fit.reason else ""),
+        applied="estimated and applied"
+        if used
+        else "asked for, not applied"
+        if apply and fit.verdict != "agree"
+        else "estimated, not applied",
+        checks=fit.as_dict(),
+    )
+    return Clock(found=found, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:
@@ -190,7 +251,7 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
     )
 
 
-def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
+def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]:
     """Replay every rank series with the arrays of ``link.rank``.
 
     Position and attitude come each from what has them: positions from the log where it holds its own, else from the
@@ -200,19 +261,20 @@ def replay_rank(data: FlightData, progress: Progress) -> list[Replayed]:
     for series in data.rank:
         link = data.settings.link.rank.build([series.tower], data.folder)
         position, valid = rank_positions(series, data.track)
-        track = None if data.track is None else _track_poses(data, series.time)
+        track = None if data.track is None else _track_poses(data.track, series.time)
         rotation = np.tile(np.eye(3), (len(position), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
-        out.append(Replayed(link, poses, valid, _replay(data, link, poses, progress), track))
+        found = replay_poses(data.site, data.settings.rt, link, poses, progress=progress)
+        out.append(Replayed(link=link, poses=poses, valid=valid, replay=found, track=track))
     return out
 
 
-def _track_poses(data: FlightData, time: Any) -> TrackPoses:
-    assert data.track is not None
-    return data.track.pose_at(time)
+def _track_poses(track: Track | None, time: Any) -> TrackPoses:
+    assert track is not None
+    return track.pose_at(time)
 
 
 def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
@@ -225,57 +287,74 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
     return rotation_from_aircraft(np.zeros_like(heading), np.zeros_like(heading), heading)
 
 
-def _poses(data: FlightData, track: TrackPoses) -> Poses:
-    rotation = np.ascontiguousarray(attitude_rotation(track, data.settings.rt.attitude)[track.valid])
+def _poses(track: TrackPoses, attitude: str) -> Poses:
+    rotation = np.ascontiguousarray(attitude_rotation(track, attitude)[track.valid])
     return Poses(track.position_m[track.valid], rotation)
 
 
-def _replay(data: FlightData, link: Link, poses: Poses, progress: Progress) -> Replay:
-    rt = data.settings.rt
-    name = f"{rt.engine} {'+'.join(link.tower_arrays)}"
+def replay_poses(
+    site: Site, rt: RtSettings, link: Link, poses: Poses, *, engine: Engine | None = None, progress: Progress = silent
+) -> Replay:
+    """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``."""
+    engine = engine or rt.engine
+    name = f"{engine} {'+'.join(link.tower_arrays)}"
     return replay(
-        data.site,
+        site,
         link,
         poses,
-        engine=rt.engine,
+        engine=engine,
         max_depth=rt.max_depth,
         samples=rt.samples,
         batch=rt.batch,
-        loss=path_loss(data, link.carrier_hz),
-        crowns=reflecting_crowns(data),
+        loss=path_loss(site.trees, rt, link.carrier_hz),
+        crowns=reflecting_crowns(site.trees, rt),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         # the image engine is done before a bar could be seen
-        progress=(lambda share: progress(f"{name} {100 * share:.0f} %")) if rt.engine == "sionna" else None,
+        progress=share_of(progress, name) if engine == "sionna" else None,
     )
 
 
-def reflecting_crowns(data: FlightData) -> Crowns | None:
+def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
     """Crowns that reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
-    rt = data.settings.rt
-    wanted = rt.foliage == "opaque" and rt.crown_reflections and len(data.site.trees) > 0
-    return Crowns(data.site.trees) if wanted else None
+    return Crowns(trees) if rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0 else None
 
 
 def path_loss(
-    data: FlightData, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
+    trees: Trees, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
 ) -> Loss | None:
-    """Loss per path besides the field's own: foliage (by ``rt`` or the arguments) and ``rt.reflection_loss_db``."""
-    through = _foliage_loss(data, carrier_hz, foliage or data.settings.rt.foliage, leaves or data.settings.rt.leaves)
-    per_reflection = data.settings.rt.reflection_loss_db
+    """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
+
+    Parameters
+    ----------
+    trees : Trees
+        Crowns and trunks of the site.
+    rt : RtSettings
+        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``.
+    carrier_hz : float
+    foliage, leaves : str, optional
+        In place of those of ``rt``.
+
+    Returns
+    -------
+    callable or None
+        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
+        through; None where no path loses anything.
+    """
+    through = _foliage_loss(trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
+    per_reflection = rt.reflection_loss_db
     if per_reflection == 0.0:
         return through
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        trees = 0.0 if through is None else through(paths, sources_m, targets_m)
-        return np.asarray(trees + per_reflection * paths.depth, dtype=np.float64)
+        trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
+        return np.asarray(trees_db + per_reflection * paths.depth, dtype=np.float64)
 
     return loss
 
 
-def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
-    rt = data.settings.rt
-    if len(data.site.trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
+def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
+    if len(trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
         return None  # where opaque crowns reflect, a run without trees has to lose those paths
     name = rt.foliage_model if foliage == "attenuating" else foliage
     own = leaves == rt.leaves  # numbers of the flight file belong to its own season
@@ -286,7 +365,7 @@ def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str
         gamma_db_per_m=rt.gamma_db_per_m if own else None,
         maximum_db=rt.maximum_loss_db if own else None,
     )
-    index = CrownIndex(data.site.trees)
+    index = CrownIndex(trees)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]
@@ -295,8 +374,7 @@ def _foliage_loss(data: FlightData, carrier_hz: float, foliage: str, leaves: str
     return loss
 
 
-def direct_foliage_m(data: FlightData, tower: str, replayed: Replayed) -> FloatArray:
-    """Length of the direct line inside tree crowns at the replayed poses (n,) [m]."""
-    target = replayed.poses.position_m
-    source = np.broadcast_to(data.site.towers[tower].position_m, target.shape)
-    return foliage_depth_m(source, np.zeros((len(target), 0, 3)), target, data.site.trees)
+def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, trees: Trees) -> FloatArray:
+    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,) to poses (n, 3) [m]."""
+    source = np.broadcast_to(tower_m, poses_m.shape)
+    return foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, trees)

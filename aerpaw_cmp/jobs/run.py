@@ -3,78 +3,75 @@
 from __future__ import annotations
 
 import os
-import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass, field
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ..common.errors import UsageError
-
-if TYPE_CHECKING:
-    from ..flight.data import FlightData
-
-Progress = Callable[[str], None]
-
-
-def _silent(_text: str) -> None:
-    """No progress."""
-
-
-@dataclass(slots=True)
-class Stages:
-    """Seconds of each named stage, in order."""
-
-    progress: Progress = _silent
-    seconds: dict[str, float] = field(default_factory=dict)
-
-    @contextmanager
-    def __call__(self, name: str) -> Iterator[None]:
-        """Time one stage."""
-        self.progress(name)
-        start = time.perf_counter()
-        try:
-            yield
-        finally:
-            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+from ..common.errors import AerpawCmpError, UsageError
+from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
+from ..common.stages import Progress, Stages, silent
+from ..flight.settings import FlightFile
+from ..site.site import Site
 
 
 def run_ingest(
-    paths: list[Path], *, out: Path | None = None, draft: Path | None = None, reader: str | None = None, **options: Any
+    paths: list[Path],
+    *,
+    out: Path | None = None,
+    draft: Path | None = None,
+    reader: str | None = None,
+    force: bool = False,
+    **options: Any,
 ) -> dict[str, Any]:
     """Read logs, write the flight file when ``out`` is given, and give the summary of DESIGN section 3.
 
     With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
+    With ``force``, the two may replace files that this tool did not write, but no input.
     """
-    from ..logs.flight_file import write_flight
+    from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
     from ..logs.readers import ReadOptions
 
-    if draft is not None:
-        from ..flight.draft import check_target, write_draft
+    if out is not None and draft is not None and os.path.realpath(out) == os.path.realpath(draft):
+        raise UsageError("-o and --draft name the same file", expected="two names", path=draft)
+    with ExitStack() as outputs:  # a wrong name is told before the logs are read
+        target = None
+        if out is not None:
+            target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
+        if draft is not None:
+            from ..flight.draft import draft as draft_of
 
-        check_target(draft)
-    files = ingest(paths, options=ReadOptions(**options), reader=reader)
-    if out is not None:
-        write_flight(out, files)
-    account = summary(files)
-    if draft is not None:
-        told = {key: options.get(key) for key in ("timezone", "time_origin")}
-        account["draft"] = write_draft(files, draft, **told)
+            drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
+        files = ingest(paths, options=ReadOptions(**options), reader=reader)
+        account = summary(files)
+        if draft is not None:
+            told = {key: options.get(key) for key in ("timezone", "time_origin")}
+            text, account["draft"] = draft_of(files, drafted.target.parent, **told)
+            drafted.write(sealed(text))
+        if target is not None:
+            target.write(flight_bytes(files))
     return account
 
 
-def run_simulate(flight: Path, *, out: Path | None = None, progress: Progress = _silent) -> list[Path]:
-    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``."""
+def run_simulate(
+    flight: Path, *, out: Path | None = None, force: bool = False, progress: Progress = silent
+) -> list[Path]:
+    """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``.
+
+    A log that is not marked as synthetic (in truth.json) is replaced with ``force`` only.
+    """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
     from ..flight.simulate import FlightSimulator
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)
-    return FlightSimulator(settings, site, flight.parent).run(out or flight.parent, progress=progress)
+    simulator = FlightSimulator(settings, site, flight.parent)
+    inputs = [flight, flight.parent / settings.site.file]
+    return simulator.run(out or flight.parent, inputs=inputs, force=force, progress=progress)
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,7 +90,8 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
-    progress: Progress = _silent,
+    force: bool = False,
+    progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
 
@@ -102,49 +100,63 @@ def run_report(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
-    from ..flight.data import gather, read_logs
     from ..flight.settings import load_flight
+    from ..report.export import metrics as metrics_of
+    from ..report.write import write_report
 
-    stages = Stages(progress)
+    settings = _overridden(load_flight(flight), engine, audit)
+    inputs = input_files(settings, flight, logs_root)
+    folder = out or Path("reports") / settings.flight.name
+    with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
+        record = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+        with output.filling() as place:
+            write_report(record, place)
+    metrics = metrics_of(record)
+    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
+    """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
+    roots = [path.parent] if logs_root is None else [path.parent, logs_root]
+    named = [root / text for text in _texts(settings.model_dump()) for root in roots if text and "\0" not in text]
+    return [path, *(file for file in dict.fromkeys(named) if os.path.isfile(file))]  # noqa: PTH113  never raises
+
+
+def _texts(value: Any) -> Iterator[str]:
+    """Every text in nested settings."""
+    if isinstance(value, (str, Path)):
+        yield str(value)
+    elif isinstance(value, dict):
+        for item in value.values():
+            yield from _texts(item)
+    elif isinstance(value, (list, tuple)):
+        for item in value:
+            yield from _texts(item)
+
+
+def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
+    """The record of a report: read, replay, compare, audit."""
+    from ..flight.data import gather, read_logs
+
     with stages("read"):
-        settings = _overridden(load_flight(flight), engine, audit)
         files = read_logs(settings, flight.parent, logs_root)
         data = gather(settings, flight.parent, files, logs_root)
-    from .compare_flight import audit_replays, compare_rank_series, compare_rss_series
-    from .replay import estimate_clocks, replay_rank, replay_rss
+    from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    with stages("clocks"):
-        clocks = estimate_clocks(data, progress)
-    with stages("replay"):
-        rss_replays = replay_rss(data, progress, clocks)
-        rank_replays = replay_rank(data, progress)
-    with stages("compare"):
-        rss = [
-            compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, rss_replays, strict=True)
-        ]
-        rank = [
-            compare_rank_series(data, series, replayed)
-            for series, replayed in zip(data.rank, rank_replays, strict=True)
-        ]
-    with stages("audit"):
-        engine_record = audit_replays(data, [*rss_replays, *rank_replays], progress)
+    found = run_flight(data, stages)
+    replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links:
         with stages("speed"):
             from .speed_table import speed_rows
 
-            speed = speed_rows(data, [*rank_replays, *rss_replays][0], progress)
-    with stages("report"):
-        from ..report.export import metrics as metrics_of
-        from ..report.write import write_report
+            speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
+    stages.progress("report")
+    from ..report.build import report_data
 
-        notes = foliage_notes(data, {r.link.carrier_hz for r in (*rss_replays, *rank_replays)})
-        record = _report_data(data, rss, rank, engine_record, speed, notes, stages)
-        folder = out or Path("reports") / settings.flight.name
-        write_report(record, folder)
-        metrics = metrics_of(record)
-    return ReportOutcome(folder, metrics, _failed_checks(metrics))
+    notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
+    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -160,45 +172,6 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
             raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
         change["audit_links"] = numbers.get(audit, int(audit) if audit.isdigit() else 0)
     return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
-
-
-def _report_data(
-    data: FlightData,
-    rss: list[Any],
-    rank: list[Any],
-    engine: Any,
-    speed: tuple[Any, ...],
-    notes: tuple[str, ...],
-    stages: Stages,
-) -> Any:
-    from ..report.data import ReportData
-    from .compare_flight import inputs_of, metrics_beyond_panels, pairs_of, track_of, versions, waypoints_of
-
-    settings = data.settings
-    warnings = list(data.warnings)
-    warnings += [w for result in (*rss, *rank) for w in result.warnings]
-    pairs = pairs_of([r.panel for r in rss])
-    return ReportData(
-        title=settings.report.title or settings.flight.title or settings.flight.name,
-        flight=settings.flight.name,
-        site=data.site,
-        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        versions=versions(),
-        inputs=inputs_of(data),
-        track=track_of(data),
-        waypoints=waypoints_of(data),
-        rss=tuple(r.panel for r in rss),
-        rank=tuple(r.panel for r in rank),
-        pairs=tuple(p.panel for p in pairs),
-        extra_metrics=metrics_beyond_panels([*rss, *rank, *pairs]),
-        engine=engine,
-        speed=speed,
-        synthetic=settings.flight.synthetic,
-        warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
-        settings=settings.model_dump(mode="json"),
-        stages_s=dict(stages.seconds),
-    )
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -221,7 +194,7 @@ def run_bench(
     poses: int = 200,
     samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000),
     ratios: bool = True,
-    progress: Progress = _silent,
+    progress: Progress = silent,
 ) -> dict[str, Any]:
     """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
     from ..propagation.bench import path_search, random_scene, speed_against_error
@@ -247,13 +220,15 @@ def run_bench(
 
 
 def run_site_import(
-    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None
+    files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
 ) -> list[str]:
     """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
-    from ..site.footprints import import_site, write_site_yaml
+    from ..site.footprints import import_site, site_yaml
 
-    model, actions = import_site(files, base=base, untagged=untagged)
-    write_site_yaml(model, out, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+    with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
+        model, actions = import_site(files, base=base, untagged=untagged)
+        text = site_yaml(model, header=["made by 'aerpaw-cmp site import' from map data", *actions])
+        output.write(sealed(text))
     return actions
 
 
@@ -265,6 +240,7 @@ def run_site_show(
     logs_root: Path | None = None,
     pose: int | None = None,
     export: bool = False,
+    force: bool = False,
 ) -> list[Path]:
     """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
 
@@ -275,34 +251,38 @@ def run_site_show(
 
     if pose is not None and flight is None:
         raise UsageError(f"--pose {pose} without a flight", expected="--flight flight.yaml, whose track has the pose")
-    track, paths = None, ()
-    if flight is None:
-        place = load_site(site or "lake_wheeler")
-    else:
-        from ..flight.data import gather, read_logs
+    settings, inputs = None, [Path(site)] if site is not None else []
+    if flight is not None:
         from ..flight.settings import load_flight
-        from .compare_flight import track_of
 
         settings = load_flight(flight)
         if site is not None:
             file = str(Path(site).resolve()) if Path(site).is_file() else site
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
-        data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
-        place, track = data.site, track_of(data)
-        if pose is not None:
-            paths = _paths_of_pose(data, place, track, pose)
-    written = write_site_view(place, out, track=track, paths=paths)
-    if export:
-        from ..site.export import export_scene
+        inputs += input_files(settings, flight, logs_root)
+    track, paths = None, ()
+    with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
+        if flight is None or settings is None:
+            place = load_site(site or "lake_wheeler")
+        else:
+            from ..flight.data import gather, read_logs
+            from ..report.build import track_of
 
-        written += export_scene(place, out / "scene")
-    return written
+            data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+            place, track = data.site, track_of(data)
+            if pose is not None:
+                paths = _paths_of_pose(settings, place, track, pose)
+        with output.filling() as folder:
+            written = write_site_view(place, folder, track=track, paths=paths)
+            if export:
+                from ..site.export import export_scene
+
+                written += export_scene(place, folder / "scene")
+    return [out / path.relative_to(folder) for path in written]
 
 
-def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
+def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> Any:
     """Propagation paths of all towers to one point of the track, as polylines."""
-    import dataclasses
-
     import numpy as np
 
     from ..propagation.arrays import Link, Poses, single_element
@@ -314,13 +294,12 @@ def _paths_of_pose(data: FlightData, site: Any, track: Any, pose: int) -> Any:
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
     # paths join the centres of the arrays: which elements they have does not matter
-    link = Link(data.settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
-    data = dataclasses.replace(data, site=site)
-    crowns, depth = reflecting_crowns(data), data.settings.rt.max_depth
+    link = Link(settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
+    crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
-    loss = path_loss(data, link.carrier_hz)
-    if data.settings.rt.foliage == "opaque" and loss is not None:
+    loss = path_loss(site.trees, settings.rt, link.carrier_hz)
+    if settings.rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
         found = found.select(np.isfinite(loss(found, sources, point)))
     lines = []
@@ -346,7 +325,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     from ..live.follow import TelemetryFollower
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
-    from ..propagation.tracer import replay
+    from .replay import replay_poses
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)
@@ -372,8 +351,8 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
             roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
             rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
         pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
-        result = replay(site, link, pose, engine="image", max_depth=settings.rt.max_depth)
-        rank = int(channel_rank(result.h[0, 0], k))
+        found = replay_poses(site, settings.rt, link, pose, engine="image")
+        rank = int(channel_rank(found.h[0, 0], k))
         return rank or None
 
     return predict
@@ -390,7 +369,7 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, progress: Progress = _silent, **options: Any,
+    logs_root: Path | None = None, force: bool = False, progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -407,10 +386,10 @@ def run_map(
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
     """
+    from ..common.versions import versions
     from ..report.maps_html import maps_metrics, write_maps
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
-    from .compare_flight import versions
     from .paper_table import paper_markdown, paper_rows
 
     given = {name: value for name, value in options.items() if value is not None}
@@ -418,22 +397,32 @@ def run_map(
     place = load_site(site)
     name = Path(site).stem
     folder = out or Path("reports") / f"map-{name}"
-    outcome = mapping.make_maps(place, settings, progress)
-    if settings.study:
-        if flight is not None:
-            outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
-        mapping.study_maps(outcome, progress)
-    generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
-    with outcome.stage("export", progress):
-        files = mapping.export_maps(outcome, folder, {"site": place.name, "generated": generated}, progress)
-    progress("page")
-    record = mapping.maps_record(
-        outcome, name=name, generated=generated, versions=versions(), paper=paper_rows(outcome)
-    )
-    written = write_maps(record, folder)
-    written.append(folder / "paper.md")
-    written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
-    return MapsOutcome(folder, (*written, *files), maps_metrics(record))
+    inputs = [Path(site), *([] if flight is None else [flight])]
+    stages = Stages(progress)
+    with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
+        outcome = mapping.make_maps(place, settings, stages)
+        if settings.study:
+            if flight is not None:
+                outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
+            mapping.study_maps(outcome, stages)
+        generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
+        with output.filling() as part:
+            with stages("export"):
+                files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
+            progress("page")
+            record = mapping.maps_record(
+                outcome,
+                name=name,
+                generated=generated,
+                versions=versions(),
+                stages_s=stages.seconds,
+                paper=paper_rows(outcome),
+            )
+            written = write_maps(record, part)
+            written.append(part / "paper.md")
+            written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
+    results = tuple(folder / path.relative_to(part) for path in (*written, *files))
+    return MapsOutcome(folder, results, maps_metrics(record))
 
 
 def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
@@ -442,7 +431,7 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
 
     from ..flight.data import gather, read_logs
     from ..flight.settings import load_flight
-    from .compare_flight import track_of
+    from ..report.build import track_of
 
     settings = load_flight(flight)
     track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
@@ -469,7 +458,8 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
-    progress: Progress = _silent,
+    force: bool = False,
+    progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
 
@@ -480,23 +470,30 @@ def run_campaign(
     """
     from dataclasses import replace
 
+    from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
     from .campaign import load_campaign
     from .campaign import run as run_all
 
     stages = Stages(progress)
-    data = run_all(
-        load_campaign(path),
-        path.parent,
-        logs_root=logs_root,
-        workers=workers,
-        cluster=cluster,
-        stage=stages,
-        progress=progress,
-    )
-    folder = out or Path("reports") / data.name
-    with stages("report"):
-        write_campaign(replace(data, stages_s=dict(stages.seconds)), folder)
+    campaign = load_campaign(path)
+    inputs = input_files(campaign, path)
+    for entry in campaign.flights:
+        with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
+            inputs += input_files(load_flight(path.parent / entry), path.parent / entry, logs_root)
+    folder = out or Path("reports") / campaign.campaign
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output:
+        data = run_all(
+            campaign,
+            path.parent,
+            logs_root=logs_root,
+            workers=workers,
+            cluster=cluster,
+            stage=stages,
+            progress=progress,
+        )
+        with stages("report"), output.filling() as place:
+            write_campaign(replace(data, stages_s=dict(stages.seconds)), place)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:

@@ -9,19 +9,21 @@ import dataclasses
 import json
 import os
 import platform
-from collections.abc import Callable
+from contextlib import suppress
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
+from ..common.errors import OutputError
+from ..common.files import write_whole
+from ..common.stages import Progress, silent
+from ..common.versions import versions
 from ..flight.data import FlightData
 from ..machine import llvm
 from ..propagation.arrays import Isotropic, Poses
 from ..propagation.bench import Row, speed_against_error
 from ..report.data import SpeedRow
-from ..report.export import write_atomic
-from .compare_flight import versions
 from .replay import Replayed
 
 POSES = 40
@@ -31,7 +33,7 @@ EXPLICIT_POSES = 10
 SAMPLES = (1_000, 10_000, 100_000)
 
 
-def speed_rows(data: FlightData, replayed: Replayed, progress: Callable[[str], None]) -> tuple[SpeedRow, ...]:
+def speed_rows(data: FlightData, replayed: Replayed, progress: Progress = silent) -> tuple[SpeedRow, ...]:
     """Rows of speed against error for one replayed series.
 
     Sionna's own arrays know isotropic elements only; with other patterns their rows are left out.
@@ -81,10 +83,9 @@ def _load(key: str) -> list[dict[str, Any]] | None:
 
 
 def _save(key: str, rows: list[dict[str, Any]]) -> None:
-    try:
-        write_atomic(llvm.cache_folder() / f"speed-{key}.json", json.dumps(rows))
-    except OSError:
-        return  # a read-only home costs the next report the time, not this one its result
+    with suppress(OSError, OutputError):  # a read-only home costs the next report the time, not this one its result
+        llvm.cache_folder().mkdir(parents=True, exist_ok=True)
+        write_whole(llvm.cache_folder() / f"speed-{key}.json", json.dumps(rows))
 
 
 def _as_report(row: dict[str, Any], depth: int) -> SpeedRow:

@@ -3,47 +3,82 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Collection, Mapping
-from typing import Any
+from collections.abc import Collection, Mapping, Sequence
+from pathlib import Path
+from typing import Any, Literal
 
 import numpy as np
 
 from ..common.units import ComplexArray, FloatArray, IntArray
 from ..compare.offset import expected_offset_db, read_reference_powers, reference_power_dbm
 from ..compare.rank import rank_from_singular_values, singular_values
-from ..flight.data import FlightData, RssSeries
-from ..flight.settings import PortSettings
+from ..compare.result import FoliageLoss, FoliageRankChange
+from ..flight.data import RssSeries
+from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
 from ..propagation.channel import Fields, channel_matrices, mean_pair_power, rss_dbm
 from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from ..propagation.tracer import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
+from ..site.site import Site
 from .replay import Replayed, attitude_rotation, path_loss
 
 LEAVES = ("in", "out")
 
 
+RssField = Literal["coherent", "power", "local_mean"]
+"""Which simulated level is compared: values of ``rss.field``."""
+
+
 def evaluate(
-    data: FlightData, replayed: Replayed, loss: Loss | None, *, link: Link | None = None, poses: Poses | None = None
+    site: Site, replayed: Replayed, loss: Loss | None, *, link: Link | None = None, poses: Poses | None = None
 ) -> Fields:
-    """Fields over the paths that the replay found, with another link, attitude or loss."""
+    """Fields over the paths that the replay found, with another link, attitude or loss.
+
+    Parameters
+    ----------
+    site : Site
+        Towers and their positions.
+    replayed : Replayed
+        Its paths are taken as they are.
+    loss : callable or None
+        Loss per path [dB], as :func:`aerpaw_cmp.jobs.replay.path_loss` gives it.
+    link, poses : optional
+        In place of those of the replay; as many poses.
+    """
     link, poses = link or replayed.link, poses or replayed.poses
-    sources = np.array([data.site.towers[name].position_m for name in replayed.replay.towers])
+    sources = np.array([site.towers[name].position_m for name in replayed.replay.towers])
     paths = replayed.replay.paths
     loss_db = None if loss is None else loss(paths, sources, poses.position_m)
     return channel_matrices(paths, replayed.replay.faces, sources, poses, link, loss_db)
 
 
-def level_dbm(data: FlightData, link: Link, fields: Fields) -> FloatArray:
+def level_dbm(link: Link, fields: Fields, field: RssField) -> FloatArray:
     """RSS (poses,) of the one tower of a series, coherent or power sum as ``rss.field`` says [dBm]."""
-    power = fields.power if data.settings.rss.field == "power" else mean_pair_power(fields.h)
+    power = fields.power if field == "power" else mean_pair_power(fields.h)
     return rss_dbm(power, link.transmit_power_dbm)[:, 0]
 
 
-def rss_alternatives(data: FlightData, replayed: Replayed) -> dict[str, FloatArray]:
-    """Levels at the replayed poses (n,) [dBm] under other assumptions, by name; only those that could differ."""
-    link, loss = replayed.link, path_loss(data, replayed.link.carrier_hz)
+def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssField) -> dict[str, FloatArray]:
+    """Levels at the replayed poses under other assumptions; only those that could differ.
+
+    Parameters
+    ----------
+    site : Site
+    rt : RtSettings
+        As the flight was replayed.
+    replayed : Replayed
+        One series.
+    field : {"coherent", "power", "local_mean"}
+        Which simulated level is compared.
+
+    Returns
+    -------
+    dict of str to (poses,)
+        By what is assumed [dBm].
+    """
+    link, loss = replayed.link, path_loss(site.trees, rt, replayed.link.carrier_hz)
     changed: dict[str, tuple[Link, Poses]] = {}
     arrays = [*link.tower_arrays.values(), link.uav_array]
     if any(isinstance(p, InstalledPattern) for a in arrays for p in a.patterns):
@@ -52,15 +87,15 @@ def rss_alternatives(data: FlightData, replayed: Replayed) -> dict[str, FloatArr
         changed["isotropic antennas"] = (_with_patterns(link, lambda _: Isotropic()), replayed.poses)
     if replayed.track is not None and any(p.name != "iso" for p in link.uav_array.patterns):
         for mode, name in (("logged", "logged attitude"), ("level", "heading only"), ("ignored", "attitude ignored")):
-            if mode != data.settings.rt.attitude:
+            if mode != rt.attitude:
                 rotation = attitude_rotation(replayed.track, mode)[replayed.valid]
                 changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
     found = {
-        name: level_dbm(data, other, evaluate(data, replayed, loss, link=other, poses=poses))
+        name: level_dbm(other, evaluate(site, replayed, loss, link=other, poses=poses), field)
         for name, (other, poses) in changed.items()
     }
-    for name, fields in foliage_alternatives(data, replayed).items():
-        found[name] = level_dbm(data, link, fields)
+    for name, fields in foliage_alternatives(site, rt, replayed).items():
+        found[name] = level_dbm(link, fields, field)
     return found
 
 
@@ -76,25 +111,25 @@ def _alone(pattern: Any) -> Any:
     return pattern.base if isinstance(pattern, InstalledPattern) else pattern
 
 
-def foliage_alternatives(data: FlightData, replayed: Replayed) -> dict[str, Fields]:
+def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict[str, Fields]:
     """Fields without trees, in leaf and out of leaf, where ``rt.paired_foliage`` asks and the site has trees."""
-    if not data.settings.rt.paired_foliage or not len(data.site.trees):
+    if not rt.paired_foliage or not len(site.trees):
         return {}
-    carrier = replayed.link.carrier_hz
-    kept = data.settings.rt.foliage
-    foliage = "attenuating" if kept == "none" else kept
-    found = {"without trees": evaluate(data, replayed, path_loss(data, carrier, foliage="none"))}
+
+    def with_trees(foliage: str, leaves: str | None = None) -> Fields:
+        loss = path_loss(site.trees, rt, replayed.link.carrier_hz, foliage=foliage, leaves=leaves)
+        return evaluate(site, replayed, loss)
+
+    foliage = "attenuating" if rt.foliage == "none" else rt.foliage
+    found = {"without trees": with_trees("none")}
     for leaves in LEAVES:
-        found[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = evaluate(
-            data, replayed, path_loss(data, carrier, foliage=foliage, leaves=leaves)
-        )
+        found[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = with_trees(foliage, leaves)
     return found
 
 
-def foliage_notes(data: FlightData, carriers_hz: Collection[float]) -> tuple[str, ...]:
-    """What a report must say of the foliage models that it used: where they are stretched or assumed."""
-    rt = data.settings.rt
-    if not len(data.site.trees) or not (rt.foliage == "attenuating" or (rt.paired_foliage and rt.foliage != "opaque")):
+def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
+    """What a report must say of its foliage models, where the site has trees: how far they are stretched or assumed."""
+    if not trees or not (rt.foliage == "attenuating" or (rt.paired_foliage and rt.foliage != "opaque")):
         return ()
     notes = []
     if rt.foliage_model == "p833" and (rt.gamma_db_per_m is None or rt.maximum_loss_db is None):
@@ -121,23 +156,23 @@ def p833_note(carrier_hz: float) -> str | None:
     )
 
 
-def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, Any]:
+def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, FoliageLoss]:
     """What the trees take from the RSS per pose, in leaf and out of leaf [dB]; empty without a paired run."""
     bare = levels.get("without trees")
     if bare is None:
         return {}
-    found: dict[str, Any] = {}
+    found = {}
     for name in ("trees in leaf", "trees out of leaf"):
         with np.errstate(invalid="ignore"):
             loss = bare - levels[name]
         known = np.isfinite(loss)
-        found[name.replace(" ", "_")] = {
-            "n": int(known.sum()),
-            "n_blocked": int((np.isfinite(bare) & ~np.isfinite(levels[name])).sum()),
-            "mean_loss_db": float(loss[known].mean()) if known.any() else float("nan"),
-            "largest_loss_db": float(loss[known].max()) if known.any() else float("nan"),
-            "share_above_1_db": float((np.abs(loss[known]) > 1.0).mean()) if known.any() else float("nan"),
-        }
+        found[name.replace(" ", "_")] = FoliageLoss(
+            n=int(known.sum()),
+            n_blocked=int((np.isfinite(bare) & ~np.isfinite(levels[name])).sum()),
+            mean_loss_db=float(loss[known].mean()) if known.any() else float("nan"),
+            largest_loss_db=float(loss[known].max()) if known.any() else float("nan"),
+            share_above_1_db=float((np.abs(loss[known]) > 1.0).mean()) if known.any() else float("nan"),
+        )
     return found
 
 
@@ -145,15 +180,30 @@ PairedRanks = dict[str, dict[float, IntArray]]
 """Ranks (n,) per K of each run of a paired replay."""
 
 
-def foliage_ranks(data: FlightData, replayed: Replayed, keep: IntArray) -> PairedRanks:
-    """Ranks without trees, in leaf and out of leaf; ``keep`` picks replayed poses. Empty without a paired run."""
-    return {
-        name: _ranks(found.h[keep, 0], data.settings.rank.k)
-        for name, found in foliage_alternatives(data, replayed).items()
-    }
+def foliage_ranks(site: Site, rt: RtSettings, replayed: Replayed, keep: IntArray, ks: Sequence[float]) -> PairedRanks:
+    """Ranks without trees, in leaf and out of leaf.
+
+    Parameters
+    ----------
+    site : Site
+    rt : RtSettings
+        ``paired_foliage`` asks for the runs.
+    replayed : Replayed
+        One rank series.
+    keep : (m,) int
+        Replayed poses that count.
+    ks : sequence of float
+        Singular-value ratios.
+
+    Returns
+    -------
+    dict of str to dict of float to (m,) int
+        By run and K; empty without a paired run.
+    """
+    return {name: _ranks(found.h[keep, 0], ks) for name, found in foliage_alternatives(site, rt, replayed).items()}
 
 
-def foliage_rank_difference(paired: PairedRanks) -> dict[str, Any]:
+def foliage_rank_difference(paired: PairedRanks) -> dict[str, dict[str, FoliageRankChange]]:
     """Poses at which trees change the rank, per K; empty without a paired run."""
     if not paired:
         return {}
@@ -162,36 +212,39 @@ def foliage_rank_difference(paired: PairedRanks) -> dict[str, Any]:
     keep = next(iter(bare.values()))
     return {
         name.replace(" ", "_"): {
-            f"{k:g}": {
-                "share_changed": float((rank[k] != bare[k]).mean()) if len(keep) else float("nan"),
-                "mean_change": float((rank[k] - bare[k]).mean()) if len(keep) else float("nan"),
-                "n_lower": int((rank[k] < bare[k]).sum()),
-                "n_higher": int((rank[k] > bare[k]).sum()),
-            }
+            f"{k:g}": FoliageRankChange(
+                share_changed=float((rank[k] != bare[k]).mean()) if len(keep) else float("nan"),
+                mean_change=float((rank[k] - bare[k]).mean()) if len(keep) else float("nan"),
+                n_lower=int((rank[k] < bare[k]).sum()),
+                n_higher=int((rank[k] > bare[k]).sum()),
+            )
             for k in bare
         }
         for name, rank in ranks.items()
     }
 
 
-def _ranks(h: ComplexArray, ks: list[float]) -> dict[float, IntArray]:
+def _ranks(h: ComplexArray, ks: Sequence[float]) -> dict[float, IntArray]:
     sigma = singular_values(h)
     return {k: rank_from_singular_values(sigma, k) for k in ks}
 
 
-def expected_offset(data: FlightData, series: RssSeries) -> dict[str, float]:
-    """Offset that the USRP reference powers predict for a series [dB]; empty where flight.yaml names none.
+def expected_offset(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries
+) -> tuple[float, float, float] | None:
+    """Offset that the USRP reference powers predict for a series [dB], and those of receiver and transmitter [dBm].
+
+    None where the flight file (``rss.reference_powers``, its table below ``folder``) has none for the channel.
 
     Raises
     ------
     InputError
         If the table cannot be read.
     """
-    budget = data.settings.rss.reference_powers
     receiver = None if budget is None else budget.receivers.get(series.channel)
     if budget is None or receiver is None:
-        return {}
-    table = read_reference_powers(data.folder / budget.file)
+        return None
+    table = read_reference_powers(folder / budget.file)
     carrier = series.link.carrier_hz
 
     def reference(port: PortSettings, category: Any) -> float:
@@ -212,4 +265,4 @@ def expected_offset(data: FlightData, series: RssSeries) -> dict[str, float]:
         transmit_gain_db=budget.transmitter.extra_gain_db if budget.transmitter else 0.0,
         receive_gain_db=receiver.extra_gain_db,
     )
-    return {"expected_db": expected, "receiver_reference_dbm": received, "transmitter_reference_dbm": sent}
+    return expected, received, sent

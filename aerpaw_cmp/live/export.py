@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -11,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError
-from ..common.files import whole
+from ..common.outputs import OutputFile
 from .log import BadLine, Record, read_log, segments
 
 COLUMNS = (
@@ -96,7 +97,14 @@ def _rows(source: Path, bad: list[BadLine]) -> Iterator[dict[str, Any]]:
             yield {"n": record["n"], **row}
 
 
-def export_csv(source: Path, out: Path) -> ExportSummary:
+def _is_export(path: Path) -> bool:
+    """Whether a file begins as a table of this module."""
+    head = ",".join(COLUMNS) + "\r\n"
+    with path.open("rb") as stream:
+        return stream.read(len(head)) == head.encode("ascii")
+
+
+def export_csv(source: Path, out: Path, *, force: bool = False) -> ExportSummary:
     """Write one CSV row per exchange, prediction and gap of a tap log: the whole file or none.
 
     Parameters
@@ -105,24 +113,27 @@ def export_csv(source: Path, out: Path) -> ExportSummary:
         A segment, or the folder of a log.
     out : Path
         The CSV file; its folder must exist.
+    force : bool
+        Replace a file that is no such table.
 
     Raises
     ------
     InputError
-        If the log cannot be read or the CSV cannot be written.
+        If the log cannot be read.
+    UsageError
+        If the file is part of the log, or no table of this function.
+    OutputError
+        If the disk does not take it.
     """
     bad: list[BadLine] = []
     rows = 0
-    segments(source)  # raises before anything is written
-    try:
-        with whole(out) as part, part.open("w", newline="", encoding="ascii") as file:
-            writer = csv.DictWriter(file, COLUMNS, extrasaction="ignore")
-            writer.writeheader()
-            for row in _rows(source, bad):
-                writer.writerow(row)
-                rows += 1
-    except OSError as error:
-        raise InputError(
-            f"cannot be written ({error.strerror})", expected="a file name in a folder that exists", path=out
-        ) from None
+    logs = segments(source)  # raises before anything is written
+    with OutputFile(out, own=_is_export, inputs=logs, force=force) as output:
+        table = io.StringIO(newline="")
+        writer = csv.DictWriter(table, COLUMNS, extrasaction="ignore")
+        writer.writeheader()
+        for row in _rows(source, bad):
+            writer.writerow(row)
+            rows += 1
+        output.write(table.getvalue().encode("ascii"))
     return ExportSummary(out, rows, tuple(bad))

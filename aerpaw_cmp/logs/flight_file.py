@@ -26,8 +26,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
 
-from ..common.errors import InputError, UsageError
-from ..common.files import whole
+from ..common.errors import InputError
+from ..common.outputs import OutputFile
 from .records import ReadResult, RejectedLine, Stream
 
 if TYPE_CHECKING:
@@ -59,37 +59,44 @@ class IngestedFile:
 
 
 def write_flight(path: str | Path, files: Sequence[IngestedFile]) -> None:
-    """Write a flight file atomically: a reader sees the old file or the new one, never a part.
+    """Write a flight file: a reader sees the old file or the new one, never a part.
 
     Raises
     ------
     UsageError
-        If the place cannot be written.
+        If the place is an input, another file, or in no folder; see :class:`~aerpaw_cmp.common.outputs.OutputFile`.
+    OutputError
+        If the disk does not take it.
+    """
+    with OutputFile(Path(path), own=is_flight_file) as output:
+        output.write(flight_bytes(files))
+
+
+def flight_bytes(files: Sequence[IngestedFile]) -> bytes:
+    """The whole content of a flight file.
+
+    Made in memory: HDF5 ends the process where a disk is full.
     """
     import h5py
 
-    try:
-        with whole(Path(path), durable=True) as part:
-            with h5py.File(part, "w") as book:
-                book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
-                shelf = book.create_group("files")
-                for i, file in enumerate(files):
-                    _write_file(shelf.create_group(f"{i:05d}"), file)
-            _seal(part)
-    except OSError as error:
-        raise UsageError(
-            f"cannot write the flight file ({error.strerror or error})",
-            cause="a missing folder or a full disk",
-            path=path,
-        ) from error
+    with h5py.File("flight", "w", driver="core", backing_store=False) as book:
+        book.attrs["format"], book.attrs["version"] = FORMAT, VERSION
+        shelf = book.create_group("files")
+        for i, file in enumerate(files):
+            _write_file(shelf.create_group(f"{i:05d}"), file)
+        book.flush()
+        content: bytes = book.id.get_file_image()
+    return content + _SEAL + hashlib.sha256(content).digest()
 
 
-def _seal(path: Path) -> None:
-    """Append the digest of the content."""
-    with path.open("r+b") as book:
-        digest = _digest(book, path.stat().st_size)
-        book.seek(0, os.SEEK_END)
-        book.write(_SEAL + digest)
+def is_flight_file(path: Path) -> bool:
+    """Whether a file is a flight file as it was written: its content has the SHA-256 at its end."""
+    with path.open("rb") as book:
+        content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
+        if content <= 0:
+            return False
+        book.seek(content)
+        return book.read() == _SEAL + _digest(book, content)
 
 
 def _digest(book: BinaryIO, size: int) -> bytes:

@@ -20,6 +20,8 @@ from ..common.errors import InputError
 from ..common.units import AnyArray
 
 MAGIC = b"MATLAB 5.0 MAT-file"
+MAGIC_73 = b"MATLAB 7.3 MAT-file"
+"""First bytes of a version 7.3 file: HDF5 behind a block of 512 bytes."""
 MOST_BYTES = 1 << 30
 """Of one variable after decompression."""
 
@@ -58,13 +60,19 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     Raises
     ------
     InputError
-        If it is no level-5 file, or any size or type in it cannot be.
+        If it is neither a level-5 nor a version 7.3 file, or any size or type in it cannot be.
+
+    Notes
+    -----
+    Version 7.3 is HDF5: arrays lie transposed, text as 16-bit codes under the attribute ``MATLAB_class``.
     """
+    if data.startswith(MAGIC_73):
+        return _read_hdf5(data, wanted)
     if not data.startswith(MAGIC) or len(data) < 128:
         raise InputError(
-            "no MATLAB 5 file",
-            expected="a file that begins with 'MATLAB 5.0 MAT-file'",
-            cause="another kind of file, or a version 7.3 file: save it again with -v7",
+            "no MATLAB file",
+            expected="a file that begins with 'MATLAB 5.0 MAT-file' or 'MATLAB 7.3 MAT-file'",
+            cause="another kind of file",
         )
     order = {b"IM": "<", b"MI": ">"}.get(data[126:128])
     if order is None:
@@ -78,6 +86,17 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
         if array is not None:
             found[name] = array
     return found
+
+
+def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
+    """The wanted variables of a version 7.3 file, read in a process of its own."""
+    from .hdf5_arrays import read
+
+    try:
+        found = read(data)
+    except ValueError as error:
+        raise _damaged(f"HDF5: {error}") from None
+    return {name: values for name, values in found.items() if wanted is None or name in wanted}
 
 
 def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_Element]:

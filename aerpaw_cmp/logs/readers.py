@@ -74,7 +74,7 @@ class Reader:
     title : str
         One line for ``aerpaw-cmp formats``.
     kinds : tuple of str
-        Kinds of stream it can give.
+        Kinds of stream it can give; none for a file that is known to be no log, and ``title`` says what it is.
     sample : str
         One typical line.
     sniff : callable
@@ -164,9 +164,12 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             cause="the repository was cloned without 'git lfs pull'",
             path=path,
         )
-    candidates = [reader for reader in catalogue() if reader.sniff(head)]
+    known = [reader for reader in catalogue() if reader.sniff(head)]
+    candidates = [reader for reader in known if reader.kinds]
     if len(candidates) == 1:
         return candidates[0]
+    if known and not candidates:
+        raise InputError(f"no log: {known[0].title}", expected="one of the formats of 'aerpaw-cmp formats'", path=path)
     if candidates:
         names = ", ".join(reader.name for reader in candidates)
         raise InputError(

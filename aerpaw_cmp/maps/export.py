@@ -308,7 +308,7 @@ def write_netcdf(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequenc
     """
     _check(grid, layers)
     try:
-        import netCDF4  # noqa: F401  (xarray's engine; asked for here to give one clear message)
+        import netCDF4
         import xarray as xr
     except ImportError as missing:
         raise _extra_missing("NetCDF", missing) from None
@@ -331,7 +331,10 @@ def write_netcdf(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequenc
     target = Path(path)
     encoding = {layer.name: {"zlib": True, "_FillValue": None if layer.classes else np.nan} for layer in layers}
     encoding |= {name: {"_FillValue": None} for name in ("north", "east", "latitude", "longitude")}
-    dataset.to_netcdf(target, engine="netcdf4", encoding=encoding)
+    # in memory: HDF5 ends the process where a disk is full
+    book = netCDF4.Dataset("maps", "w", memory=1 << 16)
+    dataset.dump_to_store(xr.backends.NetCDF4DataStore(book), encoding=encoding)
+    target.write_bytes(book.close())
     return target
 
 
@@ -372,6 +375,7 @@ def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequen
     _check(grid, layers)
     try:
         import rasterio
+        from rasterio.io import MemoryFile
     except ImportError as missing:
         raise _extra_missing("GeoTIFF", missing) from None
     half = grid.spacing_m / 2
@@ -380,15 +384,17 @@ def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequen
     crs = f"+proj=aeqd +lat_0={frame.latitude_deg!r} +lon_0={frame.longitude_deg!r} +ellps=WGS84 +units=m +no_defs"
     rows, columns = grid.shape
     target = Path(path)
-    with rasterio.open(
-        target, "w", driver="GTiff", width=columns, height=rows, count=len(layers), dtype="float32", crs=crs,
-        transform=corner, nodata=np.nan, compress="deflate",
-    ) as file:  # fmt: skip
-        for band, layer in enumerate(layers, start=1):
-            values = np.asarray(layer.values, dtype=np.float32)
-            file.write(grid.raster(values)[::-1], band)
-            file.set_band_description(band, layer.name)
-            file.update_tags(band, title=layer.title, unit=layer.unit, classes=" ".join(layer.classes))
+    with MemoryFile() as memory:  # GDAL says nothing of what a full disk did not take
+        with memory.open(
+            driver="GTiff", width=columns, height=rows, count=len(layers), dtype="float32", crs=crs,
+            transform=corner, nodata=np.nan, compress="deflate",
+        ) as file:  # fmt: skip
+            for band, layer in enumerate(layers, start=1):
+                values = np.asarray(layer.values, dtype=np.float32)
+                file.write(grid.raster(values)[::-1], band)
+                file.set_band_description(band, layer.name)
+                file.update_tags(band, title=layer.title, unit=layer.unit, classes=" ".join(layer.classes))
+        target.write_bytes(memory.read())
     return target
 
 

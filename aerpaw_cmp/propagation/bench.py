@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -15,6 +15,7 @@ from shapely import affinity
 from shapely.geometry import Point, box
 
 from ..common.geodesy import SiteFrame
+from ..common.stages import Progress, silent
 from ..common.units import ComplexArray, FloatArray, wavelength_m
 from ..site.site import Building, Site, Tower
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
@@ -22,8 +23,6 @@ from .audit import RANK_K, Difference, compare
 from .channel import mean_pair_power, rss_dbm
 from .scene import Scene
 from .tracer import Replay, replay
-
-Progress = Callable[[str], None]
 
 
 @dataclass(frozen=True, slots=True)
@@ -125,7 +124,7 @@ def speed_against_error(
     list of Row
         Image engine first: once Sionna is loaded the process stays larger.
     """
-    run = _Runner(site, link, poses, depth, tuple(ks), batch, progress or (lambda _: None))
+    run = _Runner(site, link, poses, depth, tuple(ks), batch, progress or silent)
     rows = [run.image(d) for d in depths]
     rows += [run.thinned(n) for n in thinning]
     for count in samples:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.result import Repeated
 from ..site.site import Site
 from .data import Interval
 
@@ -51,7 +52,7 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
-    within: Mapping[str, Any] = field(default_factory=dict)
+    within: Mapping[str, Repeated] = field(default_factory=dict)
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
 

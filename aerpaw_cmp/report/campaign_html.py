@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import re
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -12,19 +11,17 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from ..common.jsonable import json_safe
+from ..compare.result import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .canvas import Picture
-from .export import json_safe, write_atomic
+from .export import write_file
 from .html import CONTENT_POLICY, by_section, environment
 from .names import k_key
-from .write import remove_stale
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
-
-OWN_FIGURES = re.compile(r"(settings_rmse|rank_tv|tracks|(distance|places|held_out)_[A-Za-z0-9._-]+)\.(svg|png)")
-"""Names of figures that an earlier campaign may have left in the folder."""
 
 ARRAYS = ("time_s", "measured_db", "simulated_dbm", "position_m", "distance_m", "heading_deg")
 """Fields of a row that are samples, not numbers of a table."""
@@ -157,13 +154,13 @@ def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
     ]
 
 
-def halves(data: CampaignData) -> list[tuple[RssRow, Any, Any]]:
+def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
     """Rows whose first and second half pass the same places: with like headings, and with any."""
     found = []
     for row in data.reference_rows:
-        same, every = (row.within.get(name) or {} for name in ("same_heading", "any_heading"))
-        if every.get("n"):
-            found.append((row, same, every))
+        every = row.within.get("any_heading")
+        if every is not None and every.n:
+            found.append((row, row.within.get("same_heading"), every))
     return found
 
 
@@ -267,9 +264,8 @@ def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
     folder = Path(folder)
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
-    written = [write_atomic(folder / "campaign.json", numbers), write_atomic(folder / "campaign.csv", table)]
+    written = [write_file(folder / "campaign.json", numbers), write_file(folder / "campaign.csv", table)]
     drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
-    remove_stale(folder / "figures", {path.name for path in written}, OWN_FIGURES)
-    page = write_atomic(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
     return [page, *written]

@@ -20,7 +20,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
-from .export import write_atomic
+from .export import write_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -82,6 +82,7 @@ def style() -> Iterator[None]:
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
+        "text.parse_math": False,  # names are drawn as they are: a waypoint may be called A_$
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",
@@ -150,8 +151,8 @@ def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], 
     for plate in plates:
         picture = render(plate)
         drawn.append(picture)
-        written.append(write_atomic(folder / f"{picture.name}.svg", picture.svg))
-        written.append(write_atomic(folder / f"{picture.name}.png", picture.png))
+        written.append(write_file(folder / f"{picture.name}.svg", picture.svg))
+        written.append(write_file(folder / f"{picture.name}.png", picture.png))
     return drawn, written
 
 

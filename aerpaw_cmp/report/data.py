@@ -1,7 +1,8 @@
 """What a report is made of: finished numbers, nothing to be computed.
 
-``run`` fills these records; :mod:`aerpaw_cmp.report` turns them into files. Whatever a flight may lack is optional:
-a flight with rank only has ``rss=()``, one without a path anywhere has NaN numbers, never invented ones.
+:mod:`aerpaw_cmp.report.build` fills these records; the rest of the room turns them into files. Whatever a flight may
+lack is optional: a flight with rank only has ``rss=()``, one without a path anywhere has NaN numbers, never invented
+ones.
 Times are naive ``datetime64[ns]`` in UTC. A missing number is NaN (in ``metrics.json``: ``null``).
 """
 
@@ -9,11 +10,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.result import AuditResult, EngineResult
+from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
@@ -87,12 +90,15 @@ class Baseline:
         Received power at the samples of the panel.
     offset_db, rmse_db : float
         Best offset of the measurement against this model, and what it leaves.
+    paired : PairedDifference, optional
+        The ray tracing against this model on the same samples.
     """
 
     name: str
     level_dbm: FloatArray
     offset_db: float
     rmse_db: float
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,7 +190,8 @@ class RssPanel:
     n_effective : float
         Sample size after autocorrelation; NaN when not estimated.
     lag_s, lag_verdict : float, str
-        Radio clock minus telemetry clock as estimated, and ``"ok"``, ``"ambiguous"``, ``"failed"`` or ``""``.
+        Radio clock minus telemetry clock as estimated (positive: the radio's shows later times), and ``"ok"``,
+        ``"ambiguous"``, ``"failed"`` or ``""``.
     fitted : tuple of str
         Names of the numbers that were fitted on the very data they are scored on.
     geometry : mapping
@@ -344,32 +351,9 @@ class RankPanel:
     """Further columns (n,) of rank.csv, by name."""
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Audit:
-    """The engine checked against another one on a spread of links."""
-
-    reference: str
-    links: int
-    missing_paths: int
-    extra_paths: int
-    rss_max_error_db: float
-    rank_disagreement: Mapping[float, float] = field(default_factory=dict)
-    seconds: float = float("nan")
-    reference_seconds: float = float("nan")
-    note: str = ""
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Engine:
-    """Which engine replayed the flight, at what price, what it left out, and its audit."""
-
-    engine: str
-    links: int
-    seconds: float
-    paths: int | None = None
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    left_out: tuple[str, ...] = ()
-    audit: Audit | None = None
+Audit: TypeAlias = AuditResult
+Engine: TypeAlias = EngineResult
+"""The engine's record is numbers alone already."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -448,7 +432,7 @@ class ReportData:
     rss: tuple[RssPanel, ...] = ()
     rank: tuple[RankPanel, ...] = ()
     pairs: tuple[ChannelPair, ...] = ()
-    engine: Engine | None = None
+    engine: EngineResult | None = None
     speed: tuple[SpeedRow, ...] = ()
     synthetic: bool = False
     warnings: tuple[str, ...] = ()

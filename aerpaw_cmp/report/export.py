@@ -2,47 +2,18 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.files import write_whole
+from ..common.jsonable import json_safe
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
-if TYPE_CHECKING:
-    import pandas as pd
-
 _DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
-
-
-def json_safe(value: Any) -> Any:
-    """A copy that JSON can hold: NaN and infinity become None, arrays become lists, keys become strings.
-
-    Examples
-    --------
-    >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
-    {'rmse_db': None, '10': [1, 2]}
-    """
-    if isinstance(value, Mapping):
-        return {k_key(key) if isinstance(key, float) else str(key): json_safe(item) for key, item in value.items()}
-    if isinstance(value, np.ndarray):
-        return json_safe(value.tolist() if value.dtype.kind != "M" else value.astype(str).tolist())
-    if isinstance(value, (list, tuple, set, frozenset)):
-        return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
-    if isinstance(value, (bool, np.bool_)):
-        return bool(value)
-    if isinstance(value, (int, np.integer)):
-        return int(value)
-    if isinstance(value, (float, np.floating)):
-        number = float(value)
-        return number if math.isfinite(number) else None
-    return value if value is None else str(value)
 
 
 def metrics(data: ReportData) -> dict[str, Any]:
@@ -190,7 +161,7 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
             into[key] = value
 
 
-def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
+def rss_frame(panels: Iterable[RssPanel]) -> Any:
     """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
     import pandas as pd
 
@@ -223,7 +194,7 @@ def rss_frame(panels: Iterable[RssPanel]) -> pd.DataFrame:
     return _stacked(frames, RSS_COLUMNS)
 
 
-def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
+def rank_frame(panels: Iterable[RankPanel]) -> Any:
     """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
     import pandas as pd
 
@@ -252,13 +223,12 @@ def rank_frame(panels: Iterable[RankPanel]) -> pd.DataFrame:
     return _stacked(frames, RANK_COLUMNS)
 
 
-def _stacked(frames: list[pd.DataFrame], columns: Iterable[str]) -> pd.DataFrame:
+def _stacked(frames: list[Any], columns: Iterable[str]) -> Any:
     """Frames below each other, rounded; without any, the bare columns."""
     import pandas as pd
 
-    table: pd.DataFrame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
-    rounded: pd.DataFrame = table.round(_DECIMALS)
-    return rounded
+    table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+    return table.round(_DECIMALS)
 
 
 def _times(time: Any) -> dict[str, Any]:
@@ -272,18 +242,11 @@ def _times(time: Any) -> dict[str, Any]:
     return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
 
 
-def make_folder(folder: Path) -> Path:
-    """The folder, made when missing; UsageError where it cannot be."""
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        cause = "a file is in the way, or there is no right to write here"
-        raise UsageError(f"the folder cannot be made ({error.strerror})", cause=cause, path=folder) from None
-    return folder
+def write_file(path: Path, content: str | bytes) -> Path:
+    """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
 
-
-def write_atomic(path: Path, content: str | bytes) -> Path:
-    """Write a file so that a reader sees the old one or the new one, never a part; UsageError where it cannot be."""
-    make_folder(path.parent)
-    write_whole(path, content)
+    The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
+    """
+    path.parent.mkdir(exist_ok=True)
+    path.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     return path

@@ -96,7 +96,9 @@ def clock(instant: Any, start: Any) -> str:
 
 
 def short(value: Any) -> str:
-    """A value as text; numbers to 6 digits, which metrics.json holds in full."""
+    """A value as text; numbers to 6 digits, which metrics.json holds in full; an en dash where there is none."""
+    if value is None:
+        return "–"
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 

@@ -7,10 +7,11 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from ..common.jsonable import json_safe
 from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
-from .export import json_safe, merge, write_atomic
+from .export import merge, write_file
 from .html import CONTENT_POLICY, by_section, environment
 from .maps_data import MapError, MapsData
 from .names import k_key
@@ -91,10 +92,8 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
 def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
     folder = Path(folder)
-    written = [
-        write_atomic(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")
-    ]
+    written = [write_file(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")]
     drawn, pictures = canvas.write_plates(maps_figures.plates(data), folder / "figures")
     written += pictures
-    page = write_atomic(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
+    page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
     return [page, *written]

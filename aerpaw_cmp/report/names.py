@@ -7,6 +7,8 @@ from typing import Any
 
 import numpy as np
 
+from ..common.jsonable import number_key
+
 RSS_COLUMNS: dict[str, str] = {
     "time_utc": "instant of the sample, ISO 8601, UTC; empty: the log has relative times and no origin was given",
     "time_s": "seconds after the first sample of this tower and channel",
@@ -37,15 +39,8 @@ RANK_COLUMNS: dict[str, str] = {
 """Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path)."""
 
 
-def k_key(k: float) -> str:
-    """K as a key of metrics.json and of rank.csv.
-
-    Examples
-    --------
-    >>> k_key(1000.0), k_key(12.5)
-    ('1000', '12.5')
-    """
-    return f"{k:.10g}"
+k_key = number_key
+"""K as a key of metrics.json and of rank.csv."""
 
 
 def iso_time(time: Any) -> Any:

@@ -20,7 +20,7 @@ from ..common.units import FloatArray
 from ..site.site import Building, Site, Trees
 from . import canvas
 from .data import Track
-from .export import write_atomic
+from .export import write_file
 from .html import environment
 from .names import safe_name
 
@@ -308,9 +308,9 @@ def write_site_view(
         The page first.
     """
     folder, stem = Path(folder), safe_name(site.name)
-    written = [write_atomic(folder / f"{stem}.html", viewer(site, track, paths))]
+    written = [write_file(folder / f"{stem}.html", viewer(site, track, paths))]
     for name, draw in (("plan", plan), ("3d", solid)):
         with canvas.style():
             svg, png = canvas.save(draw(site, track, paths))
-        written += [write_atomic(folder / f"{stem}_{name}.svg", svg), write_atomic(folder / f"{stem}_{name}.png", png)]
+        written += [write_file(folder / f"{stem}_{name}.svg", svg), write_file(folder / f"{stem}_{name}.png", png)]
     return written

@@ -8,7 +8,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..common.errors import UsageError
+from ..common.outputs import told
 from .materials import (
     CROWN,
     CROWN_ATTENUATION_DB_PER_M,
@@ -50,8 +50,9 @@ def export_scene(
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
     lines += [_bsdf(name, gamma_db_per_m) for name in meshes]
     written = [folder / "scene.xml"]
-    try:
-        (folder / "meshes").mkdir(parents=True, exist_ok=True)
+    with told(folder):
+        folder.mkdir(exist_ok=True)
+        (folder / "meshes").mkdir(exist_ok=True)
         for name, mesh in meshes.items():
             written.append(folder / "meshes" / f"{name}.ply")
             write_ply(mesh, written[-1])
@@ -61,8 +62,6 @@ def export_scene(
                 f'<boolean name="face_normals" value="true"/><ref id={quoteattr(_bsdf_id(name))} name="bsdf"/></shape>'
             )
         written[0].write_text("\n".join([*lines, "</scene>", ""]), encoding="utf-8")
-    except OSError as error:
-        raise UsageError(f"cannot be written ({error.strerror})", path=error.filename or folder) from None
     return written
 
 

@@ -20,12 +20,12 @@ from shapely.geometry import LineString, MultiPolygon, Polygon, box
 from shapely.geometry.base import BaseGeometry
 
 from ..common.errors import InputError, UsageError
-from ..common.files import write_whole
 from ..common.geodesy import SiteFrame
+from ..common.outputs import OutputFile, is_sealed, sealed
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
 from .mapfiles import read_map_file
-from .outlines import MapFile, Outline, Position, TreeLine
+from .outlines import MAX_CROSSINGS, MapFile, Outline, Position, TreeLine, is_tangled
 from .site import Building, Forest, Geofence
 from .siteyaml import SiteModel, extent_m, site_model
 from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metres, positive_metres
@@ -351,6 +351,9 @@ def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
 def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
     if ring.is_valid:
         return ring
+    if is_tangled(ring):
+        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
+        return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
     return _areas_only(shapely.make_valid(ring, method="structure"))
 
@@ -559,7 +562,7 @@ def import_site(
     Returns
     -------
     SiteModel, list of str
-        The settings (see :func:`write_site_yaml`), and what was done.
+        The settings (see :func:`site_yaml`), and what was done.
     """
     if not files:
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
@@ -609,12 +612,17 @@ def _printable(text: str) -> str:
     return "".join(character if character.isprintable() else "?" for character in text)
 
 
-def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
-    """Settings as a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
+def site_yaml(model: SiteModel, *, header: Sequence[str] = ()) -> str:
+    """The text of a site.yaml that :func:`~aerpaw_cmp.site.siteyaml.load_site` reads back to the same site.
 
     ``header`` lines become comments at the top (what the import did).
     """
     content = model.model_dump(mode="json", exclude_defaults=True)
     text = "".join(f"# {_printable(line)}\n" for entry in header for line in str(entry).splitlines())
-    text += dump_yaml(content)
-    write_whole(Path(path), text)
+    return text + dump_yaml(content)
+
+
+def write_site_yaml(model: SiteModel, path: str | Path, *, header: Sequence[str] = ()) -> None:
+    """Write :func:`site_yaml` to a new file, or over one of this function that nobody changed."""
+    with OutputFile(Path(path), own=is_sealed) as output:
+        output.write(sealed(site_yaml(model, header=header)))

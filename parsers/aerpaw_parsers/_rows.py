@@ -1,8 +1,8 @@
 """From lines to records: what every text format repeats, so that a format is its pattern, its columns and its text.
 
-:func:`matched` takes a pattern with named groups (``time`` among them) and gives :class:`Rows`; :func:`built` does so
-for readers that find their rows another way. ``Rows.number`` and ``Rows.text`` are its columns, ``Rows.stream`` makes
-a stream of them, ``Rows.result`` closes the account.
+:func:`matched` takes a pattern with named groups (``time`` among them) and gives :class:`Rows`; :func:`built` does
+so for readers that find their rows another way. ``Rows.number`` and ``Rows.text`` are its columns, ``Rows.stream``
+makes a stream of them, ``Rows.result`` closes the account.
 """
 
 from __future__ import annotations
@@ -21,6 +21,8 @@ from . import _frames, _lines, _time
 
 NO_DATE = "the time stamp is no date of the calendar"
 NO_TIME = "the time is beyond any flight"
+_DECIMAL = re.compile(_lines.NUMBER)
+_SI = {b"k": 1e3, b"M": 1e6, b"G": 1e9, b"m": 1e-3, b"u": 1e-6, b"n": 1e-9}
 Reason = Callable[[bytes], "str | None"]
 
 
@@ -46,6 +48,8 @@ class Rows:
     warnings : list of str
     relative : bool
         Do the times count from an origin that nobody named?
+    at : int array, shape (n,)
+        Index of each row among those that were given to :func:`built`.
     """
 
     reader: str
@@ -59,6 +63,7 @@ class Rows:
     rejected: list[RejectedLine] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     relative: bool = False
+    at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -72,6 +77,20 @@ class Rows:
         for word in none:
             cells = np.where(cells == word, b"", cells)
         return np.asarray(_lines.numbers(cells), dtype=np.float64)
+
+    def decimal(self, name: str) -> FloatArray:
+        """A column as numbers, what is none NaN."""
+        made = [float(cell) if _DECIMAL.fullmatch(cell) else np.nan for cell in self.columns[name].tolist()]
+        return np.array(made, dtype=np.float64)
+
+    def si(self, name: str) -> FloatArray:
+        """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
+        cells = [cell.strip() for cell in self.columns[name].tolist()]
+        scale = np.array([_SI.get(cell[-1:], 1.0) for cell in cells])
+        plain = np.array([cell[:-1] if cell[-1:] in _SI else cell for cell in cells] or [b""], dtype=np.bytes_)
+        for word in (b"n/a", b"-"):
+            plain = np.where(plain == word, b"", plain)
+        return np.asarray(_lines.numbers(plain)[: len(cells)] * scale, dtype=np.float64)
 
     def text(self, name: str) -> list[str]:
         """A column as text."""
@@ -88,6 +107,7 @@ class Rows:
         values: Mapping[str, AnyArray],
         *,
         where: BoolArray | None = None,
+        pick: IntArray | None = None,
         flag: AnyArray | None = None,
         about: Mapping[str, Attribute | None] | None = None,
         **attributes: Attribute | None,
@@ -99,17 +119,22 @@ class Rows:
         values : mapping
             Columns of the kind, and any others, each of shape (n,).
         where : bool array, shape (n,), optional
+        pick : int array, shape (m,), optional
+            Index of the row of each record, for rows that hold several; ``values`` and ``flag`` are of shape (m,) then.
         flag : object array, shape (n,), optional
             In place of the flags that all streams of the rows share.
         about : mapping, optional
             Further attributes.
         """
-        pick = np.flatnonzero(np.ones(len(self), dtype=bool) if where is None else where)
+        shown = self.flag if flag is None else flag
+        if pick is None:
+            pick = np.flatnonzero(np.ones(len(self), dtype=bool) if where is None else where)
+            values, shown = {key: np.asarray(column)[pick] for key, column in values.items()}, shown[pick]
+        elif flag is None:
+            shown = self.flag[pick]
         if not len(pick):
             return None
-        shown = self.flag if flag is None else flag
-        columns = {key: np.asarray(column)[pick] for key, column in values.items()}
-        frame = _frames.frame(kind, self.time[pick], self.row[pick] + 1, shown[pick], columns)
+        frame = _frames.frame(kind, self.time[pick], self.row[pick] + 1, shown, values)
         attributes = ({"clock": "relative"} if self.relative else {}) | dict(about or {}) | attributes
         return Stream(kind, name, frame, _frames.attributes(self.options, **attributes))
 
@@ -245,6 +270,7 @@ def built(
         rejected,
         warnings,
         relative,
+        np.flatnonzero(~comment)[valid],
     )
 
 

@@ -1,7 +1,7 @@
 """Tables of plain numbers at the speed of pandas' C parser, with the lines still accounted for.
 
-pandas alone forgives too much (short rows, stray quotes) and forgets line numbers. Here the lines are chosen first, by
-their number of fields; pandas reads only these, and whatever is odd about them makes the fast way step aside.
+pandas alone forgives too much (short rows, stray quotes) and forgets line numbers. Here the lines are chosen first,
+by their number of fields; pandas reads only these, and whatever is odd about them makes the fast way step aside.
 """
 
 from __future__ import annotations

@@ -3,7 +3,11 @@
 Dataset 12 holds ``mpower1 mpower2`` (channels USRP1, USRP2), AFAR's exp-288 files ``mpower mquality``; both have
 ``mX mY mZ`` (longitude, latitude, height above take-off), ``mRoll mPitch mYaw`` in degrees and two clocks:
 ``timestamp_power_for_csv`` (text, local) and ``timestamp_power``, **local wall clock stored as if it were UTC**.
-The lines of the account are rows.
+The LTE flights hold ``RSRP RSRP2 RSRQ RSSI`` beside ``mX mY mZ``, with ``timestamp_for_csv`` (text, local) and
+``timestamp_meas``, which **is UTC**: it is taken. Their levels are dB re full scale (the authors take 98 dB off for
+dBm). Their authors' processed files (``lat_s lon_s height_s RSRP_s ori_s``; ``lat_all lon_all h_all power_all
+ori_all``) have no clock: rows are counted at the rate of the raw flights, from 1970. MATLAB 7.3 files (HDF5) are
+read as the older ones are. The lines of the account are rows.
 """
 
 from __future__ import annotations
@@ -17,9 +21,9 @@ import numpy as np
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
-from aerpaw_cmp.logs.matfile import read_arrays
+from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _time
 
@@ -34,14 +38,43 @@ TELEMETRY = {
     "mSpeedY": "velocity_east_mps",
     "mSpeedZ": "velocity_down_mps",
     "mVz": "velocity_down_mps",
+    "lat_s": "latitude_deg",
+    "lon_s": "longitude_deg",
+    "height_s": "altitude_m",
+    "ori_s": "yaw_deg",
+    "lat_all": "latitude_deg",
+    "lon_all": "longitude_deg",
+    "h_all": "altitude_m",
+    "ori_all": "yaw_deg",
+    "roll_all": "roll_deg",
+    "pitch_all": "pitch_deg",
 }
-LEVELS = {"mpower1": "USRP1", "mpower2": "USRP2", "mpower": "power", "mquality": "quality"}
-_CLOCKS = ("timestamp_power_for_csv", "timestamp_power")
-_NAMES = {*TELEMETRY, *LEVELS, *_CLOCKS, "mSpeed"}
+LEVELS = {
+    "mpower1": "USRP1",
+    "mpower2": "USRP2",
+    "mpower": "power",
+    "mquality": "quality",
+    "RSRP": "RSRP",
+    "RSRP2": "RSRP2",
+    "RSSI": "RSSI",
+    "RSRP_s": "RSRP",
+    "power_all": "power",
+}
+KPIS = {"RSRQ": ("RSRQ", "dB")}
+_TEXTS = ("timestamp_power_for_csv", "timestamp_for_csv")
+_EPOCHS = ("timestamp_power", "timestamp_meas")
+_UTC = "timestamp_meas"
+_PROCESSED = {"RSRP_s": 0.1, "power_all": 0.03276}
+"""Levels of files without a clock, and the seconds between rows of the flights that they were made of."""
+_NAMES = {*TELEMETRY, *LEVELS, *KPIS, *_TEXTS, *_EPOCHS, "mSpeed"}
+_SURE = {*LEVELS, *_TEXTS, *_EPOCHS, "mX", "mY", "mZ"}
+"""Names that only a flight has."""
+_GPS = re.compile(r"GPS[xyz]")
+"""Raw positions of the LTE flights, which stand in front of their levels; the interpolated ones are read."""
 _COMPRESSED, _MATRIX = 15, 14
 
 
-def _names(head: bytes) -> list[str]:
+def names_of(head: bytes) -> list[str]:
     """Variable names of a level-5 file that lie inside ``head`` (MAT-File Format, MathWorks, chapter 1)."""
     names: list[str] = []
     order = "<" if head[126:128] == b"IM" else ">"
@@ -78,8 +111,13 @@ def _name(body: bytes, order: str) -> str | None:
 
 
 def sniff(head: bytes) -> bool:
-    """Whether it is a MATLAB file whose first variables are those of a merged flight."""
-    return head.startswith(_MAGIC) and any(name in _NAMES for name in _names(head))
+    """Whether it is a MATLAB file whose first variables are those of a merged flight.
+
+    Of a 7.3 file the names lie anywhere: those that stand in what sniffers see decide.
+    """
+    if head.startswith(MAGIC_73):
+        return any(re.search(rb"\b%s\b" % name.encode(), head) for name in _SURE)
+    return head.startswith(_MAGIC) and any(name in _NAMES or _GPS.fullmatch(name) for name in names_of(head))
 
 
 def _load(data: bytes) -> dict[str, AnyArray]:
@@ -94,24 +132,36 @@ def _numeric(values: AnyArray, name: str) -> FloatArray:
 
 
 def _wall(table: dict[str, AnyArray]) -> tuple[AnyArray, BoolArray, str]:
-    """Wall clock in ns, which rows have one, and the column it came from."""
-    if _CLOCKS[0] in table:
-        text = np.array([str(cell).strip() for cell in table[_CLOCKS[0]]], dtype=np.str_)
-        column = np.char.encode(text, "ascii", "replace")
-        right = np.array([re.fullmatch(_time.TIME, cell) is not None for cell in column.tolist()], dtype=bool)
-        wall, valid, _, _ = _time.parse_texts(column)
-        if (valid & right).any():
-            return wall, valid & right, _CLOCKS[0]
-    if _CLOCKS[1] in table:
-        epoch = _numeric(table[_CLOCKS[1]], _CLOCKS[1])
-        valid = np.isfinite(epoch) & (epoch > 0) & (epoch < 9.2e9)
-        # double precision resolves 2.4e-7 s here: microseconds are what the file can hold
-        return np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000, valid, _CLOCKS[1]
+    """Clock in ns, which rows have one, and its column: true UTC, else text, else epoch, else the count."""
+    for name in (_UTC, *_TEXTS, *_EPOCHS):
+        if name not in table:
+            continue
+        if name in _TEXTS:
+            text = np.array([str(cell).strip() for cell in table[name]], dtype=np.str_)
+            column = np.char.encode(text, "ascii", "replace")
+            right = np.array([re.fullmatch(_time.TIME, cell) is not None for cell in column.tolist()], dtype=bool)
+            wall, valid, _, _ = _time.parse_texts(column)
+            valid = valid & right
+        else:
+            epoch = _numeric(table[name], name)
+            valid = np.isfinite(epoch) & (epoch > 0) & (epoch < 9.2e9)
+            # double precision resolves 2.4e-7 s here: microseconds are what the file can hold
+            wall = np.round(np.where(valid, epoch, 0) * 1e6).astype(np.int64) * 1000
+        if valid.any() or name in _EPOCHS:
+            return wall, valid, name
+    for name, step_s in _PROCESSED.items():
+        if name in table:
+            count = np.arange(len(table[name]))
+            return np.round(count * step_s * 1e9).astype(np.int64), count >= 0, COUNTED
     raise InputError(
         "the MATLAB file has no clock",
-        expected="a variable timestamp_power_for_csv or timestamp_power",
+        expected=f"a variable {', '.join((*_TEXTS, *_EPOCHS))}",
         cause="not a flight",
     )
+
+
+COUNTED = "row number"
+"""Clock of files that have none."""
 
 
 def _instants(
@@ -119,10 +169,18 @@ def _instants(
 ) -> tuple[_time.Instants, list[str]]:
     """UTC of each row: text and epoch both hold local wall clock unless ``clock: utc`` says otherwise."""
     warnings: list[str] = []
-    if clock == _CLOCKS[1] and options.clock is None:
+    none = np.zeros(len(wall), dtype=bool)
+    if clock == COUNTED:
+        origin = _time.origin_ns(options, needed_by="flight_mat")
+        text = "the file has no clock: its rows are counted at the rate of the raw flight"
+        warnings.append(text if origin is not None else text + ", from 1970-01-01T00:00")
+        return _time.Instants((wall + (origin or 0)).astype("datetime64[ns]"), none, none.copy()), warnings
+    if clock == _UTC and options.clock not in ("local", "local_as_utc"):
+        return _time.Instants(wall.astype("datetime64[ns]"), none, none.copy()), warnings
+    if clock == _EPOCHS[0] and options.clock is None:
         warnings.append("timestamp_power is read as local wall clock stored as UTC, as AERPAW's authors write it")
-    elif clock == _CLOCKS[0] and _CLOCKS[1] in table:
-        shift_s = np.round(_numeric(table[_CLOCKS[1]], _CLOCKS[1]) - wall / 1e9)
+    elif clock == _TEXTS[0] and _EPOCHS[0] in table:
+        shift_s = np.round(_numeric(table[_EPOCHS[0]], _EPOCHS[0]) - wall / 1e9)
         if len(shift_s) and np.abs(shift_s).max() > 1:
             warnings.append(f"timestamp_power and its text differ by {shift_s[0]:.0f} s (true UTC?): the text was used")
     return _time.wall_to_utc(wall, options, needed_by="flight_mat"), warnings
@@ -162,6 +220,11 @@ def _streams(
 ) -> tuple[Stream, ...]:
     streams: list[Stream] = []
     values = {column: _numeric(table[name], name) for name, column in TELEMETRY.items() if name in table}
+    if "ori_s" in table:  # radians, reckoned from the track
+        values["yaw_deg"] = np.degrees(values["yaw_deg"])
+    if "height_s" not in table and "lat_s" in table:
+        values["altitude_m"] = np.full(len(keep), np.nan)
+    about: dict[str, Attribute] = {"clock": "relative"} if clock == COUNTED and options.time_origin is None else {}
     if values:
         flag = _lines.flags(len(keep))
         instants.flag(flag)
@@ -174,26 +237,35 @@ def _streams(
             for column in position:
                 column[lost] = np.nan
         frame = _frames.frame("telemetry", instants.time, keep + 1, flag, values)
-        streams.append(Stream("telemetry", "vehicle", frame, _frames.attributes(options, source=clock)))
+        streams.append(Stream("telemetry", "vehicle", frame, _frames.attributes(options, source=clock) | about))
     for name, channel in LEVELS.items():
         if name not in table:
             continue
         level = _numeric(table[name], name)
         flag = _lines.flags(len(keep))
         instants.flag(flag)
-        silent = ~(level > options.floor_db)
+        silent = ~(level > options.floor_db) | ~np.isfinite(level)
         _lines.add_flag(flag, silent, "out_of_coverage")
         level[silent] = np.nan
         frame = _frames.frame("rss", instants.time, keep + 1, flag, {"rss_db": level})
-        unit = "dB" if name == "mquality" else options.unit or "dB re full scale"
-        streams.append(Stream("rss", channel, frame, _frames.attributes(options, channel=channel, unit=unit)))
+        unit = "dB" if name == "mquality" else options.unit or ("dBm" if name == "RSRP_s" else "dB re full scale")
+        quantity = channel.rstrip("2") if channel.startswith("RS") else None
+        attributes = _frames.attributes(options, channel=channel, unit=unit, quantity=quantity)
+        streams.append(Stream("rss", channel, frame, attributes | about))
+    for name, (quantity, unit) in KPIS.items():
+        if name in table:
+            flag = _lines.flags(len(keep))
+            instants.flag(flag)
+            frame = _frames.frame("kpi", instants.time, keep + 1, flag, {"value": _numeric(table[name], name)})
+            attributes = _frames.attributes(options, quantity=quantity, unit=unit)
+            streams.append(Stream("kpi", name, frame, attributes | about))
     return tuple(streams)
 
 
 READER = Reader(
     name="flight_mat",
-    title="merged MATLAB flight (Dataset 12, AFAR exp-288)",
-    kinds=("telemetry", "rss"),
+    title="merged MATLAB flight (Dataset 12, AFAR, LTE at 3.51 GHz, and what their authors made of them)",
+    kinds=("telemetry", "rss", "kpi"),
     sample="mX mY mZ mRoll mPitch mYaw mpower1 mpower2 timestamp_power timestamp_power_for_csv",
     sniff=sniff,
     read=read,

@@ -58,7 +58,12 @@ def sniff(head: bytes) -> bool:
     return _lines.mostly(head, _ROW)
 
 
-def _reason(line: bytes) -> str:
+_TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
+
+
+def _reason(line: bytes) -> str | None:
+    if _TITLE.match(line):
+        return None  # the title line of converted logs
     if b"\0" in line:
         return "NUL bytes in the line (the file system was not synced when power went)"
     fields = len(re.sub(rb"\([^()]*\)", b"", line).split(b","))

@@ -12,7 +12,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import gather, read_logs
-from aerpaw_cmp.flight.draft import draft, write_draft
+from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -38,7 +38,8 @@ def _grow(path: Path) -> None:
 def test_the_draft_of_the_sample_logs_is_a_flight(logs: Path) -> None:
     target = logs.parent / "plans" / "flight.yaml"
     target.parent.mkdir()
-    remarks = write_draft(ingest(logs, options=OPTIONS), target, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, timezone=ZONE)
+    target.write_text(text, encoding="utf-8")
     settings, given = load_flight(target), load_flight(SAMPLE / "flight.yaml")
     named = {(Path(log.path).name, log.reader, log.node, log.channel) for log in settings.logs}
     assert named == {(Path(log.path).name, log.reader, log.node, log.channel) for log in given.logs}
@@ -78,7 +79,8 @@ def test_what_a_draft_names_is_read_whatever_it_is_called(logs: Path) -> None:
         (logs / f"{name} LW{i % 5 + 1}" / f"usrp{10 + i}_power_log.txt").write_bytes(content + b"\n" * i)
     (logs / "left\nout\r_quality_log.txt").write_bytes(content + b"\n" * 20)
     target = logs / "it's a flight: 1.yaml"
-    remarks = write_draft(ingest(logs, options=OPTIONS), target, timezone=ZONE)
+    text, remarks = draft(ingest(logs, options=OPTIONS), target.parent, timezone=ZONE)
+    target.write_text(text, encoding="utf-8")
     assert not any("\n" in remark or "\r" in remark for remark in remarks)
     settings = load_flight(target)
     data = gather(settings, target.parent, read_logs(settings, target.parent))
@@ -181,7 +183,7 @@ def test_the_place_is_looked_at_before_the_logs(logs: Path, capsys: pytest.Captu
     assert main(["ingest", str(logs), "--draft", str(logs / "nowhere" / "flight.yaml")]) == 2  # and not: timezone
     assert "no such folder" in capsys.readouterr().err
     assert main(["ingest", str(logs), "--draft", str(logs)]) == 2
-    assert "exists" in capsys.readouterr().err
+    assert "no ordinary file" in capsys.readouterr().err
 
 
 def test_the_command_does_not_overwrite(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:

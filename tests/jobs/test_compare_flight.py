@@ -13,21 +13,25 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.compare.result import FlightResult, RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import body_rotation
-from aerpaw_cmp.jobs.compare_flight import (
-    Compared,
-    audit_replays,
-    compare_rank_series,
-    compare_rss_series,
-    metrics_beyond_panels,
-    pairs_of,
-    track_of,
-)
-from aerpaw_cmp.jobs.replay import estimate_clocks, replay_rank, replay_rss
+from aerpaw_cmp.jobs.compare_flight import audit_replays, compare_rank_series, compare_rss_series, pairs_of
+from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.jobs.replay import replay_rank, replay_rss
 from aerpaw_cmp.jobs.run import _paths_of_pose
 from aerpaw_cmp.jobs.what_if import foliage_notes
+from aerpaw_cmp.report.build import (
+    metrics_beyond_panels,
+    pair_panel,
+    rank_panel,
+    rank_warnings,
+    rss_panel,
+    rss_warnings,
+    track_of,
+)
+from aerpaw_cmp.report.data import RssPanel
 
 ORIGIN = "2025-06-01T14:00:00Z"
 LW1 = (35.72750947, -78.69595819)
@@ -88,10 +92,23 @@ def gathered(path: Path) -> FlightData:
     return gather(settings, path.parent, read_logs(settings, path.parent))
 
 
+@dataclasses.dataclass(frozen=True)
+class Compared:
+    """The numbers of a series, and what a report makes of them."""
+
+    result: RssResult
+
+    @property
+    def panel(self) -> RssPanel:
+        return rss_panel(self.result)
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        return rss_warnings(self.result)
+
+
 def compared_rss(path: Path) -> list[Compared]:
-    data = gathered(path)
-    replays = replay_rss(data, str, estimate_clocks(data, str))
-    return [compare_rss_series(data, series, replayed) for series, replayed in zip(data.rss, replays, strict=True)]
+    return [Compared(result) for result in run_flight(gathered(path), audit=False).result.rss]
 
 
 def free_space_db(at: Any) -> Any:
@@ -200,8 +217,8 @@ def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
     at = np.arange(0, 60, 0.5)
     path = flight(tmp_path, rank=(at, np.full(len(at), 2.0)))
     data = gathered(path)
-    (replayed,) = replay_rank(data, str)
-    panel = compare_rank_series(data, data.rank[0], replayed).panel
+    (replayed,) = replay_rank(data)
+    panel = rank_panel(compare_rank_series(data, data.rank[0], replayed))
     assert panel.histogram.share.tolist() == [0.0, 1.0, 0.0, 0.0]
     for at_k in panel.simulated:
         assert 0.0 <= at_k.agreement <= 1.0
@@ -214,10 +231,10 @@ def test_ri_only_ever_2(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> N
 def test_no_csi_is_never_a_rank(tmp_path: Path) -> None:
     at = np.arange(0, 60, 0.5)
     data = gathered(flight(tmp_path, rank=(at, np.zeros(len(at)))))
-    (replayed,) = replay_rank(data, str)
+    (replayed,) = replay_rank(data)
     result = compare_rank_series(data, data.rank[0], replayed)
-    assert not np.isfinite(result.panel.measured).any()
-    assert any("no rank" in text for text in result.warnings)
+    assert not np.isfinite(result.measured).any()
+    assert any("no rank" in text for text in rank_warnings(result))
 
 
 def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -225,25 +242,26 @@ def test_two_channels_part_where_one_was_pushed_down(tmp_path: Path, capsys: pyt
     level = free_space_db(at)
     pushed = np.where((at > 30) & (at < 36), level - 25, level)
     path = flight(tmp_path, rss={"USRP1": (at, level), "USRP2": (at + 0.05, pushed)})
-    (pair,) = pairs_of([one.panel for one in compared_rss(path)])
-    assert (pair.panel.first, pair.panel.second) == ("USRP1", "USRP2")
-    assert len(pair.panel.time) == len(at)  # 0.05 s is less than half a sampling interval
-    assert abs(np.nanmedian(pair.panel.difference_db)) < 5.0  # each channel after its own offset
-    (span,) = pair.panel.apart
+    (found,) = pairs_of([one.result for one in compared_rss(path)])
+    pair = pair_panel(found)
+    assert (pair.first, pair.second) == ("USRP1", "USRP2")
+    assert len(pair.time) == len(at)  # 0.05 s is less than half a sampling interval
+    assert abs(np.nanmedian(pair.difference_db)) < 5.0  # each channel after its own offset
+    (span,) = pair.apart
     start = np.datetime64(ORIGIN.removesuffix("Z"), "ns")
     assert (span.start - start) / np.timedelta64(1, "s") == pytest.approx(30.25, abs=0.6)
     assert (span.end - start) / np.timedelta64(1, "s") == pytest.approx(35.75, abs=0.6)
     assert span.mean_error_db > 15
-    assert metrics_beyond_panels([pair])["pairs"]["LW1"]["USRP1 - USRP2"]["share_parted"] == pytest.approx(
-        0.1, abs=0.03
-    )
+    assert metrics_beyond_panels(FlightResult(pairs=(found,)))["pairs"]["LW1"]["USRP1 - USRP2"][
+        "share_parted"
+    ] == pytest.approx(0.1, abs=0.03)
     assert "pairs" in report_completes(path, capsys)
 
 
 def test_channels_without_common_instants_make_no_pair(tmp_path: Path) -> None:
     early, late = np.arange(0, 20, 0.25), np.arange(30, 60, 0.25)
     path = flight(tmp_path, rss={"USRP1": (early, free_space_db(early)), "USRP2": (late, free_space_db(late))})
-    assert pairs_of([one.panel for one in compared_rss(path)]) == []
+    assert pairs_of([one.result for one in compared_rss(path)]) == []
 
 
 def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
@@ -260,19 +278,19 @@ def test_paired_foliage_reports_loss_and_rank_changes(tmp_path: Path) -> None:
         height_m=np.full(len(trees), 60.0), crown_base_m=np.full(len(trees), 1.0), ground_m=np.zeros(len(trees)),
     )  # fmt: skip
     data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
-    (replayed,) = replay_rss(data, str)
-    panel = compare_rss_series(data, data.rss[0], replayed).panel
+    (replayed,) = replay_rss(data)
+    panel = rss_panel(compare_rss_series(data, data.rss[0], replayed))
     names = [v.name for v in panel.variants]
     assert names[-3:] == ["without trees", "trees in leaf", "trees out of leaf"]
     assert panel.variants[-3].rmse_db == pytest.approx(panel.rmse_db, abs=1e-9)  # the flight itself has none
     found = panel.extra["foliage"]
     assert found["trees_in_leaf"]["mean_loss_db"] > found["trees_out_of_leaf"]["mean_loss_db"] > 0.0
     assert found["trees_in_leaf"]["share_above_1_db"] > 0.1
-    (ranked,) = replay_rank(data, str)
+    (ranked,) = replay_rank(data)
     per_pose = panel.per_sample
     loss = per_pose["simulated_without_trees_dbm"] - per_pose["simulated_trees_in_leaf_dbm"]
     assert np.nanmean(loss) == pytest.approx(found["trees_in_leaf"]["mean_loss_db"])
-    ranks = compare_rank_series(data, data.rank[0], ranked).panel
+    ranks = rank_panel(compare_rank_series(data, data.rank[0], ranked))
     per_k = ranks.per_sample
     changed = per_k["rank_trees_in_leaf_k10"] != per_k["rank_without_trees_k10"]
     changes = ranks.extra["foliage"]
@@ -297,7 +315,7 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
             trees, east_m=rng.uniform(20, 480, len(trees)), north_m=rng.uniform(-250, 250, len(trees)),
         )  # fmt: skip
         data = dataclasses.replace(data, site=dataclasses.replace(data.site, trees=wood))
-        return data, replay_rss(data, str)[0]
+        return data, replay_rss(data)[0]
 
     bare_data, bare = replayed("")
     data, found = replayed(", foliage: opaque, paired_foliage: true")
@@ -311,12 +329,14 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
     pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
     east, north, up = found.poses.position_m.T
     track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
-    lines = [line.label for line in _paths_of_pose(data, data.site, track, pose) if line.label.startswith("LW1")]
+    lines = [
+        line.label for line in _paths_of_pose(data.settings, data.site, track, pose) if line.label.startswith("LW1")
+    ]
     here = found.replay.paths.select(found.replay.paths.pose == pose)
     assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
     assert len(lines) <= len(here)
     # the run without trees has lost the paths over crowns as well
-    panel = compare_rss_series(data, data.rss[0], found).panel
+    panel = rss_panel(compare_rss_series(data, data.rss[0], found))
     columns = panel.per_sample
     bare_dbm = bare.spread(bare.replay.rss_dbm[:, 0])
     np.testing.assert_allclose(columns["simulated_without_trees_dbm"], bare_dbm, atol=1e-9)
@@ -328,7 +348,7 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
     ):
         rt = some.settings.rt.model_copy(update={"audit_links": 0})
         quiet = dataclasses.replace(some, settings=some.settings.model_copy(update={"rt": rt}))
-        settings = audit_replays(quiet, [one], str).settings
+        settings = audit_replays(quiet, [one]).settings
         assert {k: v for k, v in settings.items() if "crown" in k} == expected
 
 
@@ -337,7 +357,8 @@ def test_the_report_says_where_foliage_models_are_stretched_or_assumed(tmp_path:
     series = {"USRP1": (at, free_space_db(at))}
 
     def notes(rt: str, *carriers_hz: float) -> str:
-        return " ".join(foliage_notes(gathered(flight(tmp_path, 20, rss=series, rt=rt)), carriers_hz))
+        data = gathered(flight(tmp_path, 20, rss=series, rt=rt))
+        return " ".join(foliage_notes(len(data.site.trees), data.settings.rt, carriers_hz))
 
     assert notes("", 3.4e9) == ""
     assert notes(", foliage: opaque", 3.4e9) == ""
@@ -358,8 +379,8 @@ def test_angles_are_those_of_the_tilted_antenna(tmp_path: Path) -> None:
     tilted = DIPOLES.replace(", installed_db: [2.0, 0.0]}", "}, pitch_deg: 90")
     path = flight(tmp_path, 40, rss={"USRP1": (at, free_space_db(at))}, more=tilted)
     data = gathered(path)
-    (replayed,) = replay_rss(data, str)
-    seen = compare_rss_series(data, data.rss[0], replayed).panel.geometry
+    (replayed,) = replay_rss(data)
+    seen = rss_panel(compare_rss_series(data, data.rss[0], replayed)).geometry
     mount = replayed.link.tower_arrays["LW1"].mount
     ray = replayed.poses.position_m - data.site.towers["LW1"].position_m
     upward = np.degrees(np.arcsin(ray @ mount[:, 2] / np.linalg.norm(ray, axis=1)))
@@ -426,7 +447,7 @@ def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> 
     footing = one.panel.extra["same_footing"]
     assert footing["coherent"]["0 s"]["rmse_db"] == pytest.approx(one.panel.rmse_db)
     assert footing["power_sum"]["4 s"]["rmse_db"] < footing["power_sum"]["0 s"]["rmse_db"]
-    tables = metrics_beyond_panels([one])["rss"]["LW1"]["USRP1"]["residual_by"]
+    tables = metrics_beyond_panels(FlightResult(rss=(one.result,)))["rss"]["LW1"]["USRP1"]["residual_by"]
     assert {"distance_m", "elevation_deg", "azimuth_deg", "uav_azimuth_deg", "heading_deg", "time_s"} <= set(tables)
     assert sum(tables["distance_m"]["n"]) == one.panel.n
 
@@ -466,8 +487,8 @@ def test_reflection_loss_weakens_reflections_only_and_ends_as_free_space(tmp_pat
         data = gathered(path)
         rt = data.settings.rt.model_copy(update={"reflection_loss_db": loss})
         data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
-        (replayed,) = replay_rss(data, str)
-        levels[loss] = compare_rss_series(data, data.rss[0], replayed).panel
+        (replayed,) = replay_rss(data)
+        levels[loss] = rss_panel(compare_rss_series(data, data.rss[0], replayed))
     ripple = {loss: np.nanstd(p.simulated_dbm - p.baselines[0].level_dbm) for loss, p in levels.items()}
     assert ripple[0.0] > ripple[3.0] > 0.1
     assert ripple[200.0] < 1e-6, "only the line of sight is left"
@@ -550,7 +571,7 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
         rt = data.settings.rt.model_copy(update={"attitude": mode})
         data = dataclasses.replace(data, settings=data.settings.model_copy(update={"rt": rt}))
         assert data.rank[0].position_m is not None
-        (found[mode],) = replay_rank(data, str)
+        (found[mode],) = replay_rank(data)
     assert np.array_equal(found["logged"].poses.position_m, found["ignored"].poses.position_m), "of the log itself"
     turned = found["logged"].poses.rotation
     assert np.allclose(turned, body_rotation(np.zeros(58), np.zeros(58), np.full(58, 120.0)), atol=1e-6)
@@ -572,6 +593,6 @@ def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -
     (tmp_path / "ri.csv").write_text("\n".join(table) + "\n")
     data = gathered(path)
     assert np.isnan(data.rank[0].position_m[19]).all()
-    (found,) = replay_rank(data, str)
+    (found,) = replay_rank(data)
     assert found.valid.all()
     assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)

@@ -14,6 +14,7 @@ from shapely.geometry import Polygon
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.jobs import coverage_map as mapping
@@ -51,10 +52,6 @@ def site():
 def settings(**change):
     some = {"spacing_m": 50.0, "rss_altitudes_m": (30.0,), "rank_altitudes_m": (3.0, 30.0, 60.0)}
     return mapping.MapSettings(**{**some, **change})
-
-
-def quiet(_text):
-    pass
 
 
 def test_every_mode_is_what_a_replay_with_its_loss_says(site):
@@ -147,8 +144,8 @@ def test_a_broadside_beam_gains_the_number_of_elements():
 
 
 def test_modes_share_one_search_and_nothing_is_kept(site):
-    outcome = mapping.make_maps(site, settings(), quiet)
-    alone = mapping.make_maps(site, settings(foliage=("opaque",)), quiet)
+    outcome = mapping.make_maps(site, settings(), Stages())
+    alone = mapping.make_maps(site, settings(foliage=("opaque",)), Stages())
     assert outcome.paths == alone.paths > 0
     np.testing.assert_array_equal(outcome.maps["opaque"].rank, alone.maps["opaque"].rank)
     np.testing.assert_array_equal(outcome.maps["opaque"].rss_mimo_dbm, alone.maps["opaque"].rss_mimo_dbm)
@@ -177,9 +174,9 @@ def test_heights_are_above_the_ground_of_the_elevation_model():
 
 
 def test_a_threshold_puts_weak_positions_out_of_coverage(site):
-    free = mapping.make_maps(site, settings(foliage=("none",), study=False), quiet).maps["none"]
+    free = mapping.make_maps(site, settings(foliage=("none",), study=False), Stages()).maps["none"]
     level = float(np.nanmedian(free.rss("siso")))
-    cut = mapping.make_maps(site, settings(foliage=("none",), threshold_dbm=level), quiet).maps["none"]
+    cut = mapping.make_maps(site, settings(foliage=("none",), threshold_dbm=level), Stages()).maps["none"]
     np.testing.assert_array_equal(np.isfinite(cut.rss("siso")), np.nan_to_num(free.rss("siso"), nan=-np.inf) >= level)
 
 

@@ -226,5 +226,9 @@ def test_export_of_nothing(tmp_path):
     (tmp_path / "tap_x.jsonl").write_bytes(encode_record({"kind": "exchange", "n": 0}))
     with pytest.raises(InputError, match="lacks what its kind"):
         export_csv(tmp_path, tmp_path / "out.csv")
-    with pytest.raises(InputError, match="cannot be written"):
+    with pytest.raises(UsageError, match="no such folder"):
         export_csv(tmp_path, tmp_path / "no/out.csv")
+    (tmp_path / "mine.csv").write_text("mine")
+    for target, said in ((tmp_path / "mine.csv", "--force"), (tmp_path / "tap_x.jsonl", "replace an input")):
+        with pytest.raises(UsageError, match=said):
+            export_csv(tmp_path, target)

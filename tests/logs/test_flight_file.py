@@ -14,7 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
@@ -119,8 +119,8 @@ def test_a_failure_leaves_the_old_file_and_no_rest(tmp_path: Path, monkeypatch: 
     def fail(*_: object) -> None:
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr("aerpaw_cmp.logs.flight_file._write_stream", fail)
-    with pytest.raises(UsageError, match="No space left"):
+    monkeypatch.setattr("os.fsync", fail)
+    with pytest.raises(OutputError, match="No space left"):
         write_flight(path, content)
     assert path.read_bytes() == before
     assert sorted(p.name for p in tmp_path.iterdir()) == ["flight.h5", "log"]
@@ -133,13 +133,13 @@ def test_the_old_file_stands_until_the_new_one_takes_its_name(tmp_path: Path, mo
     seen = []
 
     def refuse(self: Path, target: Path) -> Path:
-        seen.append((self.parent, h5py.File(self).attrs["format"], path.read_bytes() == before))
+        seen.append((self.parent, self.read_bytes()[:4], path.read_bytes() == before))
         raise OSError(5, "Input/output error")
 
-    monkeypatch.setattr(Path, "replace", refuse)
-    with pytest.raises(UsageError, match="Input/output"):
+    monkeypatch.setattr(Path, "rename", refuse)
+    with pytest.raises(OutputError, match="Input/output"):
         write_flight(path, all_samples_of_one(tmp_path))
-    assert seen == [(tmp_path, "aerpaw-cmp flight", True)]
+    assert seen == [(tmp_path, b"\x89HDF", True)]
     assert path.read_bytes() == before
 
 
@@ -158,7 +158,7 @@ def test_the_file_has_ordinary_permissions(tmp_path: Path) -> None:
 
 
 def test_no_folder_to_write_to(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="missing folder"):
+    with pytest.raises(UsageError, match="no such folder"):
         write_flight(tmp_path / "no" / "flight.h5", [])
 
 
@@ -173,6 +173,9 @@ def test_files_that_are_no_flight_file(tmp_path: Path) -> None:
         book["a"] = 1
     with pytest.raises(InputError, match="another kind"):
         read_flight(path)
+    with pytest.raises(UsageError, match="not an unchanged output"):
+        write_flight(path, [])
+    path.unlink()
     write_flight(path, [])
     with h5py.File(path, "a") as book:
         book.attrs["version"] = 99

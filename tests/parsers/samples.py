@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import zlib
 
+import h5py
 import numpy as np
 import scipy.io
 
@@ -133,6 +134,95 @@ SRSENB = (
     b"[2025-03-02 10:00:02.000003] lte   46  n/a n/a    0      0    0    0   0% |   n/a   12.5   40   15    38k   12    0   0%    0.0\n"
     b"[2025-03-02 10:00:03.000003] lte   46   11   1  \n"
 )
+SRSUE = (
+    b"[2025-03-02 10:00:00.000001] Attaching UE...\n"
+    b"[2025-03-02 10:00:00.000002]  cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler\n"
+    b"[2025-03-02 10:00:00.000003]   0    1   -61   61 -4.2k |   2   25   1.0   3.9k    0%    1.6 |  18    0.0    35k    0%\n"
+    b"[2025-03-02 10:00:01.000003]   0    1   -62   62  -950 |   2  n/a   1.0   3.9k    0%    1.6 |  18    0.0    35k    0%\n"
+    b"[2025-03-02 10:00:02.000003]   0    7   -63   63  1.5k |   2   25   1.0   3.9k    0%    1.6 |  18    0.0    35k    0%\n"
+    b"[2025-03-02 10:00:03.000003]   0    7   -63   63  \n"
+)
+VEHICLE_LOG = (
+    b"[2025-03-02 10:00:00.000001] Starting rover search script\n"
+    b'[2025-03-02 10:00:01.000001] Home location is {"lat": 35.73, "lon": -78.7, "alt": 1.5}\n'
+    b"[2025-03-02 10:00:02.000001] Filtered data (avg): Pwr:-12.5,P_Var:1.5, Qual:58.5,Q_Var:1.25, "
+    b'{"lat": 35.7300001, "lon": -78.7000001, "alt": 40.5}, heading:312.5\n'
+    b'[2025-03-02 10:00:03.000001] Current location is {"lat": 35.7300002, "lon": -78.7000002, "alt": 40.0}\n'
+    b'[2025-03-02 10:00:04.000001] Moving to next waypoint: {"lat": 35.74, "lon": -78.7, "alt": 40}\n'
+    b"[2025-03-02 10:00:05.000001] Filtered data (avg): Pwr:-12.5,P_Var\n"
+)
+GPX = (
+    b"<?xml version='1.0' encoding='UTF-8'?>\n<gpx creator='x' version='1.1'>\n<trk><trkseg>\n"
+    b'<trkpt lat="35.7300001" lon="-78.7000002">\n<ele>76.5</ele>\n<time>2025-03-02T15:00:00.250Z</time>\n</trkpt>\n'
+    b"<trkpt lon='-78.7000003' lat='35.7300002'><time>2025-03-02T15:00:01Z</time><ele>86.5</ele></trkpt>\n"
+    b'<trkpt lat="35.7300001" lon="-78.7000002">\n<ele>76.5</ele>\n</trkpt>\n'
+    b"</trkseg></trk>\n</gpx>\n"
+)
+GPX_NEMO = GPX.replace(b"2025-03-02T15:00:00.250Z", b"T10:00:00.250Z").replace(
+    b"2025-03-02T15:00:01Z", b"T10:00:01.000Z"
+)
+_CELL = b'{"technology": "4G_LTE", "rsrp": %d, "rsrq": -6, "rssi": -51, "rssnr": 2147483647, "earfcn": "66911", "pci": "%d", "is_connected": "%s"}'
+PAWPRINTS = (
+    b'{"rel_time": 1.0, "abs_time": 1740927599000, "nr_signal_strength": {"ss_rsrp": "-88", "ss_rsrq": "-11", "ss_sinr": "33"}, '
+    b'"connected_pci": 2, "cells": [' + _CELL % (-62, 2, b"true") + b", " + _CELL % (-71, 1, b"false")
+    + b'], "companion_abs_time": 1740927600250.5}\n'
+    b'{"rel_time": 2.0, "abs_time": 1740927600000, "nr_signal_strength": {"ss_rsrp": "Unavailable"}, "connected_pci": 1, "cells": ['
+    + _CELL % (-70, 1, b"true") + b", " + _CELL % (2147483647, 2, b"false") + b'], "companion_abs_time": 1740927601250.5}\n'
+    b'{"rel_time": 3.0, "abs_time": 17409\n'
+)  # fmt: skip
+NEMO_WIDE = (
+    b"Time,Latitude,Longitude,Physical cell identity (LTE detected) - 1,Physical cell identity (LTE detected) - 2,"
+    b"RSRP (LTE detected) - 1,RSRP (LTE detected) - 2,Physical cell identity (LTE pcell),RSRP (LTE pcell),"
+    b"RSRQ (LTE pcell),Pathloss (LTE pcell),RS SNR\n"
+    b"2025-03-02 10:00:00.250,35.73,-78.70,,,,,110,-76.0,-6.0,96.0,\n"
+    b"2025-03-02 10:00:00.250,35.73,-78.70,,,,,,,,,19.0\n"
+    b"2025-03-02 10:00:01.250,35.74,-78.71,110,22,-77.0,-90.0,,,,,\n"
+    b"2025-03-02 10:00:02.250,35.74,-78.71,110,22,-77.0\n"
+)
+XCAL = (
+    b'"TIME_STAMP";"Lon";"Lat";"5G KPI PCell RF Serving PCI";"5G KPI PCell RF Serving SS-RSRP [dBm]";"5G KPI PCell RF RI"\r\n'
+    b'"2025-03-02 10:00:00.250";"-78,7000001";"35,7300002";"7";"-81,5";"2"\r\n'
+    b'"2025-03-02 10:00:00.750";"-78,7000001";"35,7300002";"7";"-82,5";""\r\n'
+)
+GNETTRACK = (
+    b"Timestamp\tLongitude\tLatitude\tSpeed\tCellID\tLTEPCI\tRSRP\tRSRQ\tSNR\tCQI\tNRxRSRP\n"
+    b"2025.03.02_10.00.00\t-78.70\t35.73\t0\t11\t42\t-95\t-13\t5\t9\t-101\n"
+    b"2025.03.02_10.00.01\t-78.70\t35.73\t0\t11\t42\t-96\t-13\t5\t9\t-\n"
+)
+AIRDATA = (
+    b"time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),xSpeed(mph),ySpeed(mph),zSpeed(mph),"
+    b" compass_heading(degrees), pitch(degrees), roll(degrees),satellites\n"
+    b"0,2025-03-02 15:00:00,35.7300001,-78.7000002,10,10,0,0,90,-1.5,0.5,14\n"
+    b"100,2025-03-02 15:00:01,35.7300001,-78.7000002,20,10,0,0,91,-1.5,0.5,14\n"
+)
+DJI = (
+    b"sep=,\n"
+    b"CUSTOM.date [local],CUSTOM.updateTime [local],OSD.latitude,OSD.longitude,OSD.height [ft],OSD.xSpeed [MPH],OSD.pitch,OSD.roll,OSD.yaw\n"
+    b"3/2/2025,10:00:00.25 AM,35.7300001,-78.7000002,32.8,10,-1.5,0.5,-170.0\n"
+    b"3/2/2025,10:00:00.35 AM,35.7300001,-78.7000002,32.8,10,-1.5,0.5,-170.0\n"
+)
+CONVERTED = (
+    b"num,Longitude,Latitude,Altitude,Pitch,Yaw,Roll,VelocityX,VelocityY,VelocityZ,BatteryVolts,time,GPSFix,NumberOfSatellites\n"
+    b"1,-78.7000001,35.7300002,0.5,0.1,1.5,-0.05,1.0,2.0,-0.5,48.1,2025-03-02 10:00:00.250000,3,12\n"
+    b"2,-78.7000001,35.7300002,1.5,0.1,1.5,-0.05,1.0,2.0,-0.5,48.1,2025-03-02 10:00:01.250000,3,12\n"
+    b"3,-78.7000001,35.73000\n"
+)
+VEHICLE_TITLE = b"num,Longitude,Latitude,Altitude,Volt,Battery Level,time,Fix,Number of Satellite\r\n" + VEHICLE_9
+QUECTEL_CONSOLE = (
+    b"2025-03-02 10:00:00 Serving cell Params \n\n"
+    b"2025-03-02 10:00:01 +----+--------------+\n"
+    b"|    | LTE          | is_TDD   |   MCC |   PCID |   earfcn |   RSRP |   RSRQ |   RSSI |   SINR |\n"
+    b"|----+--------------+----------+\n"
+    b'|  0 | +QENG: "LTE" | "FDD"    |   310 |    492 |      950 |   -113 |    -12 |    -80 |     14 |\n'
+    b"+----+--------------+----------+ \n"
+    b"2025-03-02 10:00:02 +----+------------------+\n"
+    b"|    | NR5G-NSA         |   MCC |   MNC |   PCID |   RSRP |   SINR |   RSRQ |\n"
+    b'|  0 | +QENG:"NR5G-NSA" |   310 |   410 |  65535 | -32768 | -32768 | -32768 |\n'
+    b'|  0 | +QENG:"NR5G-NSA" |   310 |   410 |     77 |    -82 |     21 |    -11 |\n'
+    b"2025-03-02 10:00:03 +----+-------------------+\n"
+    b'|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |        12 |        5 |\n'
+    b'|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |  \n'
+)
 GENERIC = (
     b"Time,Level,Note\r\n"
     b'2025-03-02T10:00:00.5,-81.5,"a, b"\r\n'
@@ -162,6 +252,60 @@ def mat_flight(**changes: object) -> bytes:
     file = io.BytesIO()
     scipy.io.savemat(file, {name: value for name, value in table.items() if value is not None}, do_compression=True)
     return file.getvalue()
+
+
+def lte_flight() -> bytes:
+    """An LTE flight as its authors merged it: raw positions of another length in front, text local, epoch UTC."""
+    count = 5
+    seconds = 1740927600.25 + 0.1 * np.arange(count)
+    table = {
+        "GPSx": np.full((2, 1), -78.7),
+        "GPSy": np.full((2, 1), 35.73),
+        "mX": np.linspace(-78.700, -78.699, count)[:, None],
+        "mY": np.linspace(35.730, 35.731, count)[:, None],
+        "mZ": np.linspace(0.5, 40.5, count)[:, None],
+        "RSRP": np.array([[17.5, 17.25, np.nan, -150.0, 16.5]]),
+        "RSRP2": np.array([[17.5, 17.25, 17.0, -150.0, 16.5]]),
+        "RSSI": np.full((1, count), 31.5),
+        "RSRQ": np.full((1, count), -6.5),
+        "timestamp_for_csv": np.array([f"2025-03-02 10:00:00.{250 + 100 * i:03d}" for i in range(count)]),
+        "timestamp_meas": seconds[:, None],
+    }
+    file = io.BytesIO()
+    scipy.io.savemat(file, table, do_compression=True)
+    return file.getvalue()
+
+
+def processed_flight() -> bytes:
+    """What the authors of the LTE flights make of one: no clock, heading in radians, other tables beside."""
+    table = {
+        "RSRP_s": np.linspace(-80.0, -90.0, 4)[:, None],
+        "acceler_s": np.zeros((4, 1)),
+        "azim_s": np.zeros((4, 1)),
+        "elev_s": np.zeros((4, 1)),
+        "height_s": np.full((4, 1), 30.0),
+        "lat_s": np.full((4, 1), 35.73),
+        "lon_s": np.full((4, 1), -78.70),
+        "ori_s": np.full((4, 1), np.pi / 2),
+        "x_f": np.zeros((9, 1)),
+    }
+    file = io.BytesIO()
+    scipy.io.savemat(file, table, do_compression=True)
+    return file.getvalue()
+
+
+def mat_73() -> bytes:
+    """The merged flight of :func:`mat_flight` as MATLAB 7.3 writes it: HDF5 behind 512 bytes, arrays transposed."""
+    file = io.BytesIO()
+    with h5py.File(file, "w", userblock_size=512) as book:
+        for name, values in scipy.io.loadmat(io.BytesIO(mat_flight())).items():
+            if name.startswith("__"):
+                continue
+            text = values.dtype.kind == "U"
+            stored = np.array([[ord(c) for c in row] for row in values.tolist()], dtype=np.uint16) if text else values
+            book.create_dataset(name, data=stored.T).attrs["MATLAB_class"] = np.bytes_("char" if text else "double")
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + b"\x00\x02IM"
+    return head.ljust(512, b"\0") + file.getvalue()[512:]
 
 
 def tap_line(text: str) -> bytes:
@@ -197,9 +341,15 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
         "eight_fields": (VEHICLE_8, 2, 0),
         "eleven_fields": (VEHICLE_11, 2, 0),
         "utc_offset": (VEHICLE_UTC, 3, 0),
+        "title_line": (VEHICLE_TITLE, 2, 0),
     },
     "sounder_log": {"runs_and_foot": (SOUNDER, 6, 1), "grown_offset": (SOUNDER_GROWN, 4, 0)},
-    "flight_mat": {"two_channels": (mat_flight(), 5, 0)},
+    "flight_mat": {
+        "two_channels": (mat_flight(), 5, 0),
+        "lte": (lte_flight(), 5, 0),
+        "processed": (processed_flight(), 4, 0),
+        "version_73": (mat_73(), 5, 0),
+    },
     "quectel_csv": {
         "csi": (QUECTEL_CSI, 3, 1),
         "csi_first_generation": (QUECTEL_FIRST, 2, 0),
@@ -213,6 +363,48 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "controller_log": {"console": (CONTROLLER, 3, 1)},
     "srsenb_log": {"console": (SRSENB, 3, 1)},
     "tap_jsonl": {"session": (TAP, 3, 1)},
+    "srsue_log": {"console": (SRSUE, 3, 1)},
+    "vehicle_log": {"console": (VEHICLE_LOG, 2, 1)},
+    "gpx": {"track": (GPX, 2, 1), "nemo": (GPX_NEMO, 2, 1)},
+    "pawprints": {"session": (PAWPRINTS, 2, 1)},
+    "drive_test": {
+        "nemo": (NEMO_WIDE, 3, 1),
+        "xcal": (XCAL, 2, 0),
+        "g_nettrack": (GNETTRACK, 2, 0),
+    },
+    "pose_csv": {"airdata": (AIRDATA, 2, 0), "dji": (DJI, 2, 0), "converted": (CONVERTED, 2, 1)},
+    "quectel_console": {"tables": (QUECTEL_CONSOLE, 4, 1)},
     "generic_csv": {"mapped": (GENERIC, 2, 1)},
 }
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]
+
+WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
+    "nemo_csv",
+    "nemo_kml",
+    "tap_jsonl",
+    "pawprints",
+    ("vehicle_out", "utc_offset"),
+    ("flight_mat", "lte"),
+    ("flight_mat", "processed"),
+    ("gpx", "track"),
+    ("pose_csv", "airdata"),
+)
+"""Readers and samples whose clock is UTC or relative."""
+
+NO_LOGS: dict[str, bytes] = {
+    "antenna_pattern": b"2\r\nFrequency=3300(MHz)\r\n\r\nphi theta total\r\n0 0 -1.5\r\n",
+    "power_references": b"Node,Category,Channel,PA_Enabled,Gain,Freq_3.30GHz\nlw1,tx,ch0,0,0.0,-57.5\n",
+    "kml_other": b"<?xml version='1.0'?>\n<kml><Document><Placemark><name>fence</name></Placemark></Document></kml>\n",
+    "gpx_other": b"<?xml version='1.0'?>\n<gpx version='1.1'>\n</gpx>\n",
+    "at_transcript": b'AT+QNWCFG="nr5g_csi"\r\n+QNWCFG: "nr5g_csi",29,2,7,28\r\n\r\nOK\r\n',
+    "nemo_summary": b"0123-4567\r\nDevice ID;1\r\nDevice Label;Nemo Handy\r\nMeasurement start;2025 Mar 2 10:00\r\n",
+    "nemo_binary": b"NMFS\0\0\1\2Anite\0",
+    "uhd_console": (
+        b"[2025-03-02 10:00:00.000001] [INFO] [UHD] linux; GNU C++\n[2025-03-02 10:00:01.000001] [INFO] [B200] Detected\n"
+    ),
+    "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
+    "document": b"# A page\n\n## Of text\n\nwords\n",
+    "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",
+    "flight_yaml": b"flight: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
+}
+"""A sample of each kind of file that is no log (the MATLAB ones aside)."""

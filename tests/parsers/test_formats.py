@@ -390,7 +390,7 @@ def test_generic_rank_base(base: str, expected: list[float]) -> None:
 
 @pytest.mark.parametrize(
     ("reader", "sample"),
-    [case for case in CASES if case[0] not in ("nemo_csv", "nemo_kml", "tap_jsonl") and case[1] != "utc_offset"],
+    [case for case in CASES if case[0] not in samples.WITHOUT_ZONE and case not in samples.WITHOUT_ZONE],
 )
 def test_a_clock_without_zone_names_the_key(reader: str, sample: str) -> None:
     with pytest.raises(UsageError, match="timezone:"):

@@ -2,17 +2,21 @@
 
 from __future__ import annotations
 
+import io
+
 import numpy as np
 import pytest
+import scipy.io
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.logs.readers import by_name, catalogue, identify
 from aerpaw_cmp.logs.records import ReadResult
-from tests.parsers.samples import CASES, OPTIONS, SAMPLES
+from tests.parsers.samples import CASES, NO_LOGS, OPTIONS, SAMPLES
 
 SNIFFED = [case for case in CASES if case[0] != "generic_csv"]
+TALK = ("controller_log", "srsenb_log", "srsue_log", "nemo_kml", "gpx", "vehicle_log", "quectel_console")
 TEXT_CASES = [case for case in CASES if case[0] != "flight_mat"]
 
 
@@ -82,7 +86,27 @@ def test_the_sample_line_shown_to_users_is_a_record(reader: str) -> None:
 
 
 def test_every_reader_has_a_sample() -> None:
-    assert {reader.name for reader in catalogue()} == set(SAMPLES)
+    assert {reader.name for reader in catalogue() if reader.kinds} == set(SAMPLES)
+
+
+@pytest.mark.parametrize("kind", NO_LOGS)
+def test_what_is_no_log_is_named_and_taken_by_no_reader(kind: str) -> None:
+    assert [reader.name for reader in catalogue() if reader.sniff(NO_LOGS[kind])] == [kind]
+    with pytest.raises(InputError, match="no log: "):
+        identify(NO_LOGS[kind])
+    with pytest.raises(InputError, match="no log: "):
+        by_name(kind).read(NO_LOGS[kind], OPTIONS)
+
+
+def test_antenna_grids_of_matlab_are_no_flight() -> None:
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"SA3300": np.zeros((61, 120)), "phi2": np.zeros((1, 120))}, do_compression=True)
+    with pytest.raises(InputError, match="antenna gain grids"):
+        identify(file.getvalue())
+    file = io.BytesIO()
+    scipy.io.savemat(file, {"results": np.zeros(4)})
+    with pytest.raises(InputError, match="no flight"):
+        identify(file.getvalue())
 
 
 @pytest.mark.parametrize(("reader", "sample"), TEXT_CASES)
@@ -124,7 +148,7 @@ def test_trailing_text_without_line_end(reader: str, sample: str) -> None:
     assert result is not None
     assert result.accepted == accepted
     # consoles and markup talk freely: there it is a comment
-    assert len(result.rejected) == rejected + (reader not in ("controller_log", "srsenb_log", "nemo_kml"))
+    assert len(result.rejected) == rejected + (reader not in TALK)
 
 
 @pytest.mark.parametrize("reader", ["generic_csv", "nemo_csv", "quectel_ri", "aadm_snr"])
@@ -159,12 +183,14 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
     assert all("unterminated_line" in flag for flag in flagged)
 
 
-@pytest.mark.parametrize("reader", [reader.name for reader in catalogue()])
+@pytest.mark.parametrize("reader", SAMPLES)
 @given(data=st.data())
 @settings(max_examples=60, deadline=None)
 def test_damaged_bytes(reader: str, data: st.DataObject) -> None:
     """Bytes overwritten, inserted and removed at random places of its own samples."""
-    sample = bytearray(data.draw(st.sampled_from([s for s, _, _ in SAMPLES[reader].values()])))
+    sample = bytearray(
+        data.draw(st.sampled_from([s for name, (s, _, _) in SAMPLES[reader].items() if name != "version_73"]))
+    )
     for _ in range(data.draw(st.integers(1, 6))):
         at = data.draw(st.integers(0, len(sample) - 1))
         new = data.draw(
@@ -176,6 +202,14 @@ def test_damaged_bytes(reader: str, data: st.DataObject) -> None:
     check_law(reader, bytes(sample))
     for other in catalogue():
         assert other.sniff(bytes(sample)) in (True, False)
+
+
+@pytest.mark.parametrize("at", [600, 1500, 3000, -400])
+def test_damaged_hdf5(at: int) -> None:
+    data = bytearray(SAMPLES["flight_mat"]["version_73"][0])
+    data[at : at + 60] = b"\xff" * 60
+    check_law("flight_mat", bytes(data))
+    check_law("flight_mat", bytes(data[: len(data) + min(at, 0)]))
 
 
 @given(st.binary(max_size=300))

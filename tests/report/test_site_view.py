@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.report import canvas, site_view
 from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
@@ -141,12 +140,6 @@ def test_crowns_on_the_plan_are_to_scale(report_data):
     [crowns] = [c for c in ax.collections if type(c).__name__ == "EllipseCollection"]
     assert crowns.get_offsets().tolist() == [[5.0, 7.0]]
     assert crowns.get_widths().tolist() == [14.0]
-
-
-def test_a_file_in_the_way_is_one_message(report_data, tmp_path):
-    (tmp_path / "taken").write_text("")
-    with pytest.raises(UsageError, match=r"the folder cannot be made .*a file is in the way"):
-        site_view.write_site_view(Site("nothing", report_data.site.frame, {}), tmp_path / "taken" / "show")
 
 
 def test_the_picture_is_scaled_by_corners_that_exist(report_data, monkeypatch):

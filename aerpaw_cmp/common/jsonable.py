@@ -1,0 +1,60 @@
+"""Values as JSON can hold them."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+
+def number_key(number: float) -> str:
+    """A number as a key of JSON, or as part of a column's name.
+
+    Examples
+    --------
+    >>> number_key(1000.0), number_key(12.5)
+    ('1000', '12.5')
+    """
+    return f"{number:.10g}"
+
+
+def json_safe(value: Any) -> Any:
+    """A copy that JSON can hold: NaN and infinity become None, arrays lists, keys text, records mappings by field.
+
+    A field of a record (dataclass) whose default is None is left out where it is None: the record has no such number.
+
+    Examples
+    --------
+    >>> json_safe({"rmse_db": float("nan"), 10: np.array([1, 2])})
+    {'rmse_db': None, '10': [1, 2]}
+    """
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return json_safe(fields_of(value))
+    if isinstance(value, Mapping):
+        return {number_key(key) if isinstance(key, float) else str(key): json_safe(item) for key, item in value.items()}
+    if isinstance(value, np.ndarray):
+        return json_safe(value.tolist() if value.dtype.kind != "M" else value.astype(str).tolist())
+    if isinstance(value, (list, tuple, set, frozenset)):
+        return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
+    if isinstance(value, (bool, np.bool_)):
+        return bool(value)
+    if isinstance(value, (int, np.integer)):
+        return int(value)
+    if isinstance(value, (float, np.floating)):
+        number = float(value)
+        return number if math.isfinite(number) else None
+    if isinstance(value, np.datetime64) and np.isnat(value):
+        return None
+    return value if value is None else str(value)
+
+
+def fields_of(record: Any) -> dict[str, Any]:
+    """Fields of a dataclass by name, without those that are None because they do not exist."""
+    return {
+        field.name: getattr(record, field.name)
+        for field in dataclasses.fields(record)
+        if not (field.default is None and getattr(record, field.name) is None)
+    }

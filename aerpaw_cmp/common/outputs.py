@@ -1,0 +1,844 @@
+"""Where results go: they replace nothing that is not this tool's, and appear whole or not at all.
+
+Three kinds of result, one rule:
+
+=====================  =======================================================  ==================================
+kind                   is this tool's own, so that it may be replaced           how the new one takes the name
+=====================  =======================================================  ==================================
+:class:`OutputFile`    a seal inside: the SHA-256 of the rest of the file       written beside, synced, renamed
+:class:`OutputFolder`  ``SHA256SUMS`` in it: the SHA-256 of every file of it    filled beside, synced, exchanged
+:class:`OutputSet`     a list beside them, with the SHA-256 of every file       by a journal that the next run ends
+=====================  =======================================================  ==================================
+
+An input is never replaced, with ``--force`` or without; inputs are known by device and inode, so through links, too.
+What this tool did not write, or what was changed after it was written, is replaced with ``--force`` only.
+
+The place beside the target (``.NAME.aerpaw-part``) is made before any computation, so that a bad ``-o`` is told first,
+and is locked (flock) until the run ends: a second run into the same target is refused. A killed run leaves at most
+that hidden place; the next run into the target clears it. See docs/security.md for what holds when.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import shutil
+import stat
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Any, BinaryIO
+
+from .errors import OutputError, UsageError, one_line
+from .files import plain_mode, sync
+
+SUMS = "SHA256SUMS"
+"""The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it."""
+_SUMS_HEAD = "# aerpaw-cmp:"
+_SEAL = "# aerpaw-cmp wrote this file; SHA-256 of the lines below: "
+_UNFINISHED = ".unfinished"
+_MOST_CARRIED = 10_000
+"""Foreign files that are kept in a result folder; more mean that -o names the wrong folder."""
+
+_Identity = tuple[int, int]
+
+
+# --- what is this tool's own ----------------------------------------------------------------------
+
+
+def sealed(text: str) -> bytes:
+    r"""Text whose first line, a comment, holds the SHA-256 of the rest.
+
+    Examples
+    --------
+    >>> sealed("a: 1\n").decode().splitlines()[1]
+    'a: 1'
+    """
+    content = text.encode("utf-8")
+    return f"{_SEAL}{hashlib.sha256(content).hexdigest()}\n".encode("ascii") + content
+
+
+def is_sealed(path: Path) -> bool:
+    """Whether a file is as :func:`sealed` made it, and nobody changed it since."""
+    with path.open("rb") as stream:
+        head = stream.readline(len(_SEAL) + 80)
+        seal = f"{_SEAL}{_digest(stream)}\n" if head.startswith(_SEAL.encode("ascii")) else ""
+    return head == seal.encode("ascii")
+
+
+def read_sums(folder: Path) -> dict[str, str] | None:
+    """SHA-256 of each file of a result folder by its relative name; None where there is no list of this tool."""
+    try:
+        text = (folder / SUMS).read_text(encoding="utf-8")
+    except (OSError, ValueError):
+        return None
+    if not text.startswith(_SUMS_HEAD):
+        return None
+    rows = [line.split("  ", 1) for line in text.splitlines() if not line.startswith("#")]
+    return {row[1]: row[0] for row in rows if len(row) == 2}
+
+
+def changed_files(folder: Path) -> list[str]:
+    """Names in ``SHA256SUMS`` whose file is there with another content."""
+    return [
+        name
+        for name, digest in (read_sums(folder) or {}).items()
+        if (folder / name).is_file() and file_digest(folder / name) != digest
+    ]
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file."""
+    with path.open("rb") as stream:
+        return _digest(stream)
+
+
+def _digest(stream: BinaryIO) -> str:
+    digest = hashlib.sha256()
+    while block := stream.read(1 << 20):
+        digest.update(block)
+    return digest.hexdigest()
+
+
+# --- what is an input -----------------------------------------------------------------------------
+
+
+def _identity(path: Path) -> _Identity | None:
+    try:
+        status = path.stat()
+    except (OSError, ValueError):
+        return None
+    return status.st_dev, status.st_ino
+
+
+def _files_below(folder: Path) -> Iterator[Path]:
+    for parent, _, names in os.walk(folder):
+        yield from (Path(parent, name) for name in names)
+
+
+def _entries_below(folder: Path) -> Iterator[Path]:
+    """Files, links (to folders, too) and empty folders."""
+    for parent, folders, names in os.walk(folder):
+        yield from (Path(parent, name) for name in names)
+        for name in folders:
+            place = Path(parent, name)
+            if place.is_symlink() or not any(place.iterdir()):
+                yield place
+
+
+def _real(path: Path) -> Path:
+    """The place that a path names, links followed; UsageError for a name that cannot be."""
+    try:
+        return Path(os.path.realpath(path))
+    except (OSError, ValueError) as error:
+        raise UsageError(f"no possible name of an output ({error})", path=path) from None
+
+
+# --- one file -------------------------------------------------------------------------------------
+
+
+class OutputFile:
+    """A file that a command writes, as a context around the whole command.
+
+    Parameters
+    ----------
+    target : Path
+        What ``-o`` names. A link is followed: the file behind it is replaced, the link stays.
+    own : callable
+        Whether a file that exists is an earlier, unchanged output of the same kind.
+    inputs : iterable of Path
+        Files and folders that the command reads.
+    force : bool
+        Replace a file that is not this tool's; never an input.
+
+    Raises
+    ------
+    UsageError
+        On entry: the target is an input, is not this tool's, lies in no folder, or another run writes it.
+    OutputError
+        If the disk does not take it.
+    """
+
+    def __init__(
+        self, target: Path, *, own: Callable[[Path], bool], inputs: Iterable[Path] = (), force: bool = False
+    ) -> None:
+        self.named, self.target = Path(target), _real(Path(target))
+        self._own, self._inputs, self._force = own, tuple(inputs), force
+        self._place: _Place | None = None
+
+    def __enter__(self) -> OutputFile:
+        if not self.target.parent.is_dir():
+            raise UsageError(
+                "there is no such folder", expected="a file name in a folder that exists", path=self.named.parent
+            )
+        self._refuse()
+        self._place = _Place(self.target, self.named, folder=False)
+        return self
+
+    def _refuse(self) -> None:
+        """UsageError unless the target may be written."""
+        if not os.path.lexists(self.target):
+            return
+        if not self.target.is_file():
+            raise UsageError("what has this name is no ordinary file", expected="a file name", path=self.named)
+        target = _identity(self.target)
+        for path in self._inputs:
+            if _identity(path) == target:
+                raise _replaces_input(self.named, path)
+        own = _ask(self._own, self.target)
+        for path in () if own else self._inputs:  # an own earlier output may lie among the logs
+            if path.is_dir() and any(_identity(file) == target for file in _files_below(path)):
+                raise _replaces_input(self.named, path)
+        if not own and not self._force:
+            raise UsageError(
+                "the file exists, and it is not an unchanged output of this command",
+                expected="a new name, or --force to replace it",
+                path=self.named,
+            )
+
+    def write(self, content: bytes) -> None:
+        """Write, sync, and take the name: a reader sees the old file or the new one, also after a power cut."""
+        place = self._place
+        assert place is not None, "used as a context"
+        with told(self.named):
+            with os.fdopen(os.dup(place.descriptor), "wb") as stream:
+                stream.write(content)
+                stream.flush()
+                os.fchmod(stream.fileno(), plain_mode())
+                os.fsync(stream.fileno())
+            self._refuse()  # what came there meanwhile is not replaced either
+            place.refuse_gone()
+            place.part.rename(self.target)
+            place.leave()  # HDF5 opens no file that somebody locks
+            self._place = None
+            _sync_folder(self.target.parent)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._place is not None:
+            self._place.leave()
+            self._place = None
+
+
+def _replaces_input(named: Path, path: Path) -> UsageError:
+    return UsageError(
+        "the output would replace an input" + ("" if path == named else f", {one_line(str(path))}"),
+        expected="another name after -o",
+        path=named,
+    )
+
+
+def _ask(own: Callable[[Path], bool], path: Path) -> bool:
+    try:
+        return own(path)
+    except (OSError, ValueError):
+        return False
+
+
+# --- a folder -------------------------------------------------------------------------------------
+
+
+class OutputFolder:
+    """A folder of results, replaced as a whole; a context around the whole command.
+
+    Parameters
+    ----------
+    target : Path
+        What ``-o`` names; made when missing, with its parents.
+    job : str
+        Name of the command, for ``SHA256SUMS``.
+    inputs : iterable of Path
+        Files that the command reads; none of them may lie in the folder.
+    force : bool
+        Take a folder that holds other files. They stay in it unless a result has the same name.
+
+    Raises
+    ------
+    UsageError
+        On entry: the folder holds an input or what is not this tool's, cannot be replaced as a whole, or another
+        run writes it.
+    OutputError
+        If the disk does not take it.
+
+    Examples
+    --------
+    ::
+
+        with OutputFolder(out, job="report", inputs=[flight]) as output:
+            result = compute()
+            with output.filling() as folder:
+                write(result, folder)
+    """
+
+    def __init__(self, target: Path, *, job: str, inputs: Iterable[Path] = (), force: bool = False) -> None:
+        self.named, self.target = Path(target), _real(Path(target))
+        self._job, self._inputs, self._force = job, tuple(inputs), force
+        self._place: _Place | None = None
+        self._made: list[Path] = []
+        """Parents made for this run, removed again where it fails."""
+
+    def __enter__(self) -> OutputFolder:
+        with told(self.named):
+            self._refuse_shape()
+            try:
+                _make_folders(self.target.parent, self._made)
+                self._place = _Place(self.target, self.named, folder=True)
+                _restore(self.target)
+                self._refuse_content()
+                (self._place.part / _UNFINISHED).touch()
+            except BaseException:
+                self.__exit__(None, None, None)
+                raise
+        return self
+
+    def _refuse_shape(self) -> None:
+        """UsageError for a name that no folder of results can have."""
+        if os.path.lexists(self.target) and not self.target.is_dir():
+            raise UsageError("a file is in the way", expected="the name of a folder", path=self.named)
+        if self.target.is_dir():
+            here = Path.cwd().resolve()
+            if self.target == here or self.target in here.parents or os.path.ismount(self.target):
+                raise UsageError(
+                    "the folder is replaced as a whole, and that cannot be done to one that a command runs in or that "
+                    "a file system is mounted on",
+                    expected=f"a folder inside it, such as {one_line(str(self.named / self._job))}",
+                    path=self.named,
+                )
+        for path in self._inputs:
+            if self.target in _real(path).parents or self.target == _real(path):
+                raise UsageError(
+                    f"the output folder holds an input, {one_line(str(path))}",
+                    expected="a folder of its own after -o: it is replaced as a whole",
+                    path=self.named,
+                )
+
+    def _refuse_content(self) -> None:
+        """UsageError where the folder holds what this tool did not write, or what was changed since."""
+        if not self.target.is_dir():
+            return
+        inputs = {_identity(path) for path in self._inputs} - {None}
+        listed = read_sums(self.target)
+        if listed is None and not self._force and (first := next(iter(sorted(self.target.iterdir())), None)):
+            raise UsageError(
+                f"the folder holds files that this tool did not write, {one_line(first.name)}"
+                + ("" if (rest := len(list(self.target.iterdir())) - 1) == 0 else f" and {rest} more"),
+                expected="a new or empty folder, or --force: it keeps them, and replaces only those whose name a "
+                "result has",
+                path=self.named,
+            )
+        for number, file in enumerate(_files_below(self.target)):
+            if number > _MOST_CARRIED:
+                raise UsageError(
+                    f"the folder holds more than {_MOST_CARRIED} files", expected="a folder of its own", path=self.named
+                )
+            if _identity(file) in inputs:
+                raise _replaces_input(self.named, file)
+        if not self._force and (changed := changed_files(self.target)):
+            raise UsageError(
+                f"{one_line(changed[0])} was changed after this tool wrote it",
+                expected="a new folder, or --force to replace it",
+                path=self.named,
+            )
+
+    @contextlib.contextmanager
+    def filling(self) -> Iterator[Path]:
+        """An empty folder to write the results to; they take the name when the block ends without an error."""
+        place = self._place
+        assert place is not None, "used as a context"
+        with told(self.named):
+            yield place.part
+            place.refuse_gone()
+            self._commit(place)
+        self._made = []
+
+    def _commit(self, place: _Place) -> None:
+        files = [file for file in _files_below(place.part) if file.name != _UNFINISHED]
+        results = sorted(file.relative_to(place.part).as_posix() for file in files)
+        sums = "".join(f"{file_digest(place.part / name)}  {name}\n" for name in results)
+        head = f"{_SUMS_HEAD} the files of one run of '{self._job}'; 'sha256sum -c {SUMS}' checks them\n"
+        (place.part / SUMS).write_text(head + sums, encoding="utf-8")
+        _sync_tree(place.part)
+        self._refuse_content()  # what came there meanwhile
+        if not self.target.is_dir():
+            (place.part / _UNFINISHED).unlink(missing_ok=True)
+            _sync_folder(place.part)
+            place.part.rename(self.target)
+            _sync_folder(self.target.parent)
+            return
+        forced = self._carry(place.part, {*results, SUMS})
+        place.part.chmod(stat.S_IMODE(self.target.stat().st_mode))
+        (place.part / _UNFINISHED).unlink(missing_ok=True)
+        _sync_folder(place.part)
+        place.lock_too(self.target)
+        _exchange(place.part, self.target)
+        _sync_folder(self.target.parent)
+        with contextlib.suppress(OSError):  # the results stand; the next run tries again
+            _clear(place.part, self.target, own=forced)
+
+    def _carry(self, part: Path, results: set[str]) -> set[str]:
+        """Files that are not this tool's come along, as links: they stand under their name before and after.
+
+        Gives the names of those that give way to a result, with ``--force``.
+        """
+        own = {SUMS, *(read_sums(self.target) or ())}
+        forced = set()
+        for file in _entries_below(self.target):
+            name = file.relative_to(self.target).as_posix()
+            if name in own:
+                continue
+            if name not in results:
+                _link(file, part / name)
+            elif self._force:
+                forced.add(name)
+            else:
+                raise UsageError(
+                    f"{one_line(name)} is not this tool's, and a result has the same name",
+                    expected="a new folder, or --force to replace it",
+                    path=self.named,
+                )
+        return forced
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._place is not None:
+            self._place.leave()
+            self._place = None
+        _remove_folders(self._made)
+
+
+def _make_folders(folder: Path, made: list[Path]) -> None:
+    """Make a folder and its parents; ``made`` gets those that were not there."""
+    missing = [place for place in (folder, *folder.parents) if not place.exists()]
+    for place in reversed(missing):
+        place.mkdir(exist_ok=True)
+        made.append(place)
+
+
+def _remove_folders(made: list[Path]) -> None:
+    """Remove folders made for a run that failed, where nothing is in them."""
+    for place in reversed(made):
+        with contextlib.suppress(OSError):
+            place.rmdir()
+
+
+def _link(file: Path, name: Path) -> None:
+    """The same file under a second name; a copy where links cannot be made."""
+    name.parent.mkdir(parents=True, exist_ok=True)
+    if file.is_dir() and not file.is_symlink():
+        name.mkdir(exist_ok=True)
+        return
+    try:
+        os.link(file, name, follow_symlinks=False)
+    except (OSError, NotImplementedError):
+        shutil.copy2(file, name, follow_symlinks=False)
+
+
+# --- several files beside files of others -----------------------------------------------------------
+
+
+class OutputSet:
+    """Files in a folder that is not the tool's alone, with a list that names them; a context around the command.
+
+    Parameters
+    ----------
+    folder : Path
+        Made when missing.
+    listing : str
+        Name of the JSON file that lists the set: under ``files`` the SHA-256 of each, by its name in the folder.
+    names : iterable of str
+        The files of the set, as names in the folder.
+    inputs : iterable of Path
+        What the command reads.
+    force : bool
+        Replace files that the list does not have, or has with another content; never an input.
+
+    Raises
+    ------
+    UsageError
+        On entry: a file stands in the way that the list does not have, or another run is at work.
+    OutputError
+        If the disk does not take it.
+
+    Notes
+    -----
+    A folder with other files in it cannot be exchanged. The new files are written beside their places and synced;
+    then a journal is written, the old list and the old files are removed, and the new ones take their names, the list
+    last. Files of the old list that the new set has not (another flight's logs) stay in folder and list. A run killed
+    on the way leaves old files or new ones, never both, and no list before the set is whole; the
+    next run finishes what the journal says.
+    """
+
+    def __init__(
+        self, folder: Path, *, listing: str, names: Iterable[str], inputs: Iterable[Path] = (), force: bool = False
+    ) -> None:
+        self.named, self.folder = Path(folder), _real(Path(folder))
+        self._listing, self._names = listing, tuple(names)
+        self._inputs, self._force = tuple(inputs), force
+        self._known: dict[str, set[str]] = {}
+        self._made: list[Path] = []
+        self._place: _Place | None = None
+        self._journal = beside(self.folder / listing, "journal")
+
+    def __enter__(self) -> OutputSet:
+        with told(self.named):
+            try:
+                _make_folders(self.folder, self._made)
+                self._place = _Place(self.folder / self._listing, self.named, folder=False)
+                self._recover()
+                self._remember(_listed(self.folder / self._listing))
+                self._refuse()
+            except BaseException:
+                self.__exit__(None, None, None)
+                raise
+        return self
+
+    def _remember(self, digests: Mapping[str, str]) -> None:
+        for name, digest in digests.items():
+            self._known.setdefault(name, set()).add(digest)
+
+    def _own(self, name: str) -> bool:
+        file = self.folder / name
+        return file.is_file() and file_digest(file) in self._known.get(name, ())
+
+    def _refuse(self) -> None:
+        """UsageError unless every file of the set may be written."""
+        listing = self.folder / self._listing
+        if os.path.lexists(listing) and not self._force and not _listed(listing):
+            raise UsageError(
+                "the file exists, and is not one that this command wrote",
+                expected="another folder, or --force to replace it",
+                path=listing,
+            )
+        foreign = []
+        for name in (*self._names, self._listing):
+            file = self.folder / name
+            for path in self._inputs:
+                if _identity(path) is not None and _identity(path) == _identity(file):
+                    raise _replaces_input(file, path)
+            if name != self._listing and os.path.lexists(file) and not self._own(name):
+                foreign.append(file)
+        if foreign and not self._force:
+            more = "" if len(foreign) == 1 else f", and so are {len(foreign) - 1} more"
+            raise UsageError(
+                f"the file exists and is not marked as synthetic{more}",
+                expected=f"another folder after -o, or --force to replace what {self._listing} does not list",
+                cause="a real log, or one that was changed",
+                path=foreign[0],
+            )
+
+    def write(self, contents: Mapping[str, bytes], listing: Mapping[str, Any]) -> list[Path]:
+        """Write the set; gives its paths, the list last. ``listing`` gets the key ``files``."""
+        digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
+        others = {name: file_digest(self.folder / name) for name in self._known if self._own(name)}
+        text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
+        everything = {**contents, self._listing: text.encode("utf-8")}
+        with told(self.named):
+            try:
+                for name, content in everything.items():
+                    _write_synced(self._new(name), content)
+                self._refuse()  # what came there meanwhile
+                old = {name: file_digest(self.folder / name) for name in contents if self._own(name)}
+                digests[self._listing] = hashlib.sha256(everything[self._listing]).hexdigest()
+                _write_synced(self._journal, json.dumps({"old": old, "new": digests}).encode("ascii"))
+            except BaseException:
+                for name in everything:
+                    with contextlib.suppress(OSError):
+                        beside(self.folder / name, "new").unlink(missing_ok=True)
+                raise
+            _sync_folder(self.folder)
+            self._recover()
+        return [self.folder / name for name in everything]
+
+    def _new(self, name: str) -> Path:
+        file = self.folder / name
+        _make_folders(file.parent, self._made)
+        return beside(file, "new")
+
+    def _recover(self) -> None:
+        """Finish what the journal says; every step may be done twice."""
+        try:
+            journal = json.loads(self._journal.read_text(encoding="ascii"))
+            old, new = dict(journal["old"]), dict(journal["new"])
+        except FileNotFoundError:
+            return
+        except (ValueError, KeyError, TypeError):  # cut while it was written: nothing had been done
+            self._journal.unlink()
+            return
+        self._remember(old)
+        self._remember(new)
+        whole = all(
+            (self._new(name).is_file() and file_digest(self._new(name)) == digest)
+            or ((self.folder / name).is_file() and file_digest(self.folder / name) == digest)
+            for name, digest in new.items()
+        )
+        if whole:
+            (self.folder / self._listing).unlink(missing_ok=True)
+            for name, digest in old.items():
+                file = self.folder / name
+                if file.is_file() and file_digest(file) == digest and new.get(name) != digest:
+                    file.unlink()
+            for name in sorted(new, key=lambda name: name == self._listing):
+                if self._new(name).exists():
+                    self._new(name).replace(self.folder / name)
+                    _sync_folder((self.folder / name).parent)
+        self._journal.unlink()
+        _sync_folder(self.folder)
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._place is not None:
+            self._place.leave()
+            self._place = None
+        _remove_folders(self._made)
+
+
+def _listed(listing: Path) -> dict[str, str]:
+    """SHA-256 by name as a list of :class:`OutputSet` says them; empty where it is none."""
+    try:
+        files = json.loads(listing.read_text(encoding="utf-8"))["files"]
+        return {str(name): str(digest) for name, digest in files.items()}
+    except (OSError, ValueError, KeyError, TypeError, AttributeError):
+        return {}
+
+
+def _write_synced(path: Path, content: bytes) -> None:
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_TRUNC | os.O_NOFOLLOW, 0o666)
+    with os.fdopen(descriptor, "wb") as stream:
+        stream.write(content)
+        stream.flush()
+        os.fsync(stream.fileno())
+
+
+# --- the place beside -----------------------------------------------------------------------------
+
+
+def beside(target: Path, suffix: str) -> Path:
+    """The hidden name of a place beside the target; short where the name is long (255 bytes are the limit)."""
+    name = target.name
+    if len(os.fsencode(name)) > 200:
+        name = hashlib.sha256(os.fsencode(name)).hexdigest()[:32]
+    return target.with_name(f".{name}.aerpaw-{suffix}")
+
+
+class _Place:
+    """``.NAME.aerpaw-part``, made and locked; what a killed run left there is cleared."""
+
+    def __init__(self, target: Path, named: Path, *, folder: bool) -> None:
+        self.target, self.named = target, named
+        self.part = beside(target, "part")
+        self._further: list[int] = []
+        with told(named):
+            self.descriptor = self._claim(folder)
+            try:
+                if folder:
+                    _clear(self.part, target, keep=True)
+                else:
+                    os.ftruncate(self.descriptor, 0)
+            except BaseException:
+                os.close(self.descriptor)
+                raise
+
+    def _claim(self, folder: bool) -> int:
+        for _ in range(1000):  # another run may remove it between our steps
+            try:
+                if folder:
+                    with contextlib.suppress(FileExistsError):
+                        self.part.mkdir()
+                    descriptor = os.open(self.part, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
+                else:
+                    descriptor = os.open(self.part, os.O_RDWR | os.O_CREAT | os.O_NOFOLLOW, 0o600)
+            except FileNotFoundError:
+                if not self.part.parent.is_dir():
+                    raise
+                continue
+            if not _lock(descriptor):
+                os.close(descriptor)
+                raise self._busy()
+            if self._is_there(descriptor):
+                return descriptor
+            os.close(descriptor)
+        raise self._busy()
+
+    def _busy(self) -> UsageError:
+        return UsageError(
+            "another run is writing here", expected="one run at a time, or another name after -o", path=self.named
+        )
+
+    def lock_too(self, folder: Path) -> None:
+        """Lock what is about to come to this place."""
+        descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
+        self._further.append(descriptor)
+        _lock(descriptor)
+
+    def _is_there(self, descriptor: int) -> bool:
+        status = os.fstat(descriptor)
+        return _identity(self.part) == (status.st_dev, status.st_ino)
+
+    def refuse_gone(self) -> None:
+        """OutputError where somebody removed or replaced the place."""
+        if not self._is_there(self.descriptor):
+            raise FileNotFoundError(errno.ENOENT, "removed while the run went on", str(self.part))
+
+    def leave(self) -> None:
+        """Remove what did not take the name, and unlock."""
+        descriptors = (self.descriptor, *self._further)
+        if any(self._is_there(descriptor) for descriptor in descriptors):  # else another run's place, or none
+            with contextlib.suppress(OSError):
+                _clear(self.part, self.target) if self.part.is_dir() else self.part.unlink()
+        for descriptor in descriptors:
+            os.close(descriptor)
+
+
+def _lock(descriptor: int) -> bool:
+    """Whether the lock was had; True as well on systems and disks that have no locks."""
+    try:
+        import fcntl
+
+        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except ImportError:
+        return True
+    except OSError as error:
+        return error.errno not in (errno.EWOULDBLOCK, errno.EAGAIN, errno.EACCES)
+    return True
+
+
+def _clear(part: Path, target: Path, *, own: Iterable[str] = (), keep: bool = False) -> None:
+    """Empty a place and, unless ``keep``, remove it. Files of others that the target has not are put there.
+
+    A place with ``.unfinished`` was being filled: all in it is ours or a link to what the target has. Without it, it
+    is the set that was replaced; what its list does not name (nor ``own``) is somebody's. Both signs go last.
+    """
+    signs = {part / _UNFINISHED, part / SUMS}
+    unfinished = (part / _UNFINISHED).exists()
+    known = {*own, *(read_sums(part) or ())}
+    for parent, folders, names in os.walk(part, topdown=False):
+        for file in (Path(parent, name) for name in names):
+            name = file.relative_to(part).as_posix()
+            if file in signs:
+                continue
+            if unfinished or name in known or not target.is_dir():
+                file.unlink()
+            else:
+                _rescue(file, target / name)
+        for folder in (Path(parent, name) for name in folders):
+            folder.unlink() if folder.is_symlink() else folder.rmdir()
+    for sign in signs:
+        sign.unlink(missing_ok=True)
+    if not keep:
+        part.rmdir()
+
+
+def _rescue(file: Path, name: Path) -> None:
+    """Give a file a name in the target, unless it was carried there."""
+    name.parent.mkdir(parents=True, exist_ok=True)
+    while os.path.lexists(name):
+        if _same_content(file, name):
+            file.unlink()
+            return
+        name = name.with_name(f"{name.name}.kept")
+    file.rename(name)
+
+
+def _same_content(one: Path, other: Path) -> bool:
+    if os.path.samestat(one.lstat(), other.lstat()):
+        return True
+    if one.is_symlink() or other.is_symlink():
+        return one.is_symlink() and other.is_symlink() and one.readlink() == other.readlink()
+    return one.is_file() and other.is_file() and file_digest(one) == file_digest(other)
+
+
+# --- names and disks ------------------------------------------------------------------------------
+
+
+def _exchange(part: Path, target: Path) -> None:
+    """Two folders swap their names in one step; where the system cannot, in two that :func:`_restore` mends."""
+    if _renamed_both(part, target):
+        return
+    old = beside(target, "old")
+    target.rename(old)
+    part.rename(target)
+    old.rename(part)
+
+
+def _restore(target: Path) -> None:
+    """Mend what a run killed between the two steps left: the old set has its name again."""
+    old = beside(target, "old")
+    if not old.is_dir():
+        return
+    if os.path.lexists(target):
+        _clear(old, target)
+    else:
+        old.rename(target)
+
+
+def _renamed_both(one: Path, other: Path) -> bool:
+    """RENAME_EXCHANGE (Linux) or RENAME_SWAP (macOS); False where kernel, library or file system have it not."""
+    library = ctypes.CDLL(None, use_errno=True)
+    names = os.fsencode(one), os.fsencode(other)
+    if sys.platform == "darwin":
+        function, arguments = getattr(library, "renamex_np", None), (*names, 2)
+    else:
+        function, arguments = getattr(library, "renameat2", None), (-100, names[0], -100, names[1], 2)
+    if function is None:
+        return False
+    if function(*arguments) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL, errno.ENOTSUP, errno.EOPNOTSUPP):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
+
+
+def _sync_tree(folder: Path) -> None:
+    for parent, _, names in os.walk(folder, topdown=False):
+        for name in names:
+            if not Path(parent, name).is_symlink():
+                sync(Path(parent, name))
+        _sync_folder(Path(parent))
+
+
+def _sync_folder(folder: Path) -> None:
+    """Bring the names in a folder to the disk; not every system lets folders be synced."""
+    try:
+        sync(folder)
+    except OSError as error:
+        if error.errno in (errno.EIO, errno.ENOSPC, errno.EDQUOT):
+            raise
+
+
+_REMEDIES = {
+    errno.ENOSPC: "the disk is full: free some space, or name another place with -o",
+    errno.EDQUOT: "your quota is used up: free some space, or name another place with -o",
+    errno.EFBIG: "a limit on the size of files (ulimit -f), or a file system that takes no larger ones",
+    errno.EIO: "the disk fails: name another one with -o",
+    errno.EROFS: "the disk is mounted read-only: name another place with -o",
+    errno.EACCES: "no right to write here: name another place with -o",
+    errno.EPERM: "no right to write here: name another place with -o",
+    errno.ENOENT: "the folder was removed while the run went on: run again",
+}
+_WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+
+
+@contextlib.contextmanager
+def told(path: str | Path) -> Iterator[None]:
+    """An OSError inside becomes one message that names the output and says what to do."""
+    try:
+        yield
+    except OSError as error:
+        if error.errno in _WRONG_NAMES:
+            raise UsageError(
+                f"cannot be written ({error.strerror})", cause="a file is in the way, or a name too long", path=path
+            ) from error
+        raise OutputError(
+            f"cannot be written ({error.strerror or error})",
+            cause=_REMEDIES.get(error.errno or 0),
+            path=path,
+        ) from error

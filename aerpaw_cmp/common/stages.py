@@ -1,0 +1,65 @@
+"""Named stages of a job: how far it is, and how long each took."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Protocol
+
+
+class Progress(Protocol):
+    """Takes what is being done and, where it is known, the share of it that is done (0 to 1).
+
+    The same text with a growing share is one bar; a text without a share is a line.
+    """
+
+    def __call__(self, text: str, fraction: float | None = None, /) -> object: ...  # noqa: D102
+
+
+def silent(_text: str, _fraction: float | None = None, /) -> None:
+    """No progress."""
+
+
+def share_of(progress: Progress, text: str) -> Callable[[float], None]:
+    """The progress of one step, for code that knows its share and not its name."""
+
+    def step(fraction: float) -> None:
+        progress(text, fraction)
+
+    return step
+
+
+@dataclass(slots=True)
+class Stages:
+    """Seconds of each named stage, in order.
+
+    Parameters
+    ----------
+    progress : Progress
+        Gets the name of each stage as it begins.
+    seconds : dict of str to float
+        What has been spent; a name that comes twice adds up.
+
+    Examples
+    --------
+    >>> stages = Stages()
+    >>> with stages("read"):
+    ...     pass
+    >>> list(stages.seconds)
+    ['read']
+    """
+
+    progress: Progress = silent
+    seconds: dict[str, float] = field(default_factory=dict)
+
+    @contextmanager
+    def __call__(self, name: str) -> Iterator[None]:
+        """Time one stage."""
+        self.progress(name)
+        start = time.perf_counter()
+        try:
+            yield
+        finally:
+            self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start

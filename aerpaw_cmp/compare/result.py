@@ -1,0 +1,301 @@
+"""The numbers of one comparison: what the comparison stage gives, and report, campaign and JSON take from.
+
+Nothing here is computed, drawn or formatted. Times are naive ``datetime64[ns]`` in UTC, a missing number is NaN, a
+number that a flight cannot have is None.
+
+A new number of a tower and channel takes one field of :class:`RssFurther` (of the rank: :class:`RankFurther`) and one
+function beside those that fill its neighbours: metrics.json and the tables of the report list its fields by name.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from .rank import CommonestRank, RankComparison, RankRepeat
+from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .statistics import Interval, PairedDifference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ClockResult:
+    """Radio clock of a receiver (a tower) against the telemetry clock, as far as it is a number.
+
+    ``radio_minus_telemetry_s`` is positive where the radio's clock shows later times; subtracting it corrects them.
+    ``checks`` is what the verdict rests on, by name.
+    """
+
+    receiver: str
+    radio_minus_telemetry_s: float
+    ci95_s: Interval
+    drift_s_per_s: float
+    verdict: str
+    reason: str
+    applied: str
+    checks: Mapping[str, object] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Fit:
+    """An offset [dB], what it leaves [dB], and over how many values where that is not the number of samples."""
+
+    offset_db: float
+    rmse_db: float
+    n: int | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ModelLevel:
+    """Another simulation of the same samples: level (n,) [dBm] and its own best offset."""
+
+    level_dbm: FloatArray
+    offset_db: float
+    rmse_db: float
+    rmse_ci95_db: Interval
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Censored:
+    """Offset where samples below the weakest level seen count as such; only ``n`` = 0 where a side has no level."""
+
+    offset_db: float | None = None
+    sigma_db: float | None = None
+    n: int
+    n_measured_below: int | None = None
+    n_simulated_below: int | None = None
+    at_search_edge: bool | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExpectedOffset:
+    """Offset that the USRP reference powers predict, what it is made of, and how far the fitted one is from it."""
+
+    expected_db: float
+    receiver_reference_dbm: float
+    transmitter_reference_dbm: float
+    fitted_minus_expected_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Repeated:
+    """What two passes of the same places differ by [dB], over ``n`` pairs."""
+
+    rmse_db: float
+    rmse_ci95_db: Interval
+    n: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoliageLoss:
+    """What trees take from the level per pose [dB]; ``n_blocked`` poses have a path without trees only."""
+
+    n: int
+    n_blocked: int
+    mean_loss_db: float
+    largest_loss_db: float
+    share_above_1_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FoliageRankChange:
+    """Poses at which trees change the rank."""
+
+    share_changed: float
+    mean_change: float
+    n_lower: int
+    n_higher: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssFurther:
+    """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
+
+    A field without a default is always written; one whose default is None only where the flight has it.
+    ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
+    the replay is better or worse on the same samples; ``same_footing`` is by simulation and window; ``trimmed``,
+    ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
+    """
+
+    n_measured_out: int
+    n_simulated_out: int
+    block_length: int
+    identifiable_db: Interval
+    trimmed: Fit
+    n_too_low: int
+    n_no_pose: int
+    n_flagged: Mapping[str, int]
+    clock: ClockResult | None
+    baseline_rmse_ci95_db: Mapping[str, Interval]
+    compared_with: Mapping[str, PairedDifference]
+    same_footing: Mapping[str, Mapping[str, Fit]]
+    censored: Censored | None = None
+    expected_offset: ExpectedOffset | None = None
+    repeatability: Mapping[str, Repeated]
+    foliage: Mapping[str, FoliageLoss] | None = None
+    explained_by: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RssResult:
+    """RSS of one tower and channel, measured against simulated.
+
+    Parameters
+    ----------
+    tower, channel, unit : str
+        ``unit`` of the measurement before the offset: ``"dBm"`` or ``"dB re full scale"``.
+    time : (n,) datetime64[ns]
+    measured_db, simulated_dbm : (n,)
+        Before the offset; NaN without a signal, without a path, or where the pose is unknown or too low.
+    posed : (n,) bool
+        Samples with a known pose above the lowest height: the others belong to no comparison.
+    position_m : (n, 3)
+        In the site frame; NaN where no pose is known.
+    line_of_sight : (n,)
+        1, 0, NaN without a pose.
+    geometry : mapping of str to (n,)
+        Distance [m] and angles [deg] of the link, by name with unit.
+    score : RssComparison
+        Offset, RMSE, correlation and their intervals.
+    baselines, variants : mapping of str to ModelLevel
+        Free space and two-ray; the same paths under other assumptions.
+    curve_offset_db, curve_rmse_db : (m,)
+        RMSE against candidate offset.
+    spans : tuple of ErrorSpan
+        Stretches with the largest errors.
+    residual_by : mapping of str to ResidualBins
+        Residual against each quantity of the geometry, time and line of sight.
+    further : RssFurther
+    """
+
+    tower: str
+    channel: str
+    unit: str
+    time: AnyArray
+    measured_db: FloatArray
+    simulated_dbm: FloatArray
+    posed: BoolArray
+    position_m: FloatArray
+    line_of_sight: FloatArray
+    geometry: Mapping[str, FloatArray]
+    score: RssComparison
+    baselines: Mapping[str, ModelLevel]
+    variants: Mapping[str, ModelLevel]
+    curve_offset_db: FloatArray
+    curve_rmse_db: FloatArray
+    spans: tuple[ErrorSpan, ...]
+    residual_by: Mapping[str, ResidualBins]
+    further: RssFurther
+
+    @property
+    def name(self) -> str:
+        """Tower and channel as one label."""
+        return f"{self.tower} {self.channel}".strip()
+
+    @property
+    def calibrated_db(self) -> FloatArray:
+        """Measurement plus offset (n,), comparable with ``simulated_dbm``."""
+        return self.measured_db + self.score.offset_db
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PairResult:
+    """Two channels of one tower at their common instants: ``time`` (n,), differences (n,) first minus second [dB]."""
+
+    tower: str
+    first: str
+    second: str
+    time: AnyArray
+    difference_db: FloatArray
+    simulated_difference_db: FloatArray
+    score: ChannelDifference
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankFurther:
+    """Numbers of a tower's rank beside those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
+
+    ``n_flagged`` is by reason, ``foliage`` by run and K. ``commonest`` is the forecast that needs no model; ``repeat``
+    is how well the modem agrees with itself where the second half of the flight passes places of the first.
+    """
+
+    n_flagged: Mapping[str, int]
+    kappa_ci95: Mapping[str, Interval]
+    commonest: CommonestRank
+    repeat: Mapping[str, RankRepeat]
+    foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankResult:
+    """Rank of one tower: what the modem reported against what each K says, over the samples that are compared.
+
+    Parameters
+    ----------
+    tower : str
+    n_samples : int
+        Of the log; those too low or without a pose are left out of what follows.
+    time : (n,) datetime64[ns]
+    position_m : (n, 3)
+    measured : (n,)
+        NaN: no CSI.
+    sinr_db : (n,), optional
+    sigma : (n, min(n_rx, n_tx))
+        Singular values of the simulated channels, falling.
+    rank : mapping of float to (n,) int
+        Simulated, per K; 0: no path.
+    foliage_rank : mapping of str to mapping of float to (n,) int
+        The same without trees, in leaf and out of leaf; empty without a paired run.
+    score : RankComparison
+    further : RankFurther
+    """
+
+    tower: str
+    n_samples: int
+    time: AnyArray
+    position_m: FloatArray
+    measured: FloatArray
+    sinr_db: FloatArray | None
+    sigma: FloatArray
+    rank: Mapping[float, IntArray]
+    foliage_rank: Mapping[str, Mapping[float, IntArray]]
+    score: RankComparison
+    further: RankFurther
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AuditResult:
+    """The engine checked against another one on a spread of links of all series."""
+
+    reference: str
+    links: int
+    missing_paths: int
+    extra_paths: int
+    rss_max_error_db: float
+    rank_disagreement: Mapping[float, float] = field(default_factory=dict)
+    seconds: float = float("nan")
+    reference_seconds: float = float("nan")
+    note: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class EngineResult:
+    """Which engine replayed the flight, at what price, what it left out, and its audit."""
+
+    engine: str
+    links: int
+    seconds: float
+    paths: int | None = None
+    settings: Mapping[str, object] = field(default_factory=dict)
+    left_out: tuple[str, ...] = ()
+    audit: AuditResult | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightResult:
+    """Everything that was found about one flight; empty where it has no such series."""
+
+    rss: tuple[RssResult, ...] = ()
+    rank: tuple[RankResult, ...] = ()
+    pairs: tuple[PairResult, ...] = ()
+    engine: EngineResult | None = None

@@ -1,0 +1,79 @@
+"""One flight from its data to its numbers: clocks, replay, comparison, audit. Every job on a flight starts here.
+
+A new stage (a ladder of models, the receiver's chain, a further audit) is a function of what stands before it, one
+field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResult`, and two lines in :func:`run_flight`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from ..common.stages import Stages
+from ..compare.result import FlightResult
+from ..flight.data import FlightData
+from .compare_flight import audit_replays, compare_flight
+from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightRun:
+    """What was computed of one flight.
+
+    Parameters
+    ----------
+    data : FlightData
+        As read: settings, site, logs, track, series.
+    replays : FlightReplay
+        Poses, paths, fields and clock of every series.
+    result : FlightResult
+        Numbers alone.
+    """
+
+    data: FlightData
+    replays: FlightReplay
+    result: FlightResult
+
+
+def replay_flight(
+    data: FlightData, stages: Stages | None = None, *, clocks: Sequence[Clock | None] | None = None
+) -> FlightReplay:
+    """Clocks and replay alone.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks" and "replay".
+    clocks : sequence of Clock or None, optional
+        One per RSS series, in place of what ``rss.lag`` asks for.
+    """
+    stages = stages or Stages()
+    with stages("clocks"):
+        known = estimate_clocks(data, stages.progress) if clocks is None else clocks
+    with stages("replay"):
+        return FlightReplay(
+            rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
+        )
+
+
+def run_flight(data: FlightData, stages: Stages | None = None, *, audit: bool = True) -> FlightRun:
+    """Clocks, replay, comparison and audit.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks", "replay", "compare" and "audit".
+    audit : bool
+        Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+    """
+    stages = stages or Stages()
+    replays = replay_flight(data, stages)
+    with stages("compare"):
+        result = compare_flight(data, replays)
+    if audit:
+        with stages("audit"):
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
+    return FlightRun(data=data, replays=replays, result=result)

@@ -1,0 +1,47 @@
+"""One RSS series at its samples: measured and simulated level, and which samples are compared."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray
+from ..compare import rss
+from ..flight.data import RssSeries
+from ..flight.settings import RssSettings
+from .replay import Replayed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Levels:
+    """Measured and simulated levels (n,) [dB].
+
+    ``posed`` are the samples with a known pose above the lowest height; ``measured_db`` is NaN elsewhere.
+    """
+
+    measured_db: FloatArray
+    simulated_db: FloatArray
+    posed: BoolArray
+
+
+def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> Levels:
+    """What is compared of a series, as ``rss`` of the flight file asks."""
+    measured = series.measured_db
+    if settings.window_s > 0:
+        measured = rss.local_mean_db(series.time, measured, settings.window_s)
+    posed = replayed.valid.copy()
+    if settings.minimum_height_m is not None:
+        posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
+    found = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
+    return Levels(
+        measured_db=np.where(posed, measured, np.nan),
+        simulated_db=at_samples(series, replayed, found[:, 0], settings),
+        posed=posed,
+    )
+
+
+def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, settings: RssSettings) -> FloatArray:
+    """A simulated level of the replayed poses at the samples (n,), averaged as ``rss.field: local_mean`` asks."""
+    level = replayed.spread(level_db)
+    return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level

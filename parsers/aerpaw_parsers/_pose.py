@@ -1,0 +1,114 @@
+"""Telemetry of tables with named columns: AERPAW's and others' autopilots, DJI, phones."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs.records import Stream
+
+from . import _rows, _sheet
+
+LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
+LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
+ABOVE_TAKEOFF = (
+    r"height above takeoff( feet| m| ft)?", r"osd height( ft| m)?", r"(rel|relative) (alt|altitude|height)( m)?",
+    r"relalt", r"height( m)?", r"alt m",
+)  # fmt: skip
+ALTITUDE = (
+    r"(gps )?(alt|altitude|ele|elevation)( m| ft| meters)?",
+    r"osd altitude( ft| m)?",
+    r"altitude above ?sea ?level.*",
+)
+ANGLES = {
+    "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
+    "pitch_deg": (r"(osd )?pitch( deg| degrees| rad)?",),
+    "yaw_deg": (r"(osd )?yaw( deg| degrees| rad)?", r"compass heading( degrees)?", r"heading( deg)?", r"bearing"),
+}
+VELOCITIES = {
+    "velocity_north_mps": (r"velocity ?(north|x)( mps)?", r"vn", r"(osd )?x ?speed.*", r"speed ?x"),
+    "velocity_east_mps": (r"velocity ?(east|y)( mps)?", r"ve", r"(osd )?y ?speed.*", r"speed ?y"),
+    "velocity_down_mps": (r"velocity ?(down|z)( mps)?", r"vd", r"vz", r"(osd )?z ?speed.*", r"speed ?z"),
+}
+COUNTS = {
+    "fix": (r"(gps )?fix( type)?", r"gpsfix"),
+    "satellites": (r"(number of satellites?|satellites|num ?sat|osd gpsnum|nsats|numberofsatellites)",),
+}
+
+
+def has_position(names: list[str]) -> bool:
+    """Whether plain names hold a latitude and a longitude."""
+    from re import fullmatch
+
+    return all(any(fullmatch(p, name) for p in form[:1] for name in names) for form in (LATITUDE, LONGITUDE))
+
+
+def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
+    """The telemetry stream of a table; None where it has no position.
+
+    Altitudes above sea level are brought to height above the first position; angles are degrees unless the column
+    names radians or no yaw of the log is beyond 2 pi.
+    """
+    latitude, longitude = sheet.find(*LATITUDE), sheet.find(*LONGITUDE)
+    if latitude is None or longitude is None:
+        return None
+    values: dict[str, AnyArray] = {"latitude_deg": sheet.numbers(latitude), "longitude_deg": sheet.numbers(longitude)}
+    lost = clean(rows, values)
+    values["altitude_m"] = _altitude(rows, sheet, lost)
+    angles = {key: column for key, form in ANGLES.items() if (column := sheet.find(*form)) is not None}
+    values |= _angles(rows, sheet, angles)
+    for key, form in VELOCITIES.items():
+        if (column := sheet.find(*form)) is not None:
+            values[key] = sheet.numbers(column)
+    for key, form in COUNTS.items():
+        if (column := sheet.find(*form)) is not None:
+            values[key] = np.nan_to_num(sheet.numbers(column), nan=-1).astype(np.int64)
+    where = ~lost if lost.any() and not lost.all() else None
+    return rows.stream("telemetry", name, values, where=where, source=source)
+
+
+def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
+    """Positions that cannot be (or 0, 0) made NaN, in place; their mask."""
+    latitude, longitude = values["latitude_deg"], values["longitude_deg"]
+    lost: AnyArray = np.asarray(
+        ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | ((latitude == 0) & (longitude == 0))
+    )
+    latitude[lost], longitude[lost] = np.nan, np.nan
+    rows.mark(lost, "no_fix")
+    return lost
+
+
+def above_takeoff(rows: _rows.Rows, altitude: FloatArray, lost: AnyArray) -> FloatArray:
+    """Altitudes above sea level as heights above the first position, with a warning."""
+    known = altitude[np.isfinite(altitude) & ~lost]
+    if not len(known):
+        return altitude
+    zero = float(known[0])
+    rows.warnings.append(f"altitudes are above sea level: {zero:.1f} m, that of the first position, was taken off")
+    return np.asarray(altitude - zero)
+
+
+def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: AnyArray) -> FloatArray:
+    column = sheet.find(*ABOVE_TAKEOFF)
+    if column is not None:
+        return sheet.numbers(column)
+    column = sheet.find(*ALTITUDE)
+    if column is None:
+        rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
+        return np.full(len(rows), np.nan)
+    altitude = sheet.numbers(column)
+    known = altitude[np.isfinite(altitude) & ~lost]
+    # take-off is where a flight's log begins: what begins within a few metres of zero is relative to it
+    if not len(known) or abs(known[0]) < 10.0:
+        return altitude
+    return above_takeoff(rows, altitude, lost)
+
+
+def _angles(rows: _rows.Rows, sheet: _sheet.Sheet, columns: dict[str, int]) -> dict[str, FloatArray]:
+    values = {key: sheet.numbers(column) for key, column in columns.items()}
+    named = any(sheet.unit(c) or sheet.plain[c].endswith((" deg", " degrees", " rad")) for c in columns.values())
+    yaw = values.get("yaw_deg")
+    if yaw is None or named or not np.isfinite(yaw).any() or np.nanmax(np.abs(yaw)) > 2 * np.pi:
+        return values
+    rows.warnings.append("no yaw is beyond 2 pi: the angles were read as radians")
+    return {key: np.degrees(column) for key, column in values.items()}

@@ -1,0 +1,153 @@
+"""Dates and times in the forms that programs other than AERPAW's write, brought to one: ``YYYY-mm-dd HH:MM:SS.f``.
+
+Which of two readings of ``03/04/2025`` holds is decided by the whole column; where it says nothing the month comes
+first and a warning says so.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs.readers import ReadOptions
+
+_CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
+_ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
+_YEAR_FIRST = re.compile(r"(\d{4})[-/._](\d{1,2})[-/._](\d{1,2})" + _CLOCK + _ZONE)
+_YEAR_LAST = re.compile(r"(\d{1,2})([-/.])(\d{1,2})\2(\d{4})" + _CLOCK + _ZONE)
+_WORD_MONTH = re.compile(r"(\d{1,2})[- ]?([A-Z][a-z]{2})[a-z]{0,6}[- ]?(\d{4}|\d\d)" + _CLOCK + _ZONE)
+_DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})?)()" + _ZONE)
+_OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
+_NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
+_MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+_IN_NAME = (
+    re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
+    re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
+)
+
+
+def date_in_name(name: str) -> str | None:
+    """The date that a file name carries.
+
+    Examples
+    --------
+    >>> date_in_name("24Jun24_141317.1.gpx"), date_in_name("2022-06-10_19:52:44_log.txt"), date_in_name("60m.csv")
+    ('2024-06-24', '2022-06-10', None)
+    """
+    for pattern in _IN_NAME:
+        for found in pattern.finditer(name):
+            year, month, day = found.groups() if pattern is _IN_NAME[0] else (f"20{found[3]}", found[2], found[1])
+            number = int(month) if month.isdigit() else _month(month)
+            if 1 <= number <= 12 and 1 <= int(day) <= 31:
+                return f"{year}-{number:02d}-{int(day):02d}"
+    return None
+
+
+def _month(word: str) -> int:
+    return _MONTHS.index(word[:3].lower()) + 1 if word[:3].lower() in _MONTHS else 0
+
+
+def _written(year: str, month: int, day: str, clock: Sequence[str | None], zone: str | None) -> bytes:
+    """One time in the common form; ``-`` where it is no time of the day."""
+    hour, minute, second, half = (clock[0] or "0", clock[1] or "0", clock[2] or "0", clock[3])
+    number = int(hour)
+    if half:
+        number = number % 12 + (12 if half.lower() == "pm" else 0)
+    whole, _, fraction = re.sub("[,:]", ".", second).partition(".")
+    text = f"{year}-{month:02d}-{int(day):02d} {number:02d}:{int(minute):02d}:{int(whole):02d}"
+    end = "Z" if zone in ("UTC", "GMT") else zone or ""
+    return (text + (f".{fraction}" if fraction else "") + end).encode()
+
+
+def _dated(text: str, day_first: bool) -> bytes | None:
+    if found := _YEAR_FIRST.fullmatch(text) or _DIGITS.fullmatch(text):
+        return _written(found[1], int(found[2]), found[3], found.groups()[3:7], found[8])
+    if found := _YEAR_LAST.fullmatch(text):
+        day, month = (found[1], found[3]) if day_first else (found[3], found[1])
+        return _written(found[4], int(month), day, found.groups()[4:8], found[9])
+    if found := _WORD_MONTH.fullmatch(text):
+        year = found[3] if len(found[3]) == 4 else f"20{found[3]}"
+        return _written(year, _month(found[2]), found[1], found.groups()[3:7], found[8])
+    return None
+
+
+def _day_first(texts: Sequence[str]) -> bool | None:
+    """Whether the day stands before the month; None where every date can be read both ways."""
+    pairs = [(int(found[1]), int(found[3])) for text in texts if (found := _YEAR_LAST.fullmatch(text))]
+    if any(first > 12 for first, _ in pairs):
+        return True
+    if any(second > 12 for _, second in pairs) or not pairs:
+        return False
+    return None
+
+
+def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None) -> tuple[str, AnyArray, list[str]]:
+    """A column of times in any of the known forms.
+
+    Parameters
+    ----------
+    texts : sequence of str
+    unit : {"s", "ms"}, optional
+        Of numbers, where the head of the column says so and they count from no known origin.
+
+    Returns
+    -------
+    clock : str
+        As :func:`_rows.times` takes it.
+    cells : array, shape (n,)
+        Bytes or floats for it.
+    warnings : list of str
+    """
+    shown = [text.strip().strip('"').strip() for text in texts]
+    some = [text for text in shown if text]
+    if (
+        some
+        and sum(_NUMBER.fullmatch(text) is not None for text in some) * 2 > len(some)
+        and not any(_DIGITS.fullmatch(text) for text in some[:3])
+    ):
+        return _numbers(shown, unit)
+    if some and sum(_OF_DAY.fullmatch(text) is not None for text in some) * 2 > len(some):
+        return _of_day(shown, options)
+    first = _day_first(some)
+    cells = np.array([_dated(text, bool(first)) or b"-" for text in shown] or [b"-"], dtype=np.bytes_)[: len(shown)]
+    warnings = ["the dates can be read with the day or the month first: the month was taken"] if first is None else []
+    return "wall", cells, warnings
+
+
+def _numbers(texts: Sequence[str], unit: str | None) -> tuple[str, FloatArray, list[str]]:
+    """Numbers: epochs by their size, else relative times."""
+    value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
+    middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
+    for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
+        if middle >= 0.9 * scale:
+            return (form, value, []) if form else ("epoch_us", value / 1e3, [])
+    return f"relative_{unit or 's'}", value, []
+
+
+def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
+    """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
+    found = [_OF_DAY.fullmatch(text) for text in texts]
+    seconds = np.array([_seconds(one.groups()) if one else np.nan for one in found], dtype=np.float64)
+    steps = np.diff(seconds, prepend=seconds[:1])
+    seconds = seconds + 86_400.0 * np.cumsum(np.nan_to_num(steps) < -43_200)  # past midnight
+    date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
+    if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
+        return "relative_s", seconds, ["the times have no date and the file name has none either"]
+    day = np.datetime64(date, "us")
+    stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
+    cells = np.array([str(stamp).encode() for stamp in stamps], dtype=np.bytes_)
+    cells = np.where(np.isnan(seconds), b"-", cells)
+    marked = any(one and one.groups()[4] for one in found)
+    warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
+    source = "time_origin" if options.time_origin else "the file name"
+    return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
+
+
+def _seconds(parts: Sequence[str | None]) -> float:
+    hour = int(parts[0] or 0)
+    if parts[3]:
+        hour = hour % 12 + (12 if parts[3].lower() == "pm" else 0)
+    return hour * 3600.0 + int(parts[1] or 0) * 60.0 + float((parts[2] or "0").replace(",", "."))

@@ -1,0 +1,193 @@
+"""Exports of drive-test programs and phones: Nemo, XCAL, TEMS, QualiPoc, G-NetTrack; one table of names for all.
+
+A column is told by its name: the quantity (RSRP, RSRQ, RSSI, SINR, path loss, PCI, ARFCN, CQI, throughput, rank),
+the radio access (LTE, NR) and the role of the cell (serving, or the n-th detected or neighbour). Levels with a PCI
+become one stream per cell, ``lte_pci110`` say, whose column ``serving`` is 1 while that cell served; other
+quantities become streams of kind ``kpi``, RI a rank stream (from one). Positions become the telemetry stream
+``phone``.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, Stream
+
+from . import _cells, _pose, _quantities, _rows, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
+
+_PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
+_ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
+_NEIGHBOUR = re.compile(
+    r"\b(detected|neighbou?rs?|nbr|nb|ncell|n ?\d{1,2}|nrx|nlte\w*|adjacent|top \d{1,2})\b|^n\d?(rsrp|rxrsrp)\b|^nrx"
+)
+_NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss")
+_LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
+_NUMBER = re.compile(r"(?:^| )n?(\d{1,2})(?: |$)")
+_BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss": "pathloss_db"}
+_TOWER_SNR = re.compile(r"snr (lw\d)")
+
+
+def is_header(names: list[str]) -> bool:
+    """Whether names hold a time and a level, ratio or rank."""
+    times = any(re.fullmatch(pattern, name) for pattern in (*_sheet.TIME_NAMES, "date") for name in names)
+    return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
+
+
+def sniff(head: bytes) -> bool:
+    """Whether a header of such names stands in front, and it is none of the narrower formats."""
+    return _sheet.starts(head, is_header) and not any(r.sniff(head) for r in (nemo_csv, quectel_ri, aadm_snr))
+
+
+@dataclass
+class _Cell:
+    """Columns of one place in the table: the serving cell, or the n-th of the others."""
+
+    rat: str
+    serving: bool
+    rsrp: int | None = None
+    pci: int | None = None
+    arfcn: int | None = None
+    beside: dict[str, int] = field(default_factory=dict)
+
+
+def _places(sheet: _sheet.Sheet) -> tuple[list[_Cell], list[int], list[int]]:
+    """Cells of the table, columns of other quantities, columns of rank."""
+    cells: dict[tuple[str, str], _Cell] = {}
+    others, ranks = [], []
+    for i, name in enumerate(sheet.plain):
+        meaning = _quantities.quantity(name)
+        is_pci, is_arfcn = _PCI.search(name) is not None, _ARFCN.search(name) is not None
+        if meaning is None and not is_pci and not is_arfcn:
+            continue
+        if meaning is not None and meaning.kind == "rank":
+            ranks.append(i)
+            continue
+        if meaning is not None and meaning.name not in ("RSRP", *_BESIDE):
+            others.append(i)
+            continue
+        rat = "nr" if _NR.search(name) else "lte" if _LTE.search(name) else ""
+        neighbour = _NEIGHBOUR.search(name) is not None
+        number = _NUMBER.search(re.sub(r"\b[45] ?g\b", "", name))
+        role = f"n{number[1] if number else 0}" if neighbour else "serving"
+        cell = cells.setdefault((rat, role), _Cell(rat, not neighbour))
+        _put(cell, i, meaning, is_pci=is_pci, is_arfcn=is_arfcn, others=others)
+    return _completed(cells, others), others, ranks
+
+
+def _put(
+    cell: _Cell, i: int, meaning: _quantities.Quantity | None, *, is_pci: bool, is_arfcn: bool, others: list[int]
+) -> None:
+    """Column ``i`` to its place; a second column of one quantity is kept as a KPI."""
+    if meaning is None and is_pci:
+        cell.pci = i if cell.pci is None else cell.pci
+    elif meaning is None and is_arfcn:
+        cell.arfcn = i if cell.arfcn is None else cell.arfcn
+    elif meaning is not None and meaning.name == "RSRP" and cell.rsrp is None:
+        cell.rsrp = i
+    elif meaning is not None and meaning.name in _BESIDE and _BESIDE[meaning.name] not in cell.beside:
+        cell.beside[_BESIDE[meaning.name]] = i
+    else:
+        others.append(i)
+
+
+def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
+    """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role."""
+    for (rat, role), cell in list(cells.items()):
+        if cell.rsrp is not None:
+            continue
+        same = [other for (access, place), other in cells.items() if place == role and (not rat or access in ("", rat))]
+        homes = [other for other in same if other.rsrp is not None]
+        if len(homes) == 1:
+            home = homes[0]
+            home.rat = home.rat or rat
+            home.pci = cell.pci if home.pci is None else home.pci
+            home.arfcn = cell.arfcn if home.arfcn is None else home.arfcn
+            others += [column for key, column in cell.beside.items() if key in home.beside]
+            home.beside = {**cell.beside, **home.beside}
+            del cells[(rat, role)]
+    others += [column for cell in cells.values() if cell.rsrp is None for column in cell.beside.values()]
+    return [cell for cell in cells.values() if cell.rsrp is not None]
+
+
+def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> Iterator[_cells.Reading]:
+    for cell in cells:
+        assert cell.rsrp is not None
+        level = sheet.numbers(cell.rsrp)
+        pci = _or_nan(sheet, cell.pci, len(level))
+        arfcn = _or_nan(sheet, cell.arfcn, len(level))
+        beside = [_or_nan(sheet, cell.beside.get(name), len(level)) for name in _cells.BESIDE]
+        for i in np.flatnonzero(np.isfinite(level)).tolist():
+            values = tuple(float(column[i]) for column in beside)
+            yield _cells.Reading(i, cell.rat, float(pci[i]), float(arfcn[i]), float(level[i]), cell.serving, values)
+
+
+def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
+    return np.full(count, np.nan) if column is None else sheet.numbers(column)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Cells, ranks, KPIs and the track of the phone; UsageError if the clock has no zone and none is given."""
+    sheet = _sheet.read(data, is_header)
+    rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
+    if sheet is None or rows is None:
+        return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
+    cells, others, ranks = _places(sheet)
+    streams: list[Stream | None] = [_pose.from_sheet(rows, sheet, name="phone", source="table of a phone")]
+    streams += _cells.streams(rows, _readings(sheet, cells), source="drive test")
+    streams += [_rank(rows, sheet, column) for column in ranks]
+    streams += [_other(rows, sheet, column) for column in [*others, *_alone(sheet, cells)]]
+    return rows.result(_distinct(streams))
+
+
+def _alone(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
+    """Columns beside a level whose values stand in rows of their own, too: Nemo writes one row per event."""
+    found = []
+    for cell in cells:
+        if cell.rsrp is None or not cell.serving:
+            continue
+        silent = np.isnan(sheet.numbers(cell.rsrp))
+        found += [column for column in cell.beside.values() if np.isfinite(sheet.numbers(column)[silent]).any()]
+    return found
+
+
+def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
+    ri = sheet.numbers(column)
+    flag = rows.flag.copy()
+    good = (ri >= 1) & (ri <= 8)
+    values = {"rank": np.where(good & (ri == np.round(ri)), ri, np.nan), "ri_raw": ri}
+    name = re.sub(r"\W+", "_", sheet.plain[column])
+    source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
+    return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base="one", source=source)
+
+
+def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
+    values = sheet.numbers(column)
+    name = sheet.plain[column]
+    if found := _TOWER_SNR.fullmatch(name):
+        return _rows.snr(rows, found[1].upper(), values)
+    return _quantities.stream(rows, name, values, unit=sheet.unit(column), where=np.isfinite(values))
+
+
+def _distinct(streams: list[Stream | None]) -> list[Stream | None]:
+    """Streams by name: of two columns of one name the first is kept."""
+    kept: dict[str, Stream] = {}
+    for stream in streams:
+        if stream is not None:
+            kept.setdefault(stream.name, stream)
+    return list(kept.values())
+
+
+READER = Reader(
+    name="drive_test",
+    title="drive-test export, CSV (Nemo, XCAL, TEMS, QualiPoc, G-NetTrack): cells by PCI, rank, KPIs, positions",
+    kinds=("rss", "rank", "kpi", "telemetry"),
+    sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)",
+    sniff=sniff,
+    read=read,
+)

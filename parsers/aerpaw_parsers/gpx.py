@@ -1,0 +1,82 @@
+"""GPX tracks of phones, loggers and Nemo: ``<trkpt lat lon><ele><time>``.
+
+Read by pattern and not as XML: a parser that resolves entities has no business with a file from elsewhere. Nemo
+Handy writes times of the day without a date (``T14:13:17.853Z``), local in spite of the Z: their date is that of
+the file name. Elevations are brought to heights above the first point.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+
+from . import _lines, _pose, _rows, _stamps
+
+_N = rb"(" + _lines.NUMBER + rb")"
+_POINT = re.compile(rb"<(?:trkpt|wpt|rtept)\b([^<>]{0,200})>(.{0,2000}?)(?:</(?:trkpt|wpt|rtept)>)", re.DOTALL)
+_ATTRIBUTE = re.compile(rb"\b(lat|lon)\s?=\s?[\"']\s?" + _N + rb"\s?[\"']")
+_INSIDE = re.compile(rb"<(ele|time|speed|course)>\s{0,40}([^<>]{1,60}?)\s{0,40}</")
+_START = re.compile(rb"<(?:trkpt|wpt|rtept)\b")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it is a GPX with points."""
+    return re.search(rb"<gpx\b", head[:4096]) is not None and _START.search(head) is not None
+
+
+def _points(data: bytes) -> list[tuple[int, dict[bytes, bytes]]]:
+    """Place and values of each whole point."""
+    found = []
+    for point in _POINT.finditer(data):
+        if _START.search(point[2]):
+            continue  # torn: the next point begins inside
+        values = dict(_ATTRIBUTE.findall(point[1]))
+        values |= dict(_INSIDE.findall(point[2]))
+        found.append((point.start(), values))
+    return found
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Telemetry ``track``; UsageError if the times have no zone and none is given."""
+    lines = _lines.split(data)
+    points = [(at, values) for at, values in _points(data) if {b"lat", b"lon", b"time"} <= set(values)]
+    row = np.searchsorted(lines.starts, np.array([at for at, _ in points], dtype=np.int64), side="right") - 1
+    row, first = np.unique(row, return_index=True)
+    kept = [points[i][1] for i in first.tolist()]
+    clock, time, warnings = _stamps.read([values[b"time"].decode("ascii", "replace") for values in kept], options)
+    column = {
+        name.decode(): np.array([values.get(name, b"") for values in kept] or [b""], dtype=np.bytes_)[: len(kept)]
+        for name in (b"lat", b"lon", b"ele", b"course")
+    }
+    rows = _rows.built(
+        lines, row, {"time": time, **column}, options, reader="gpx", reason=lambda _line: None, clock=clock,
+        extra=_torn(lines, data, row),
+    )  # fmt: skip
+    rows.warnings += warnings
+    if len(points) > len(row):
+        rows.warnings.append(f"{len(points) - len(row)} further points on lines that hold several were not read")
+    values = {"latitude_deg": rows.decimal("lat"), "longitude_deg": rows.decimal("lon")}
+    lost = _pose.clean(rows, values)
+    values["altitude_m"] = _pose.above_takeoff(rows, rows.decimal("ele"), lost)
+    return rows.result([rows.stream("telemetry", "track", values, where=~lost, source="GPX")])
+
+
+def _torn(lines: _lines.Lines, data: bytes, row: object) -> list[RejectedLine]:
+    """Lines on which a point begins that is not whole."""
+    places = np.array([found.start() for found in _START.finditer(data)], dtype=np.int64)
+    begun = np.unique(np.searchsorted(lines.starts, places, side="right") - 1)
+    return lines.reject_all(np.setdiff1d(begun, np.asarray(row)), "a point without position or time (torn?)")
+
+
+READER = Reader(
+    name="gpx",
+    title="GPX track (Nemo, phones, loggers)",
+    kinds=("telemetry",),
+    sample='<trkpt lat="35.7280002" lon="-78.6960001"><ele>76.0</ele><time>2025-01-01T12:00:07Z</time></trkpt>',
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,149 @@
+"""Files that lie beside logs and are none: named, so that a folder's account says what each of its files is.
+
+Each entry is a reader without kinds: its sniffer knows the file, its title says what it is.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.matfile import MAGIC
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _lines, flight_mat, gpx, nemo_kml, vehicle_log
+
+_PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
+_PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
+_POWER_REFS = re.compile(rb"(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
+_UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
+_PLACE = re.compile(rb"\s*-?\d{1,3}\.\d{2,12}, ?-?\d{1,3}\.\d{2,12}\s*")
+_AT = re.compile(rb"(?i)\s*(?:at[+&a-z][^\r\n]{0,200}|\+[A-Z0-9]{2,12}: ?[^\r\n]{0,300}|OK|ERROR|ATI)\s*")
+_NEMO_BINARY = re.compile(rb"(?i)nmfs|nemo file|anite")
+_SCRIPT_TALK = re.compile(rb"\[[-0-9/]{10} [0-9:.]{8,18}\] ")
+
+
+def _texts(head: bytes) -> list[bytes]:
+    return _lines.first_lines(head, 60)
+
+
+def _antenna_text(head: bytes) -> bool:
+    return b"\0" not in head[:400] and _PATTERN.search(head[:400]) is not None
+
+
+def _antenna_mat(head: bytes) -> bool:
+    if not head.startswith(MAGIC) or flight_mat.sniff(head):
+        return False
+    names = flight_mat.names_of(head)
+    return any(_PATTERN_MAT.fullmatch(name) for name in names)
+
+
+def _other_mat(head: bytes) -> bool:
+    return (
+        head.startswith(MAGIC)
+        and not flight_mat.sniff(head)
+        and not _antenna_mat(head)
+        and bool(flight_mat.names_of(head))
+    )
+
+
+def _kml(head: bytes) -> bool:
+    return b"<kml" in head[:2048] and not nemo_kml.sniff(head)
+
+
+def _gpx(head: bytes) -> bool:
+    return re.search(rb"<gpx\b", head[:4096]) is not None and not gpx.sniff(head)
+
+
+def _transcript(head: bytes) -> bool:
+    lines = _texts(head)
+    known = sum(_AT.fullmatch(line) is not None for line in lines)
+    return (
+        b"\0" not in head
+        and 2 * known > len(lines)
+        and any(line.lstrip()[:3].upper() in (b"AT+", b"+QE", b"+QC", b"+QN", b"+CM") for line in lines)
+    )
+
+
+def _nemo_summary(head: bytes) -> bool:
+    lines = _texts(head)
+    return (
+        len(lines) > 3
+        and lines[1].startswith(b"Device ID;")
+        and any(line.startswith(b"Measurement start;") for line in lines)
+    )
+
+
+def _nemo_binary(head: bytes) -> bool:
+    return b"\0" in head and _NEMO_BINARY.search(head[:2048]) is not None
+
+
+def _uhd(head: bytes) -> bool:
+    return (
+        b"\0" not in head
+        and _UHD.search(head) is not None
+        and sum(_UHD.search(line) is not None for line in _texts(head)) >= 2
+    )
+
+
+def _places(head: bytes) -> bool:
+    lines = _texts(head)
+    return 0 < len(lines) < 40 and sum(_PLACE.fullmatch(line) is not None for line in lines) * 2 >= len(lines)
+
+
+def _document(head: bytes) -> bool:
+    lines = _texts(head)
+    return b"\0" not in head and bool(lines) and re.match(rb"(?:\xef\xbb\xbf)?# \w", lines[0]) is not None and any(
+        line.startswith((b"## ", b"| ")) for line in lines
+    )  # fmt: skip
+
+
+def _flight_talk(head: bytes) -> bool:
+    lines = _texts(head)
+    stamped = sum(_SCRIPT_TALK.match(line) is not None for line in lines)
+    marks = (b"[aerpawlib]", b"Waypoint", b"waypoint", b"Taking off", b"Arming", b"arming", b"Landing")
+    return 2 * stamped > len(lines) and any(mark in head for mark in marks) and not vehicle_log.sniff(head)
+
+
+def _yaml(head: bytes) -> bool:
+    return re.search(rb"(?m)^flight: ", head[:4096]) is not None and re.search(rb"(?m)^logs:", head) is not None
+
+
+def _sniffer(test: Callable[[bytes], bool]) -> Callable[[bytes], bool]:
+    return lambda head: bool(head.strip()) and test(head)
+
+
+def _refuse(what: str) -> Callable[[bytes, ReadOptions], ReadResult]:
+    def read(_data: bytes, _options: ReadOptions) -> ReadResult:
+        raise InputError(f"no log: {what}", expected="one of the formats of 'aerpaw-cmp formats'")
+
+    return read
+
+
+_KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
+    ("antenna_pattern", "a measured antenna pattern (for 'antenna: {model: file}' in flight.yaml)", _antenna_text),
+    ("antenna_grid", "antenna gain grids of MATLAB (for 'antenna: {model: gain_grid}' in flight.yaml)", _antenna_mat),
+    ("matlab_other", "MATLAB variables that are no flight", _other_mat),
+    ("power_references", "a table of USRP reference powers", lambda head: _POWER_REFS.match(head) is not None),
+    ("kml_other", "a KML without measurements (a geofence, a map)", _kml),
+    ("gpx_other", "a GPX without points", _gpx),
+    (
+        "at_transcript",
+        "a modem transcript without times (AT answers; 'aerpaw-cmp tap' logs them with times)",
+        _transcript,
+    ),
+    ("nemo_summary", "a Nemo summary of a session (counts and rates, no samples)", _nemo_summary),
+    ("nemo_binary", "a binary Nemo measurement file (.nmfs: export it as CSV with Nemo's own tools)", _nemo_binary),
+    ("uhd_console", "the console of a USRP program, without samples", _uhd),
+    ("positions", "a list of positions without times", _places),
+    ("document", "a page of text", _document),
+    ("flight_script", "the console of a flight script, without positions", _flight_talk),
+    ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),
+)
+
+READERS: tuple[Reader, ...] = tuple(
+    Reader(name=name, title=what, kinds=(), sample="", sniff=_sniffer(test), read=_refuse(what))
+    for name, what, test in _KINDS
+)

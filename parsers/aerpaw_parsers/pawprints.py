@@ -1,0 +1,104 @@
+"""PawPrints, AERPAW's logger of an Android phone: JSON lines with LTE and NR cells.
+
+``companion_abs_time`` (ms of UTC, the clock of the aircraft's computer) is the time; where a line lacks it,
+``abs_time``, the phone's own. A cell's level is its RSRP; 2147483647 and ``Unavailable`` mean that there is none.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, Stream
+
+from . import _cells, _json, _lines, _pose, _rows
+
+_MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
+
+
+def sniff(head: bytes) -> bool:
+    """Whether the first line is an object with a phone's cells and times."""
+    first = head.split(b"\n", 1)[0]
+    return (
+        head.lstrip(b"\xef\xbb\xbf[ \r\n").startswith(b"{")
+        and b'"abs_time"' in first
+        and any(m in first for m in _MARKS)
+    )
+
+
+def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading:
+    rat = "nr" if "NR" in str(cell.get("technology")) or "5G" in str(cell.get("technology")) else "lte"
+    pci = _json.number(cell.get("pci"))
+    level, quality, ratio = (
+        next((v for key in keys if np.isfinite(v := _json.number(cell.get(key)))), np.nan)
+        for keys in (("rsrp", "ss_rsrp"), ("rsrq", "ss_rsrq"), ("rssnr", "ss_sinr", "sinr"))
+    )
+    serving = str(cell.get("is_connected")).lower() == "true" or (rat == "lte" and pci == connected)
+    arfcn = next((v for key in ("earfcn", "nrarfcn", "arfcn") if np.isfinite(v := _json.number(cell.get(key)))), np.nan)
+    return _cells.Reading(
+        row, rat, pci, arfcn, level, serving, (quality, _json.number(cell.get("rssi")), ratio, np.nan)
+    )
+
+
+def _readings(found: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
+    for i, one in enumerate(found):
+        for cell in _json.listed(one, "cells"):
+            yield _reading(i, cell, _json.number(one.get("connected_pci")))
+
+
+def _nr(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
+    """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
+    legs = [_json.inside(one, "nr_signal_strength") for one in found]
+    level = _json.column(legs, "ss_rsrp")
+    if not np.isfinite(level).any():
+        return None
+    known = np.isfinite(level)
+    shown, flag = rows.level(level)
+    values = {"rss_db": shown, "rsrq_db": _json.column(legs, "ss_rsrq"), "sinr_db": _json.column(legs, "ss_sinr")}
+    return rows.stream(
+        "rss", "nr_ss_rsrp", values, where=known, flag=flag, channel=rows.options.channel or "nr_ss_rsrp",
+        unit="dBm", quantity="RSRP", rat="nr",
+    )  # fmt: skip
+
+
+def _track(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
+    """Positions, in the object itself or in its ``location``."""
+    places = [{**_json.inside(one, "gps"), **_json.inside(one, "location"), **one} for one in found]
+    values = {
+        "latitude_deg": _json.column(places, "latitude", "lat"),
+        "longitude_deg": _json.column(places, "longitude", "lon", "lng"),
+    }
+    if not np.isfinite(values["latitude_deg"]).any():
+        return None
+    lost = _pose.clean(rows, values)
+    values["altitude_m"] = _pose.above_takeoff(rows, _json.column(places, "altitude", "alt"), lost)
+    return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location")
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """A level stream per LTE or NR cell, the level of the NR leg, and the phone's track where it is logged."""
+    lines = _lines.split(data)
+    row, found, rejected = _json.objects(lines)
+    time = _json.column(found, "companion_abs_time", "abs_time")
+    rows = _rows.built(
+        lines, row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms", extra=rejected
+    )
+    kept = [found[i] for i in rows.at.tolist()]
+    if any("companion_abs_time" not in one for one in kept):
+        rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
+    return rows.result(
+        [_track(rows, kept), *_cells.streams(rows, _readings(kept), source="PawPrints"), _nr(rows, kept)]
+    )
+
+
+READER = Reader(
+    name="pawprints",
+    title="PawPrints (AERPAW's Android logger), JSON lines: LTE and NR cells",
+    kinds=("rss", "telemetry"),
+    sample='{"abs_time": 1740927600000, "connected_pci": 2, "cells": [{"technology": "4G_LTE", "rsrp": -6, "pci": 2}]}',
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,53 @@
+"""Positions and attitude as CSV with named columns: converted vehicleOut, ArduPilot exports, DJI and AirData records.
+
+Columns come in any order; units in brackets (``[ft]``, ``[MPH]``) are converted; altitudes above sea level are
+brought to heights above the first position. Times without a zone are local unless the column's name says UTC or GPS.
+"""
+
+from __future__ import annotations
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _pose, _quantities, _sheet, nemo_csv, quectel_ri, vehicle_out
+
+
+def is_header(names: list[str]) -> bool:
+    """Whether names hold a position and a time, and no quantity of a radio."""
+    return _pose.has_position(names) and _has_time(names) and not any(has_radio(name) for name in names)
+
+
+def has_radio(name: str) -> bool:
+    """Whether a plain name is that of a level or rank."""
+    meaning = _quantities.quantity(name)
+    return meaning is not None and (meaning.kind in ("rss", "rank") or meaning.name in ("SINR", "RSRQ"))
+
+
+def _has_time(names: list[str]) -> bool:
+    from re import fullmatch
+
+    return any(fullmatch(pattern, name) for pattern in _sheet.TIME_NAMES for name in names)
+
+
+def sniff(head: bytes) -> bool:
+    """Whether a header with position and time stands in front, and it is not AERPAW's own layout."""
+    return _sheet.starts(head, is_header) and not any(r.sniff(head) for r in (vehicle_out, nemo_csv, quectel_ri))
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Telemetry ``vehicle``; UsageError if the clock has no zone and none is given."""
+    sheet = _sheet.read(data, is_header)
+    rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
+    if sheet is None or rows is None:
+        return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
+    return rows.result([_pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")])
+
+
+READER = Reader(
+    name="pose_csv",
+    title="positions and attitude, CSV with named columns (converted vehicleOut, ArduPilot export, DJI, AirData)",
+    kinds=("telemetry",),
+    sample="timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw",
+    sniff=sniff,
+    read=read,
+)

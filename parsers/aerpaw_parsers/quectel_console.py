@@ -1,0 +1,102 @@
+"""Console of AERPAW's Quectel logger: tables drawn with ``+----+`` and ``|``, each behind a line with its time.
+
+Rows ``| 0 | +QENG: "LTE" | ... |`` give the LTE cell, ``NR5G-NSA`` (RSRP, SINR, RSRQ) and ``NR5G-SA`` (RSRP, RSRQ,
+SINR) the NR cell, ``+QNWCFG: "nr5g_csi"`` the rank (from one; 0 means no CSI). Times are local; a row's time is
+that of its table.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+
+from . import _cells, _lines, _rows, _time
+
+_STAMP = re.compile(rb"^(" + _time.TIME + rb")")
+_ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')
+_HEADER = re.compile(rb"\|\s*\|\s*(LTE|NR5G-NSA|NR5G-SA|servingcell)\s*\|(.*)\|\s*$")
+_CSI = ("lte_csi", "nr5g_csi")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether tables of AT answers stand in it."""
+    return b"|----+" in head and re.search(rb'\|\s*\d+\s*\|\s*"?\+Q(ENG|NWCFG):', head) is not None
+
+
+def _number(cell: bytes) -> float:
+    text = cell.strip().strip(b'"')
+    value = float(text) if re.fullmatch(rb"[-+]?\d{1,9}(\.\d{1,6})?", text) else np.nan
+    return np.nan if value in (-32768, -3276, 65535) else value
+
+
+def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, float]]], list[RejectedLine]]:
+    """Line, time, title and named values of each row that holds a level or a CSI."""
+    time = b""
+    names: dict[bytes, list[str]] = {}
+    found, rejected = [], []
+    for i in range(len(lines)):
+        line = lines.raw(i)
+        if stamp := _STAMP.match(line):
+            time = stamp[1]
+        if header := _HEADER.search(line):
+            names[header[1]] = [cell.decode("ascii", "replace").strip() for cell in header[2].split(b"|")]
+        row = _ROW.search(line)
+        if row is None:
+            continue
+        title, cells = row[2], row[3].split(b"|")
+        heads = ["mcs", "ri", "cqi", "pmi"] if title.decode("ascii", "replace") in _CSI else names.get(title)
+        if heads is None:
+            continue  # neighbours, operators: no record is made of them
+        if not time or len(cells) != len(heads):
+            rejected.append(lines.reject(i, "a table row without a time, or of another width than its head (torn?)"))
+            continue
+        found.append((i, time, title.decode("ascii"), dict(zip(heads, map(_number, cells), strict=True))))
+    return found, rejected
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
+    lines = _lines.split(data)
+    found, rejected = _tables(lines)
+    row = np.array([one[0] for one in found], dtype=np.int64)
+    time = np.array([one[1] for one in found] or [b""], dtype=np.bytes_)[: len(found)]
+    rows = _rows.built(
+        lines, row, {"time": time}, options, reader="quectel_console", reason=lambda _line: None, extra=rejected
+    )
+    kept = [found[i] for i in rows.at.tolist()]
+    readings = [
+        _cells.Reading(
+            i, "lte" if title == "LTE" else "nr", value.get("PCID", np.nan),
+            value.get("earfcn", value.get("ARFCN", np.nan)),
+            value.get("RSRP", np.nan), True,
+            (value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
+        )
+        for i, (_, _, title, value) in enumerate(kept) if "RSRP" in value
+    ]  # fmt: skip
+    ranks = [_rank(rows, name, [(one[2], one[3]) for one in kept]) for name in _CSI]
+    return rows.result([*ranks, *_cells.streams(rows, readings, source="Quectel console")])
+
+
+def _rank(rows: _rows.Rows, name: str, values: list[tuple[str, dict[str, float]]]) -> Stream | None:
+    where = np.array([title == name for title, _ in values], dtype=bool)
+    column = {key: np.array([value.get(key, np.nan) for _, value in values]) for key in ("ri", "cqi", "mcs")}
+    ri = column["ri"]
+    good = (ri >= 1) & (ri <= 8)
+    flag = rows.flag.copy()
+    _lines.add_flag(flag, where & ~good, "no_csi")
+    content = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": column["cqi"], "mcs": column["mcs"]}
+    return rows.stream("rank", name, content, where=where, flag=flag, channel=name, ri_base="one", source="CSI report")
+
+
+READER = Reader(
+    name="quectel_console",
+    title="console of AERPAW's Quectel logger (drawn tables)",
+    kinds=("rss", "rank"),
+    sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |',
+    sniff=sniff,
+    read=read,
+)

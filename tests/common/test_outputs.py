@@ -1,0 +1,333 @@
+"""Outputs replace no input and nothing of others, and are whole."""
+
+from __future__ import annotations
+
+import errno
+import os
+import shutil
+import subprocess
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.common import outputs
+from aerpaw_cmp.common.errors import OutputError, UsageError
+from aerpaw_cmp.common.outputs import SUMS, OutputFile, OutputFolder, OutputSet, is_sealed, sealed
+
+
+def write_file(target: Path, text: str = "new\n", **keys: object) -> None:
+    with OutputFile(target, own=is_sealed, **keys) as output:  # type: ignore[arg-type]
+        output.write(sealed(text))
+
+
+def write_folder(target: Path, files: dict[str, str], **keys: object) -> None:
+    with OutputFolder(target, job="test", **keys) as output, output.filling() as folder:  # type: ignore[arg-type]
+        for name, text in files.items():
+            (folder / name).parent.mkdir(exist_ok=True)
+            (folder / name).write_text(text)
+
+
+def content(folder: Path) -> dict[str, bytes]:
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*") if p.is_file()}
+
+
+# --- one file ---------------------------------------------------------------------------------------------------------
+
+
+def linked(real: Path, name: Path) -> Path:
+    name.symlink_to(real)
+    return name
+
+
+def hard_linked(real: Path, name: Path) -> Path:
+    name.hardlink_to(real)
+    return name
+
+
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", [lambda real, _: real, linked, hard_linked])
+def test_an_input_is_never_replaced(tmp_path: Path, name: Callable[[Path, Path], Path], force: bool) -> None:
+    log = tmp_path / "log.txt"
+    log.write_text("raw")
+    target = name(log, tmp_path / "other")
+    with pytest.raises(UsageError, match="would replace an input"):
+        write_file(target, inputs=[log], force=force)
+    with pytest.raises(UsageError, match="would replace an input"):
+        write_file(target, inputs=[tmp_path], force=force)  # a folder that holds it
+    assert log.read_text() == "raw"
+    assert not list(tmp_path.glob(".*"))
+
+
+def test_files_of_others_need_force_and_own_ones_do_not(tmp_path: Path) -> None:
+    target = tmp_path / "site.yaml"
+    target.write_text("mine: 1\n")
+    with pytest.raises(UsageError, match="--force"):
+        write_file(target)
+    assert target.read_text() == "mine: 1\n"
+    write_file(target, "a: 1\n", force=True)
+    write_file(target, "a: 2\n")
+    assert target.read_bytes() == sealed("a: 2\n")
+    target.write_bytes(target.read_bytes() + b"b: 3\n")  # edited: no longer as it was written
+    with pytest.raises(UsageError, match="not an unchanged output"):
+        write_file(target)
+
+
+def test_a_link_stays_and_its_file_is_written(tmp_path: Path) -> None:
+    (tmp_path / "real").mkdir()
+    (tmp_path / "link").symlink_to(tmp_path / "real" / "a.yaml")
+    write_file(tmp_path / "link")
+    write_file(tmp_path / "link", "again\n")
+    assert (tmp_path / "link").is_symlink()
+    assert (tmp_path / "real" / "a.yaml").read_bytes() == sealed("again\n")
+
+
+def test_no_ordinary_file_is_replaced(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "pipe")
+    for target in (tmp_path / "pipe", tmp_path, Path(os.devnull)):
+        with pytest.raises(UsageError, match="no ordinary file"):
+            write_file(target, force=True)
+    with pytest.raises(UsageError, match="no such folder"):
+        write_file(tmp_path / "none" / "a")
+
+
+def test_what_comes_while_the_command_runs_is_not_replaced(tmp_path: Path) -> None:
+    target = tmp_path / "a.yaml"
+    with OutputFile(target, own=is_sealed) as output:
+        target.write_text("mine")
+        with pytest.raises(UsageError, match="--force"):
+            output.write(sealed("a"))
+    assert content(tmp_path) == {"a.yaml": b"mine"}
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "set"])
+def test_two_runs_into_one_place(tmp_path: Path, kind: str) -> None:
+    def output() -> OutputFile | OutputFolder | OutputSet:
+        if kind == "file":
+            return OutputFile(tmp_path / "a", own=is_sealed)
+        if kind == "folder":
+            return OutputFolder(tmp_path / "a", job="test")
+        return OutputSet(tmp_path / "a", listing="truth.json", names=["log"])
+
+    with output(), pytest.raises(UsageError, match="another run is writing here"), output():
+        pass
+    with output():
+        pass
+    assert list(tmp_path.iterdir()) == []
+
+
+# --- a folder ---------------------------------------------------------------------------------------------------------
+
+
+def test_a_folder_is_replaced_as_a_whole_and_can_be_checked(tmp_path: Path) -> None:
+    target = tmp_path / "deep" / "report"
+    write_folder(target, {"a.html": "1", "figures/old.svg": "1"})
+    write_folder(target, {"a.html": "2", "figures/new.svg": "2"})
+    assert set(content(target)) == {"a.html", "figures/new.svg", SUMS}
+    assert [p.name for p in target.parent.iterdir()] == ["report"]
+    done = subprocess.run(["sha256sum", "-c", "--strict", SUMS], cwd=target, capture_output=True, check=False)
+    assert done.returncode == 0, done
+
+
+def test_files_of_others_stay_in_the_folder(tmp_path: Path) -> None:
+    target = tmp_path / "report"
+    write_folder(target, {"a.html": "1"})
+    (target / "notes" / "empty").mkdir(parents=True)
+    (target / "notes" / "mine.txt").write_text("mine")
+    (target / "link").symlink_to("nowhere")
+    inode = (target / "notes" / "mine.txt").stat().st_ino
+    write_folder(target, {"a.html": "2", "b.html": "2"})
+    assert content(target).keys() == {"a.html", "b.html", "notes/mine.txt", SUMS}
+    assert (target / "notes" / "mine.txt").stat().st_ino == inode
+    assert (target / "notes" / "empty").is_dir()
+    assert (target / "link").readlink() == Path("nowhere")
+    with pytest.raises(UsageError, match="a result has the same name"):
+        write_folder(target, {"notes/mine.txt": "3"})
+    assert (target / "notes" / "mine.txt").read_text() == "mine"
+    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+
+
+def test_a_folder_of_others_needs_force_and_keeps_their_files(tmp_path: Path) -> None:
+    target = tmp_path / "home"
+    target.mkdir()
+    write_folder(target, {"a.html": "0"})  # an empty folder is free
+    shutil.rmtree(target)
+    target.mkdir()
+    (target / "thesis.tex").write_text("mine")
+    with pytest.raises(UsageError, match=r"did not write, thesis\.tex"):
+        write_folder(target, {"a.html": "1"})
+    assert content(target) == {"thesis.tex": b"mine"}
+    write_folder(target, {"a.html": "1"}, force=True)
+    assert content(target).keys() == {"a.html", "thesis.tex", SUMS}
+
+
+def test_a_changed_result_needs_force(tmp_path: Path) -> None:
+    target = tmp_path / "report"
+    write_folder(target, {"rss.csv": "1"})
+    (target / "rss.csv").write_text("edited")
+    with pytest.raises(UsageError, match=r"rss\.csv was changed"):
+        write_folder(target, {"rss.csv": "2"})
+    assert (target / "rss.csv").read_text() == "edited"
+    write_folder(target, {"rss.csv": "2"}, force=True)
+    assert (target / "rss.csv").read_text() == "2"
+    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+
+
+def test_a_folder_with_an_input_is_refused(tmp_path: Path) -> None:
+    target = tmp_path / "flight"
+    target.mkdir()
+    log = target / "log.txt"
+    log.write_text("raw")
+    (tmp_path / "hard").hardlink_to(log)
+    (tmp_path / "soft").symlink_to(log)
+    for path in (log, tmp_path / "hard", tmp_path / "soft"):
+        with pytest.raises(UsageError, match="input"):
+            write_folder(target, {"log.txt": "result"}, inputs=[path], force=True)
+    assert content(target) == {"log.txt": b"raw"}
+
+
+def test_folders_that_cannot_be_exchanged_are_told_first(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "here" / "below").mkdir(parents=True)
+    monkeypatch.chdir(tmp_path / "here" / "below")
+    for name in (".", "..", "/"):
+        with pytest.raises(UsageError, match="a folder inside it"), OutputFolder(Path(name), job="report"):
+            pass
+    (tmp_path / "file").write_text("")
+    for name in ("file", "file/report", "x" * 300):
+        with pytest.raises(UsageError), OutputFolder(tmp_path / name, job="report"):
+            pass
+
+
+def test_a_failure_leaves_the_old_set_and_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "new" / "report"
+    fail = lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device"))  # noqa: E731
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", fail)
+        with pytest.raises(OutputError, match=r"No space left.*free some space"):
+            write_folder(target, {"a": "1"})
+    assert list(tmp_path.iterdir()) == []
+    write_folder(target, {"a": "1"})
+    before = content(target)
+    with monkeypatch.context() as patched:
+        patched.setattr("os.fsync", fail)
+        with pytest.raises(OutputError):
+            write_folder(target, {"a": "2"})
+    with pytest.raises(TypeError):
+        write_folder(target, {"a": "3", "b": 3})  # type: ignore[dict-item]  # a fault while it is filled
+    assert content(target) == before
+    assert [p.name for p in target.parent.iterdir()] == ["report"]
+
+
+def test_a_folder_removed_on_the_way(tmp_path: Path) -> None:
+    target = tmp_path / "reports" / "a"
+
+    def remove_and_write() -> None:
+        with OutputFolder(target, job="test") as output:
+            shutil.rmtree(target.parent)
+            with output.filling() as folder:
+                (folder / "a").write_text("1")
+
+    with pytest.raises(OutputError, match="was removed while the run"):
+        remove_and_write()
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("step", range(3))
+def test_two_renames_where_the_system_cannot_exchange(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: int
+) -> None:
+    """Killed before, between and after the two renames: the old set or the new one, at the next run at the latest."""
+    monkeypatch.setattr(outputs, "_renamed_both", lambda *_: False)
+    target = tmp_path / "report"
+    write_folder(target, {"a": "1"})
+    (target / "mine").write_text("mine")
+    rename, calls = Path.rename, []
+
+    def killed(self: Path, to: Path) -> Path:
+        if len(calls) == step:
+            os._exit(9)
+        calls.append(to)
+        return rename(self, to)
+
+    child = os.fork()
+    if child == 0:
+        try:
+            monkeypatch.setattr(Path, "rename", killed)
+            write_folder(target, {"a": "2"})
+        finally:
+            os._exit(0)
+    assert os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]) == 9
+    with OutputFolder(target, job="test"):  # any next run mends
+        found = content(target)
+    assert found["a"] == (b"2" if step == 2 else b"1")
+    assert found["mine"] == b"mine"
+    assert set(found) == {"a", "mine", SUMS}
+    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+
+
+# --- a set ------------------------------------------------------------------------------------------------------------
+
+
+def write_set(folder: Path, files: dict[str, str], **keys: object) -> None:
+    with OutputSet(folder, listing="truth.json", names=list(files), **keys) as output:  # type: ignore[arg-type]
+        output.write({name: text.encode() for name, text in files.items()}, {"synthetic": True})
+
+
+def test_a_set_replaces_what_its_list_names(tmp_path: Path) -> None:
+    write_set(tmp_path / "logs", {"LW1/a.txt": "1", "b.txt": "1"})
+    write_set(tmp_path / "logs", {"LW1/a.txt": "2"})
+    assert set(content(tmp_path / "logs")) == {"LW1/a.txt", "b.txt", "truth.json"}  # b.txt: another flight's
+    write_set(tmp_path / "logs", {"b.txt": "2"})
+    (tmp_path / "logs" / "c.txt").write_text("raw")
+    for name in ("c.txt", "LW1/a.txt"):
+        (tmp_path / "logs" / name).write_text("raw")
+        with pytest.raises(UsageError, match="not marked as synthetic"):
+            write_set(tmp_path / "logs", {name: "3"})
+        assert (tmp_path / "logs" / name).read_text() == "raw"
+    write_set(tmp_path / "logs", {"c.txt": "3"}, force=True)
+    assert content(tmp_path / "logs")["LW1/a.txt"] == b"raw"  # not in the new set, and not ours
+    with pytest.raises(UsageError, match="replace an input"):
+        write_set(tmp_path / "logs", {"c.txt": "4"}, inputs=[tmp_path / "logs" / "c.txt"], force=True)
+
+
+_calls: list[Path] = []
+
+
+def dies_after(step: int, do: Callable[..., object]) -> Callable[..., object]:
+    """A method of Path that ends the process once as many calls of such methods were made."""
+
+    def counted(self: Path, *args: object, **keys: object) -> object:
+        if len(_calls) == step:
+            os._exit(9)
+        _calls.append(self)
+        return do(self, *args, **keys)
+
+    return counted
+
+
+def test_a_set_killed_at_every_step_is_of_one_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    folder, step = tmp_path / "logs", 0
+    old, new = {"a": "old a", "b": "old b", "c": "old c"}, {"a": "new a", "b": "new b", "c": "new c", "d": "new d"}
+    while True:
+        shutil.rmtree(folder, ignore_errors=True)
+        write_set(folder, old)
+        child = os.fork()
+        if child == 0:
+            try:
+                for name in ("unlink", "replace", "rename"):
+                    monkeypatch.setattr(Path, name, dies_after(step, getattr(Path, name)))
+                write_set(folder, new)
+            finally:
+                os._exit(0)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        seen = {name: text for name, text in content(folder).items() if "aerpaw" not in name and name != "truth.json"}
+        words = {text.split()[0] for text in seen.values()}
+        assert len(words) <= 1, (step, seen)
+        if "truth.json" in content(folder):  # then the set is whole
+            assert set(seen) == (set(old) if words == {b"old"} else set(new)), step
+        write_set(folder, new)
+        assert set(content(folder)) == {*new, "truth.json"}, step
+        if code == 0:
+            break
+        step += 1
+    assert step > 6

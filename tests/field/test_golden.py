@@ -1,0 +1,51 @@
+"""Every file of the field data: its reader and counts, or what it is instead of a log.
+
+``golden.csv`` holds a line per file: path, reader, lines, accepted, rejected, number of streams and of their rows;
+for a file that is none, ``no log`` and what it is. The counts of the text logs were taken by other means too (grep,
+SciPy).
+"""
+
+from __future__ import annotations
+
+import csv
+import os
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.logs.ingest import Ingested, ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+
+ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
+pytestmark = [
+    pytest.mark.field,
+    pytest.mark.skipif(not Path(ROOT).is_dir() or not ROOT, reason="AERPAW_CMP_FIELD_DATA is not set"),
+]
+TABLE = list(csv.reader((Path(__file__).parent / "golden.csv").read_text().splitlines()))[1:]
+
+
+def rows_of(found: Ingested) -> dict[str, list[str]]:
+    rows = {}
+    for file in found:
+        result = file.result
+        counts = (result.lines, result.accepted, len(result.rejected), len(result.streams))
+        total = sum(len(one.frame) for one in result.streams)
+        rows[os.path.relpath(file.path, ROOT)] = [result.reader, *map(str, (*counts, total))]
+    for left in found.skipped:
+        rows[os.path.relpath(left.path, ROOT)] = ["no log", left.reason.removeprefix("no log: ")]
+    return rows
+
+
+@pytest.fixture(scope="module")
+def found() -> dict[str, list[str]]:
+    return rows_of(ingest(ROOT, options=ReadOptions(timezone="America/New_York")))
+
+
+def test_no_file_is_left_without_a_word(found: dict[str, list[str]]) -> None:
+    assert set(found) == {row[0] for row in TABLE}
+    assert not any("no reader knows" in row[-1] for row in found.values())
+
+
+@pytest.mark.parametrize("row", TABLE, ids=[row[0] for row in TABLE])
+def test_golden_counts(found: dict[str, list[str]], row: list[str]) -> None:
+    assert found[row[0]] == [cell for cell in row[1:] if cell]

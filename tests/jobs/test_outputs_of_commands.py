@@ -1,0 +1,194 @@
+"""What the commands write: inputs stay, others' files stay, sets are of one run, a bad ``-o`` is told first."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+ZONE = ["--timezone", "America/New_York"]
+MAP = {
+    "type": "FeatureCollection",
+    "features": [
+        {
+            "type": "Feature",
+            "properties": {"building": "yes"},
+            "geometry": {
+                "type": "Polygon",
+                "coordinates": [[[-78.7, 35.727], [-78.6999, 35.727], [-78.6999, 35.7271], [-78.7, 35.727]]],
+            },
+        }
+    ],
+}
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = (path for path in folder.rglob("*") if path.is_file())
+    return {path.relative_to(folder).as_posix(): hashlib.sha256(path.read_bytes()).hexdigest() for path in files}
+
+
+@pytest.fixture
+def logs(tmp_path: Path) -> Path:
+    """The sample logs, as if they were real: nothing says that they are synthetic."""
+    shutil.copytree(SAMPLE, tmp_path / "logs", ignore=shutil.ignore_patterns("truth.json"))
+    return tmp_path / "logs"
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, *arguments: str | Path, code: int = 2) -> str:
+    """Run a command that must fail with one message and leave every file below ``folder`` as it was."""
+    before = digests(folder)
+    assert main([str(a) for a in arguments]) == code
+    error = [line for line in capsys.readouterr().err.splitlines() if line.startswith("aerpaw-cmp: ")]
+    assert len(error) == 1, error
+    assert digests(folder) == before
+    return error[0]
+
+
+@pytest.mark.parametrize("force", [[], ["--force"]])
+def test_ingest_never_replaces_a_log(logs: Path, capsys: pytest.CaptureFixture[str], force: list[str]) -> None:
+    log = next(logs.glob("UAV/*vehicleOut.txt"))
+    (logs.parent / "soft").symlink_to(log)
+    (logs.parent / "hard").hardlink_to(log)
+    for target in (log, logs.parent / "soft", logs.parent / "hard"):
+        for option in ("-o", "--draft"):
+            said = refused(capsys, logs.parent, "ingest", log, *ZONE, option, target, *force)
+            assert "would replace an input" in said
+    other = next(logs.glob("LW1/USRP1*"))
+    assert "would replace an input" in refused(capsys, logs.parent, "ingest", log, other, *ZONE, "-o", other, *force)
+    assert "would replace an input" in refused(capsys, logs.parent, "ingest", logs, *ZONE, "-o", other, *force)
+
+
+def test_ingest_replaces_its_own_flight_file_only(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    log, target = next(logs.glob("UAV/*vehicleOut.txt")), logs / "flight.h5"
+    target.write_text("my notes")
+    assert "--force" in refused(capsys, logs, "ingest", log, *ZONE, "-o", target)
+    assert main(["ingest", str(log), *ZONE, "-o", str(target), "--force"]) == 0
+    assert main(["ingest", str(logs), *ZONE, "-o", str(target)]) == 0  # in the folder of its logs
+    both = str(logs.parent / "both")
+    assert "two names" in refused(capsys, logs.parent, "ingest", logs, *ZONE, "-o", both, "--draft", both)
+
+
+def test_site_import_never_replaces_the_map(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    place, site = tmp_path / "g.json", tmp_path / "site.yaml"
+    place.write_text(json.dumps(MAP))
+    assert "would replace an input" in refused(capsys, tmp_path, "site", "import", place, "-o", place, "--force")
+    assert main(["site", "import", str(place), "-o", str(site)]) == 0
+    assert main(["site", "import", str(place), "-o", str(site)]) == 0
+    assert "input" in refused(capsys, tmp_path, "site", "import", place, "--base", site, "-o", site, "--force")
+    site.write_text(site.read_text() + "# checked by me\n")
+    assert "--force" in refused(capsys, tmp_path, "site", "import", place, "-o", site)
+
+
+def test_simulate_writes_over_no_log_that_is_not_marked_synthetic(
+    logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    said = refused(capsys, logs, "simulate", logs / "flight.yaml")
+    assert "not marked as synthetic" in said
+    out = logs.parent / "out"
+    assert main(["simulate", str(logs / "flight.yaml"), "-o", str(out)]) == 0
+    assert main(["simulate", str(logs / "flight.yaml"), "-o", str(out)]) == 0
+    log = next(out.glob("UAV/*vehicleOut.txt"))
+    log.write_bytes(log.read_bytes() + b"\n")
+    assert "not marked as synthetic" in refused(capsys, out, "simulate", logs / "flight.yaml", "-o", out)
+    said = refused(capsys, logs, "simulate", logs / "flight.yaml", "-o", logs)
+    assert "not marked as synthetic" in said
+
+
+def test_simulate_writes_nothing_outside_its_folder(logs: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    text = (logs / "flight.yaml").read_text()
+    log = next(logs.glob("LW1/USRP1*")).relative_to(logs).as_posix()
+    for name in (f"../{log}", str(logs / log)):
+        (logs / "away.yaml").write_text(text.replace(log, name))
+        said = refused(capsys, logs.parent, "simulate", logs / "away.yaml", "-o", logs.parent / "out", "--force")
+        assert "outside" in said
+
+
+@pytest.fixture
+def commands(logs: Path) -> dict[str, list[str]]:
+    """Every command that writes a folder; the folder follows."""
+    (logs / "campaign.yaml").write_text("campaign: c\nflights: [flight.yaml]\n")
+    site = logs.parent / "site.yaml"
+    place = logs.parent / "g.json"
+    place.write_text(json.dumps(MAP))
+    assert main(["site", "import", str(place), "-o", str(site)]) == 0
+    return {
+        "report": ["report", str(logs / "flight.yaml"), "--audit", "none"],
+        "campaign": ["campaign", str(logs / "campaign.yaml")],
+        "map": ["map", str(site), "--quick"],
+        "site show": ["site", "show", str(site)],
+    }
+
+
+@pytest.mark.parametrize("job", ["report", "campaign", "map", "site show"])
+def test_a_bad_folder_is_told_before_the_computation(
+    job: str, logs: Path, commands: dict[str, Any], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def never(*_: Any, **__: Any) -> None:
+        raise AssertionError("the computation began")
+
+    for name in ("flight.data.gather", "jobs.campaign.run", "jobs.coverage_map.make_maps", "report.site_view.plan"):
+        monkeypatch.setattr(f"aerpaw_cmp.{name}", never)
+    command = commands[job]
+    taken, mine = logs.parent / "taken", logs.parent / "mine"
+    taken.write_text("a file")
+    mine.mkdir()
+    (mine / "thesis.tex").write_text("mine")
+    capsys.readouterr()
+    for target, said in (
+        (taken, "in the way"),
+        (taken / "below", "in the way"),
+        (mine, "did not write"),
+        (Path.cwd(), "a folder inside it"),
+        (Path(command[1 if job != "site show" else 2]).parent, "input"),
+    ):
+        assert said in refused(capsys, logs.parent, *command, "-o", target)
+    monkeypatch.undo()
+
+
+def tiny_flight(folder: Path) -> Path:
+    """Eight seconds of flight, one log of levels, one of ranks: a report of a few seconds."""
+    content = yaml.safe_load((SAMPLE / "flight.yaml").read_text())
+    content["flight"]["plan"] |= {
+        "waypoints": [{"east_m": -40, "north_m": 10, "height_m": 40}, {"east_m": 40, "north_m": 10, "height_m": 40}],
+        "bad_lines": 0,
+        "clock_shift_s": {},
+    }
+    content["logs"] = [
+        log for log in content["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")
+    ]
+    content |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off", "bootstrap": 20}}
+    (folder / "flight.yaml").write_text(yaml.safe_dump(content))
+    assert main(["simulate", str(folder / "flight.yaml")]) == 0
+    return folder / "flight.yaml"
+
+
+def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """An error inside the writing leaves the old set whole."""
+    from aerpaw_cmp.report import figures, html
+
+    plates = figures.plates
+    monkeypatch.setattr(figures, "plates", lambda data: plates(data)[:2])  # drawing is the slow part
+    out = tmp_path / "reports" / "r"
+    command = ["report", str(tiny_flight(tmp_path)), "-o", str(out)]
+    assert main(command) == 0
+    before = digests(out)
+    assert set(read_sums(out) or ()) == set(before) - {SUMS}
+    assert changed_files(out) == []
+
+    def fail(*_: Any) -> str:
+        raise OSError(5, "Input/output error")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(html, "page", fail)  # the last file of the set
+        assert main(command) == 3
+    assert digests(out) == before
+    assert [path.name for path in out.parent.iterdir()] == ["r"]

@@ -1,0 +1,227 @@
+"""Phones, drive tests, tables of positions and consoles: what each value means."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_parsers import _quantities, _stamps
+from tests.parsers import samples
+from tests.parsers.samples import OPTIONS
+
+PLAIN = ReadOptions(timezone="America/New_York")
+
+
+def read(reader: str, data: bytes, options: ReadOptions = PLAIN) -> ReadResult:
+    return by_name(reader).read(data, options)
+
+
+def stream(result: ReadResult, name: str) -> Stream:
+    return next(one for one in result.streams if one.name == name)
+
+
+def test_pawprints_cells_and_who_serves() -> None:
+    result = read("pawprints", samples.PAWPRINTS)
+    one, two = stream(result, "lte_pci1"), stream(result, "lte_pci2")
+    assert one.frame["rss_db"].tolist() == [-71.0, -70.0]
+    assert one.frame["serving"].tolist() == [0.0, 1.0]
+    assert two.frame["rss_db"].tolist() == [-62.0], "2147483647 is no level"
+    assert (two.attributes["pci"], two.attributes["arfcn"], two.attributes["rat"]) == (2, 66911, "lte")
+    assert two.frame["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.250500")], "the companion's clock, UTC"
+    nr = stream(result, "nr_ss_rsrp")
+    assert nr.frame[["rss_db", "rsrq_db", "sinr_db"]].values.tolist() == [[-88.0, -11.0, 33.0]]
+
+
+def test_pawprints_with_a_location_has_a_track() -> None:
+    data = samples.PAWPRINTS.replace(
+        b'"rel_time": 1.0', b'"location": {"latitude": 35.5, "longitude": -78.5, "altitude": 90}'
+    )
+    track = stream(read("pawprints", data), "phone").frame
+    assert track[["latitude_deg", "longitude_deg", "altitude_m"]].values.tolist() == [[35.5, -78.5, 0.0]]
+
+
+def test_nemo_wide_table_gives_cells_by_pci() -> None:
+    result = read("drive_test", samples.NEMO_WIDE)
+    first = stream(result, "lte_pci110").frame
+    assert first["rss_db"].tolist() == [-76.0, -77.0]
+    assert first["serving"].tolist() == [1.0, 1.0], "still serving when detected a second later"
+    assert (first["rsrq_db"][0], first["pathloss_db"][0]) == (-6.0, 96.0)
+    assert stream(result, "lte_pci22").frame["serving"].tolist() == [0.0]
+    assert stream(result, "rs_snr").frame["value"].tolist() == [19.0], "a row of its own"
+    assert len(stream(result, "phone").frame) == 3
+
+
+def test_nemo_times_of_the_day_take_the_date_of_the_file_name() -> None:
+    data = samples.NEMO_WIDE.replace(b"2025-03-02 ", b"")
+    named = read("drive_test", data, replace(PLAIN, file_name="02Mar25_100000.1.csv"))
+    assert named.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
+    nobody = read("drive_test", data, replace(PLAIN, file_name="60m.csv"))
+    assert nobody.streams[0].frame["time"][0] == pd.Timestamp("1970-01-01T10:00:00.250")
+    assert nobody.streams[0].attributes["clock"] == "relative"
+
+
+def test_xcal_semicolons_and_decimal_commas() -> None:
+    result = read("drive_test", samples.XCAL)
+    cell = stream(result, "nr_pci7")
+    assert cell.frame["rss_db"].tolist() == [-81.5, -82.5]
+    assert stream(result, "phone").frame["longitude_deg"][0] == -78.7000001
+    rank = next(one for one in result.streams if one.kind == "rank")
+    assert rank.frame["rank"].tolist() == [2.0]
+
+
+def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
+    result = read("drive_test", samples.GNETTRACK)
+    serving = next(one for one in result.streams if one.attributes.get("pci") == 42)
+    assert serving.frame["rss_db"].tolist() == [-95.0, -96.0]
+    assert serving.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00")
+
+
+@pytest.mark.parametrize("columns", [lambda names: names[::-1], lambda names: names[3:] + names[:3]])
+def test_columns_in_any_order(columns: object) -> None:
+    lines = [line.split(b",") for line in samples.NEMO_WIDE.strip().split(b"\n")[:-1]]
+    turned = b"\n".join(b",".join(columns(line)) for line in lines) + b"\n"  # type: ignore[operator]
+    one, other = read("drive_test", samples.NEMO_WIDE), read("drive_test", turned)
+    for name in ("lte_pci110", "lte_pci22", "phone"):
+        pd.testing.assert_frame_equal(stream(one, name).frame, stream(other, name).frame)
+
+
+def test_the_same_pose_from_every_program() -> None:
+    """One flight state, written by four programs in their own units."""
+    feet = read("pose_csv", samples.AIRDATA).streams[0].frame.iloc[0]
+    assert feet["altitude_m"] == pytest.approx(3.048)
+    assert feet["velocity_north_mps"] == pytest.approx(4.4704)
+    assert (feet["yaw_deg"], feet["pitch_deg"], feet["satellites"]) == (90.0, -1.5, 14)
+    assert feet["time"] == pd.Timestamp("2025-03-02T15:00:00"), "datetime(utc)"
+    dji = read("pose_csv", samples.DJI).streams[0].frame.iloc[0]
+    assert dji["altitude_m"] == pytest.approx(9.99744)
+    assert dji["time"] == pd.Timestamp("2025-03-02T15:00:00.250"), "local"
+    own = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[0]
+    converted = read("pose_csv", samples.CONVERTED).streams[0].frame.iloc[0]
+    for name in ("time", "latitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_east_mps", "fix"):
+        assert converted[name] == own[name], name
+
+
+def test_title_lines_in_front_of_a_table() -> None:
+    data = b"Flight of the second\nexported by x\n\n" + samples.AIRDATA
+    assert read("pose_csv", data).accepted == 2
+    assert by_name("pose_csv").sniff(data)
+
+
+def test_gpx_heights_count_from_the_first_point() -> None:
+    frame = read("gpx", samples.GPX).streams[0].frame
+    assert frame["altitude_m"].tolist() == [0.0, 10.0]
+    assert frame["time"].tolist() == [pd.Timestamp("2025-03-02T15:00:00.250"), pd.Timestamp("2025-03-02T15:00:01")]
+    nemo = read("gpx", samples.GPX_NEMO, replace(PLAIN, file_name="02Mar25_100000.1.gpx"))
+    assert nemo.streams[0].frame["time"].tolist() == frame["time"].tolist()
+
+
+def test_positions_of_a_flight_script_and_not_its_plans() -> None:
+    frame = stream(read("vehicle_log", samples.VEHICLE_LOG), "vehicle").frame
+    assert frame["altitude_m"].tolist() == [40.5, 40.0], "neither home nor a waypoint"
+    assert frame["yaw_deg"][0] == 312.5
+    assert stream(read("vehicle_log", samples.VEHICLE_LOG), "power").frame["value"].tolist()[0] == -12.5
+
+
+def test_srsue_cells_and_si_suffixes() -> None:
+    result = read("srsue_log", samples.SRSUE)
+    first = stream(result, "lte_pci1").frame
+    assert first["rss_db"].tolist() == [-61.0, -62.0]
+    assert first["pathloss_db"].tolist() == [61.0, 62.0]
+    assert stream(result, "lte_pci7").frame["serving"].tolist() == [1.0]
+    assert stream(result, "cfo").frame["value"].tolist() == [-4200.0, -950.0, 1500.0]
+
+
+def test_lte_flight_epochs_are_utc_and_its_text_local() -> None:
+    result = read("flight_mat", samples.lte_flight())
+    level = stream(result, "RSRP")
+    assert level.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
+    assert level.frame["flag"].tolist() == ["", "", "out_of_coverage", "", ""]
+    assert (level.attributes["quantity"], level.attributes["unit"]) == ("RSRP", "dB re full scale")
+    table = read("flight_mat", samples.mat_flight())
+    assert table.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250"), (
+        "the other authors' epoch is local"
+    )
+
+
+def test_processed_flights_have_no_clock_and_say_so() -> None:
+    result = read("flight_mat", samples.processed_flight())
+    track = stream(result, "vehicle")
+    assert track.attributes["clock"] == "relative"
+    assert track.frame["yaw_deg"].tolist() == pytest.approx([90.0] * 4)
+    assert stream(result, "RSRP").attributes["unit"] == "dBm"
+    assert any("no clock" in text for text in result.warnings)
+
+
+def test_matlab_73_holds_the_same_flight() -> None:
+    old, new = read("flight_mat", samples.mat_flight()), read("flight_mat", samples.mat_73())
+    for one, other in zip(old.streams, new.streams, strict=True):
+        pd.testing.assert_frame_equal(one.frame, other.frame)
+
+
+def test_quectel_console_names_the_cells_by_their_tables() -> None:
+    result = read("quectel_console", samples.QUECTEL_CONSOLE)
+    assert stream(result, "nr_pci77").frame[["rss_db", "rsrq_db", "sinr_db"]].values.tolist() == [[-82.0, -11.0, 21.0]]
+    assert stream(result, "lte_pci492").attributes["arfcn"] == 950
+    assert stream(result, "nr5g_csi").frame["rank"].tolist() == [2.0]
+
+
+@pytest.mark.parametrize(
+    ("name", "quantity"),
+    [
+        ("RSRP (NR SpCell)", "RSRP"), ("NR5G SS-RSRP[0]", "RSRP"), ("RS SNR", "SINR"), ("SINR (LTE pcell)", "SINR"),
+        ("WB CQI (NR)", "CQI"), ("PDSCH rank (NR)", "rank"), ("5G KPI PCell RF RI", "rank"),
+        ("Application throughput downlink", "throughput"), ("PDSCH throughput (NR)", "throughput"), ("E-UTRAN carrier RSSI", "RSSI"),
+    ],
+)  # fmt: skip
+def test_names_of_quantities(name: str, quantity: str) -> None:
+    found = _quantities.quantity(name)
+    assert found is not None
+    assert found.name == quantity
+
+
+@pytest.mark.parametrize("name", ["Longitude", "Grid", "Carrier", "Direction", "Priority", "Time", "Primary"])
+def test_names_that_only_look_like_one(name: str) -> None:
+    assert _quantities.quantity(name) is None
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "2025-03-02 10:00:00.250", "2025/03/02T10:00:00.250", "02.03.2025 10:00:00.250", "2025.03.02_10.00.00.250",
+        "20250302100000.250", "02-Mar-2025 10:00:00.250", "2025-03-02T15:00:00.250Z", "2025-03-02 10:00:00.250-05:00",
+        "1740927600.250", "1740927600250", "1740927600250000",
+    ],
+)  # fmt: skip
+def test_every_form_of_one_time(text: str) -> None:
+    clock, cells, _ = _stamps.read([text, text.replace("02.03", "22.03")] if "02.03." in text else [text], PLAIN)
+    from aerpaw_parsers import _rows
+
+    _, instants, valid = _rows.times(cells, PLAIN, clock=clock, reader="x")
+    assert valid[0]
+    assert instants.time[0] == np.datetime64("2025-03-02T15:00:00.250")
+
+
+def test_dates_that_can_be_read_two_ways_are_told() -> None:
+    _, cells, warnings = _stamps.read(["03/02/2025 10:00:00"], PLAIN)
+    assert cells[0] == b"2025-03-02 10:00:00"
+    assert any("month" in text for text in warnings)
+    _, cells, warnings = _stamps.read(["02/03/2025 10:00:00", "13/03/2025 10:00:00"], PLAIN)
+    assert cells[0] == b"2025-03-02 10:00:00"
+    assert not warnings
+
+
+def test_past_midnight() -> None:
+    _, cells, _ = _stamps.read(["23:59:59.5", "00:00:00.5"], replace(PLAIN, file_name="2025-03-02_x.csv"))
+    assert cells.tolist() == [b"2025-03-02T23:59:59.500000", b"2025-03-03T00:00:00.500000"]
+
+
+def test_a_local_clock_without_a_zone_is_asked_for() -> None:
+    for reader, data in (("drive_test", samples.NEMO_WIDE), ("srsue_log", samples.SRSUE), ("pose_csv", samples.DJI)):
+        with pytest.raises(UsageError, match="timezone:"):
+            read(reader, data, replace(OPTIONS, timezone=None, time_origin=None))

@@ -15,15 +15,16 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
-from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
 from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
 from ..logs.limits import UNSCORED, flagged
 from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
 from ..site.site import Site
 from ..site.siteyaml import load_site
+from .clock import clock_trap
 from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
-from .track import Track, clock_trap
+from .track import Track
 
 Times = NDArray[np.datetime64]
 
@@ -44,6 +45,10 @@ class RssSeries:
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
     serving: FloatArray | None = None
     """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
+    log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Number of the log (n,) under ``logs:`` that holds each sample; empty where it is not known."""
+    line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Line (n,) of that log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -356,6 +361,8 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         measured_db=frame["rss_db"].to_numpy(np.float64),
         link=link,
         settings_key=link.model_dump_json(),
+        log=np.full(len(frame), settings.logs.index(log), dtype=np.int64),
+        line=frame["line"].to_numpy(np.int64),
         flagged=left_out,
         serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,
     )

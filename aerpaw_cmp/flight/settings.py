@@ -353,7 +353,7 @@ class RssSettings(Settings):
     step_db: Positive = 0.1
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
-    """Clock offset: estimated and shown, estimated and applied, or applied as given [s]."""
+    """Radio minus telemetry clock: estimated and shown, estimated and applied, or taken off as given [s]."""
     lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     field: Literal["coherent", "power", "local_mean"] = "coherent"
     """Which simulated RSS is compared."""

@@ -21,7 +21,7 @@ from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputSet
 from ..common.stages import Progress, silent
-from ..common.units import FloatArray, IntArray
+from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
@@ -275,6 +275,8 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
+        # as the replay does: on the ground itself the two rays cancel
+        position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
         roll, pitch, yaw = plan_attitude(self.trajectory, time_s)

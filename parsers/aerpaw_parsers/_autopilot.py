@@ -40,6 +40,9 @@ class Series:
         return np.where(np.abs(self.time_s[best] - time_s) <= NEAR_S, self.columns[name][best], np.nan)
 
 
+_MOST_S = 4e9
+"""Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns."""
+
 NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
 
 
@@ -80,6 +83,12 @@ def result(
     else:
         zero_ns = origin or 0
         warnings += [] if origin is not None else ["no message carries UTC: " + _rows.RELATIVE]
+    broken = len(damaged)
+    beyond = ~(np.abs(position.time_s) < _MOST_S) | ~np.isfinite(position.time_s)
+    damaged = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in position.number[beyond])]
+    kept = np.flatnonzero(~beyond)
+    columns = {name: column[kept] for name, column in position.columns.items()}
+    position = Series(position.time_s[kept], position.number[kept], columns)
     time: AnyArray = (np.round(position.time_s * 1e6).astype(np.int64) * 1000 + zero_ns).astype("datetime64[ns]")
     flag = _lines.flags(len(time))
     values: dict[str, AnyArray] = dict(position.columns)
@@ -92,7 +101,7 @@ def result(
     for name in ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"):
         values[name] = velocity.near(name, position.time_s)
     for name in ("fix", "satellites"):
-        values[name] = np.nan_to_num(fix.near(name, position.time_s), nan=-1).astype(np.int64)
+        values[name] = np.nan_to_num(fix.near(name, position.time_s), nan=-1).clip(-1, 255).astype(np.int64)
     about: dict[str, Attribute] = {"source": source}
     if utc_minus_clock_s is None and origin is None:
         about["clock"] = "relative"
@@ -101,6 +110,11 @@ def result(
     stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, **about))
     accepted = len(frame)
     return ReadResult(
-        reader, (stream,) if accepted else (), messages + len(damaged), accepted, messages - accepted,
-        tuple(damaged), tuple(warnings),
-    )  # fmt: skip
+        reader,
+        (stream,) if accepted else (),
+        messages + broken,
+        accepted,
+        messages + broken - accepted - len(damaged),
+        tuple(sorted(damaged, key=lambda line: line.number)),
+        tuple(warnings),
+    )

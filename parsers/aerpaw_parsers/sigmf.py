@@ -13,6 +13,7 @@ abs(x)^2 over all of the burst, dB re full scale of the data type. The lines of 
 from __future__ import annotations
 
 import json
+import re
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
 from . import _frames, _json, _lines, _rows, _stamps
 
+_MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 BURST_S = 0.02
 _SAMPLES = {
     "cf64": ("f8", 1.0), "cf32": ("f4", 1.0), "ci32": ("i4", 2.0**31), "ci16": ("i2", 2.0**15), "ci8": ("i1", 2.0**7),
@@ -77,11 +79,13 @@ def _stream(
     values: dict[str, AnyArray],
     options: ReadOptions,
     warnings: list[str],
+    counts: list[int],
     **about: Any,
-) -> tuple[Stream | None, int]:
-    """A stream of values with times; second, how many have none."""
+) -> Stream | None:
+    """A stream of values with times; how many there are goes to ``counts``."""
+    counts.append(len(texts))
     if not texts:
-        return None, 0
+        return None
     clock, cells, told = _stamps.read(texts, options)
     relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
     warnings += [*told, *instants.warnings, *([_rows.RELATIVE] if relative else [])]
@@ -95,7 +99,7 @@ def _stream(
     kept = {key: np.asarray(column)[keep] for key, column in values.items()}
     frame = _frames.frame(kind, instants.time[keep], keep + 1, flag[keep], kept)  # type: ignore[arg-type]
     attributes = _frames.attributes(options, **({"clock": "relative"} if relative else {}), **about)
-    return (Stream(kind, name, frame, attributes) if len(frame) else None), len(texts) - len(keep)  # type: ignore[arg-type]
+    return Stream(kind, name, frame, attributes) if len(frame) else None  # type: ignore[arg-type]
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -114,49 +118,43 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
             f"the SigMF meta file is no JSON ({error})", expected="a whole file", cause="a cut download"
         ) from None
     warnings: list[str] = []
-    streams: list[Stream | None] = [_track(captures, options, warnings)]
-    levels, count, lost = _levels(captures, options, warnings)
-    if not levels:
-        levels, count = _powers(meta, captures, options, warnings)
-    streams += levels
+    counts: list[int] = []
+    streams = [_track(captures, options, warnings, counts), *_levels(captures, options, warnings, counts)]
+    if not any(stream is not None and stream.kind == "rss" for stream in streams):
+        streams += _powers(meta, captures, options, warnings, counts)
     kept = tuple(stream for stream in streams if stream is not None)
     if not kept:
         raise InputError(
             "the SigMF meta file holds neither values nor positions, and its samples cannot be read",
             expected=f"measurement:values, core:rx_location, or {_data_name(options)!r} in the same folder",
         )
-    count = max([count, *(len(stream.frame) + lost for stream in kept)])
-    rejected = tuple(RejectedLine(count - i, "a value without a time", "") for i in range(lost - 1, -1, -1))
-    return ReadResult("sigmf", kept, count, count - lost, 0, rejected, tuple(dict.fromkeys(warnings)))
+    count = max(counts)
+    read_lines = np.unique(np.concatenate([stream.frame["line"].to_numpy() for stream in kept]))
+    lost = np.setdiff1d(np.arange(1, count + 1), read_lines)
+    rejected = tuple(RejectedLine(int(i), "a value without a time", "") for i in lost)
+    return ReadResult("sigmf", kept, count, len(read_lines), 0, rejected, tuple(dict.fromkeys(warnings)))
 
 
 def _levels(
-    captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
-) -> tuple[list[Stream | None], int, int]:
+    captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
+) -> list[Stream | None]:
     texts = _times(captures, "measurement:time_stamp", "core:datetime", "core:timestamp")
     made: list[Stream | None] = []
-    lost = 0
     for name, channel in _LEVELS.items():
         values = _column(captures, "measurement:values", name)
         if not len(values):
             continue
         if len(values) != len(texts):
             raise InputError(f"{len(values)} values of {name} and {len(texts)} times", expected="as many of each")
-        stream, lost = _stream(
-            "rss",
-            channel,
-            texts,
-            {"rss_db": values},
-            options,
-            warnings,
-            channel=channel,
-            unit=options.unit or "dB re full scale",
-        )
-        made.append(stream)
-    return made, len(texts) if made else 0, lost
+        unit = options.unit or "dB re full scale"
+        level = {"rss_db": values}
+        made.append(_stream("rss", channel, texts, level, options, warnings, counts, channel=channel, unit=unit))
+    return made
 
 
-def _track(captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]) -> Stream | None:
+def _track(
+    captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
+) -> Stream | None:
     """Positions: of the measurements, of the GPS, or of the receiver."""
     for field, times in (
         ("measurement:values", ("measurement:time_stamp", "core:datetime", "core:timestamp")),
@@ -172,7 +170,7 @@ def _track(captures: list[dict[str, Any]], options: ReadOptions, warnings: list[
             column = _column(captures, "core:rotation", key)
             if len(column) == len(texts):
                 values[name] = column
-        return _stream("telemetry", "vehicle", texts, dict(values), options, warnings, source=field)[0]
+        return _stream("telemetry", "vehicle", texts, dict(values), options, warnings, counts, source=field)
     return None
 
 
@@ -181,25 +179,25 @@ def _data_name(options: ReadOptions) -> str:
 
 
 def _powers(
-    meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str]
-) -> tuple[list[Stream | None], int]:
+    meta: dict[str, Any], captures: list[dict[str, Any]], options: ReadOptions, warnings: list[str], counts: list[int]
+) -> list[Stream | None]:
     """Power of each burst of the samples beside the meta file."""
     common = _json.inside(meta, "global")
     data = options.beside(_data_name(options)) if options.beside else None
     kind = _SAMPLES.get(str(common.get("core:datatype", "")).split("_")[0])
     rate = _json.number(common.get("core:sample_rate"))
     if data is None or kind is None or not rate > 0:
-        return [], 0
+        return []
     order = ">" if str(common.get("core:datatype")).endswith("_be") else "<"
     parts = 2 if str(common.get("core:datatype")).startswith("c") else 1
-    channels = int(_json.number(common.get("core:num_channels"))) if "core:num_channels" in common else 1
+    channels = min(max(_whole(common.get("core:num_channels"), 1), 1), 64)
     frame_bytes = np.dtype(kind[0]).itemsize * parts * channels
     usable = len(data) // frame_bytes * frame_bytes
     samples = np.frombuffer(data[:usable], dtype=order + kind[0]).reshape(-1, channels, parts)
     size = max(1, round(BURST_S * rate))
     texts: list[str] = []
     powers: list[FloatArray] = []
-    starts = [int(_json.number(one.get("core:sample_start", 0)) or 0) for one in captures]
+    starts = [min(max(_whole(one.get("core:sample_start"), 0), 0), len(samples)) for one in captures]
     for i, capture in enumerate(captures):
         end = starts[i + 1] if i + 1 < len(starts) else len(samples)
         stamp = next(
@@ -215,15 +213,20 @@ def _powers(
                 with np.errstate(all="ignore"):  # damaged samples may be any number
                     powers.append((piece**2).sum(axis=2).mean(axis=0))
     if not texts:
-        return [], 0
+        return []
     with np.errstate(all="ignore"):
         level = 10 * np.log10(np.array(powers))
-    made = [
-        _stream("rss", f"USRP{c + 1}", texts, {"rss_db": level[:, c]}, options, warnings, channel=f"USRP{c + 1}",
-                unit=options.unit or "dB re full scale")[0]
-        for c in range(channels)
-    ]  # fmt: skip
-    return list(made), len(texts)
+    unit = options.unit or "dB re full scale"
+    made: list[Stream | None] = []
+    for i in range(channels):
+        name, values = f"USRP{i + 1}", {"rss_db": level[:, i]}
+        made.append(_stream("rss", name, texts, values, options, warnings, counts, channel=name, unit=unit))
+    return made
+
+
+def _whole(value: Any, default: int) -> int:
+    number = _json.number(value)
+    return int(number) if np.isfinite(number) and abs(number) < 2**53 else default
 
 
 def _later(stamp: str, seconds: float) -> str:
@@ -232,6 +235,8 @@ def _later(stamp: str, seconds: float) -> str:
         return f"{float(stamp) + seconds:.6f}"
     except ValueError:
         zone = stamp[-1:] if stamp.endswith("Z") else ""
+        if not _MOMENT.fullmatch(stamp):
+            return "-"
         moment = np.datetime64(stamp.removesuffix("Z").replace(" ", "T"), "ns") + np.timedelta64(
             round(seconds * 1e9), "ns"
         )

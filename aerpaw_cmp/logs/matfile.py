@@ -168,7 +168,9 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     imaginary = next(parts, None)
     if imaginary is None:
         raise _damaged(f"complex variable {title!r} without imaginary part")
-    return title, real + 1j * _numbers(imaginary, shape, order, _CLASSES[family])
+    both = real.astype(np.complex128)
+    both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
+    return title, both
 
 
 def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) -> AnyArray:

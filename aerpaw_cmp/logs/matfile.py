@@ -168,7 +168,8 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     imaginary = next(parts, None)
     if imaginary is None:
         raise _damaged(f"complex variable {title!r} without imaginary part")
-    both = real.astype(np.complex128)
+    with np.errstate(all="ignore"):
+        both = real.astype(np.complex128)
     both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
     return title, both
 
@@ -180,7 +181,8 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
     count = math.prod(shape)
     if len(values.body) != count * np.dtype(stored).itemsize:
         raise _damaged(f"{len(values.body)} bytes for {count} values")
-    return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
+    with np.errstate(all="ignore"):  # damaged values may be any number
+        return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
 
 
 def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:

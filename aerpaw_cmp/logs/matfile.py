@@ -170,7 +170,7 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
         raise _damaged(f"complex variable {title!r} without imaginary part")
     with np.errstate(all="ignore"):
         both = real.astype(np.complex128)
-    both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
+        both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
     return title, both
 
 

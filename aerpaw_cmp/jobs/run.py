@@ -154,9 +154,11 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
             speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
     stages.progress("report")
     from ..report.build import report_data
+    from .manifest import other_inputs
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
+    others = other_inputs(settings, flight, logs_root)
+    return report_data(data, found.result, speed=speed, notes=notes, other_inputs=others, stages_s=stages.seconds)
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:

@@ -60,9 +60,9 @@ def streams(rows: _rows.Rows, readings: Iterable[Reading], *, source: str) -> li
     made: list[Stream] = []
     names = {(one.rat, one.pci if np.isfinite(one.pci) else -1.0) for one in found}
     for rat, pci in sorted(names):
-        mine = [
-            i for i, one in enumerate(found) if one.rat == rat and (one.pci == pci or (pci < 0 and not np.isfinite(one.pci)))
-        ]
+        none = pci < 0
+        same = [one.rat == rat and (one.pci == pci or (none and not np.isfinite(one.pci))) for one in found]
+        mine = np.flatnonzero(same).tolist()
         stream = _stream(rows, [found[i] for i in mine], served[mine], rat, pci, source)
         if stream is not None:
             made.append(stream)

@@ -52,7 +52,7 @@ LIMIT_MIB = 300
 WATCHDOG_S = 20.0
 """A worker that finishes no input for so long hangs in native code, where no alarm reaches it."""
 
-BLOCK = 2000
+BLOCK = 1000
 SEED_BYTES = 1500
 MEDIUM_BYTES = 4000
 
@@ -308,6 +308,14 @@ def _small_mat(data: bytes) -> bytes:
     return out.getvalue()
 
 
+def _mat_of(arrays: dict[str, Any]) -> bytes:
+    import scipy.io
+
+    out = io.BytesIO()
+    scipy.io.savemat(out, arrays)
+    return out.getvalue()
+
+
 def _log_files() -> Iterator[Path]:
     roots = [ROOT / "sample_logs"]
     if field := os.environ.get("AERPAW_CMP_FIELD_DATA"):
@@ -318,11 +326,15 @@ def _log_files() -> Iterator[Path]:
 
 def _log_seeds() -> dict[str, list[bytes]]:
     """Pieces of real logs and of the samples, by the reader that knows them."""
-    from tests.parsers.samples import SAMPLES
+    from tests.parsers.samples import NO_LOGS, SAMPLES
 
     found: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
     for name, samples in SAMPLES.items():
-        found.setdefault(name, []).extend(data for data, *_ in samples.values())
+        found[name] += [data for data, *_ in samples.values()]
+    for name, data in NO_LOGS.items():
+        found[name].append(data)
+    found["antenna_grid"].append(_mat_of({"rad_pat": np.zeros((3, 4))}))
+    found["matlab_other"].append(_mat_of({"other": np.ones((2, 2))}))
     for path in _log_files():
         data = path.read_bytes()
         if data.startswith(b"\x1f\x8b"):
@@ -339,7 +351,7 @@ def _log_seeds() -> dict[str, list[bytes]]:
                 continue
         elif b"\0" not in data[:1000]:
             found[readers[0].name] += [p for p in _pieces(data) if len(p) <= MEDIUM_BYTES]
-    return {name: list(dict.fromkeys(seeds)) for name, seeds in found.items() if seeds}
+    return {name: [s for s in dict.fromkeys(seeds) if len(s) <= 40_000] for name, seeds in found.items() if seeds}
 
 
 @contextmanager
@@ -563,7 +575,7 @@ def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) ->
     except AerpawCmpError as error:
         verdict, what = "refused", ""
         if not all(c.isprintable() or c == "\n" for c in str(error)) or not str(error).strip():
-            verdict, what = "violation", f"a message that a terminal would take for commands: {str(error)[:200]!r}"
+            verdict, what = "violation", f"no message, or one with control characters: {str(error)[:200]!r}"
     except TimeIsUpError:
         verdict, what = "violation", f"more than {LIMIT_S:g} s"
     except MemoryError:

@@ -22,8 +22,9 @@ from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
 from ..logs.records import Stream
 from ..site.site import Site
 from ..site.siteyaml import load_site
+from .clock import clock_trap
 from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
-from .track import Track, clock_trap
+from .track import Track
 
 Times = NDArray[np.datetime64]
 

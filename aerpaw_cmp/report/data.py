@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.result import AuditResult, EngineResult
+from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
@@ -89,12 +90,15 @@ class Baseline:
         Received power at the samples of the panel.
     offset_db, rmse_db : float
         Best offset of the measurement against this model, and what it leaves.
+    paired : PairedDifference, optional
+        The ray tracing against this model on the same samples.
     """
 
     name: str
     level_dbm: FloatArray
     offset_db: float
     rmse_db: float
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aerpaw_cmp.compare.statistics import paired_difference
 from aerpaw_cmp.logs.records import RejectedLine
 from aerpaw_cmp.report import html, words
 from aerpaw_cmp.report.canvas import Picture
@@ -206,16 +207,26 @@ def test_panels_are_said_in_their_own_section(report_data):
 
 
 class TestWords:
-    def test_worse_than_a_baseline_is_said(self, report_data):
-        panel = dataclasses.replace(report_data.rss[0], rmse_db=9.0, rmse_ci95_db=(8.5, 9.5))
-        assert "WORSE than two-ray" in words.rss_verdict(panel)
-
-    def test_a_gain_within_the_interval_is_doubted(self, report_data):
+    def test_the_words_follow_from_the_paired_interval(self, report_data):
         panel = report_data.rss[0]
-        assert "within the interval" in words.rss_verdict(dataclasses.replace(panel, rmse_ci95_db=(0.1, 99.0)))
-        assert "within the interval" not in words.rss_verdict(
-            dataclasses.replace(panel, rmse_ci95_db=(panel.rmse_db, panel.rmse_db))
-        )
+        best = min(panel.baselines, key=lambda baseline: baseline.rmse_db)
+
+        def said(error_db, other_db):
+            paired = paired_difference(error_db, other_db, free_offset=False)
+            beside = dataclasses.replace(best, paired=paired)
+            return words.rss_verdict(dataclasses.replace(panel, baselines=(beside,)))
+
+        rng = np.random.default_rng(1)
+        small, large = rng.normal(0, 3.0, 500), rng.normal(0, 4.0, 500)
+        assert "WORSE than two-ray ground by 1.5 dB [1." in said(large, small)
+        assert "better than two-ray ground by 1.5 dB [1." in said(small, large)
+        assert "no difference from two-ray ground shown" in said(small, rng.permutation(small))
+        assert "too few independent samples" in said(small[:5], large[:5])
+
+    def test_without_a_pair_nothing_is_judged(self, report_data):
+        text = words.rss_verdict(report_data.rss[0])
+        assert "WORSE" not in text
+        assert "better" not in text
 
     def test_edge_of_the_search(self, report_data):
         data = dataclasses.replace(report_data, rss=(dataclasses.replace(report_data.rss[0], at_search_edge=True),))
@@ -226,21 +237,14 @@ class TestWords:
         panel = dataclasses.replace(report_data.rss[0], n=0, rmse_db=np.nan, offset_db=np.nan)
         assert "nothing to score" in words.rss_verdict(panel)
 
-    @pytest.mark.parametrize(
-        ("verdict", "lag", "said"),
-        [
-            ("ok", 0.1, False),
-            ("ok", -3.0, True),
-            ("ambiguous", 0.0, True),
-            ("failed", np.nan, True),
-            ("", np.nan, False),
-        ],
-    )
-    def test_clock(self, report_data, verdict, lag, said):
-        data = dataclasses.replace(
-            report_data, rss=(dataclasses.replace(report_data.rss[0], lag_verdict=verdict, lag_s=lag),)
+    def test_kappa_has_its_neighbours(self, report_data):
+        panel = dataclasses.replace(
+            report_data.rank[0],
+            extra={"commonest": {"rank": 2, "agreement": 0.71}, "repeat": {"any_heading": {"n": 90, "kappa": 0.42}}},
         )
-        assert any("radio clock" in w for w in words.warnings(data)) == said
+        text = words.rank_verdict(panel)
+        assert "always saying 2 would agree in 71 %" in text
+        assert "repeats itself at the same places to kappa 0.42" in text
 
     def test_best_k_is_the_nearest_distribution(self, report_data):
         panel = report_data.rank[0]

@@ -19,11 +19,9 @@ SITE = Path(__file__).parents[2] / "aerpaw_cmp" / "site" / "data" / "lake_wheele
 def folder(tmp_path: Path) -> Path:
     (tmp_path / "own").mkdir()
     site = yaml.safe_load(SITE.read_text())
-    site["trees"] = {"file": "trees.csv"}
+    site["dem"] = {"path": "dem.tif"}
     (tmp_path / "own" / "site.yaml").write_text(yaml.safe_dump(site))
-    (tmp_path / "own" / "trees.csv").write_text(
-        "latitude_deg,longitude_deg,height_m,crown_radius_m\n35.728,-78.695,12,3\n"
-    )
+    (tmp_path / "own" / "dem.tif").write_bytes(b"heights")
     (tmp_path / "powers.csv").write_text("node,channel\n")
     azimuth, elevation = np.meshgrid(np.arange(0, 360, 30.0), np.arange(-90, 91, 30.0))
     rows = [f"{a},{e},0" for a, e in zip(azimuth.ravel(), elevation.ravel(), strict=True)]
@@ -43,13 +41,13 @@ rss: {reference_powers: {file: powers.csv, receivers: {A: {node: lw1, channel: c
 
 def test_every_named_file_is_there_once_with_its_digest(folder: Path) -> None:
     found = {entry.path: entry for entry in other_inputs(load_flight(folder / "flight.yaml"), folder / "flight.yaml")}
-    assert set(found) == {"flight.yaml", "own/site.yaml", "trees.csv", "antenna.csv", "powers.csv"}
+    assert set(found) == {"flight.yaml", "own/site.yaml", "dem.tif", "antenna.csv", "powers.csv"}
     for name, entry in found.items():
-        place = folder / ("own/trees.csv" if name == "trees.csv" else name)
+        place = folder / ("own/dem.tif" if name == "dem.tif" else name)
         assert entry.sha256 == sha256(place.read_bytes()).hexdigest()
         assert entry.lines == entry.accepted + entry.rejected + entry.blank == 0
     assert found["antenna.csv"].role == "link.rss.uav.antenna.file"
-    assert found["trees.csv"].role.startswith("site: ")
+    assert found["dem.tif"].role == "site: dem.path"
 
 
 def test_a_packaged_site_counts(folder: Path) -> None:

@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
+from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Array, Isotropic, Link, Poses
 from .channel import channel_matrices
@@ -71,7 +72,7 @@ def expected_array(array: Array) -> ExpectedArray:
     """An array's own numbers."""
     patterns = array.patterns * len(array) if len(array.patterns) == 1 else array.patterns
     return ExpectedArray(
-        tuple(tuple(float(x) for x in row) for row in array.positions_m),  # type: ignore[arg-type]
+        tuple((float(x), float(y), float(z)) for x, y, z in array.positions_m),
         tuple(float(x) for x in np.degrees(array.slant_rad)),
         tuple(scalar_pattern(pattern) for pattern in patterns),
         matrix_of(array.mount),
@@ -86,79 +87,6 @@ def scalar_pattern(pattern: Any) -> Any:
         return complex(e_theta), complex(e_phi)
 
     return of
-
-
-@dataclass(frozen=True, slots=True)
-class FieldAudit:
-    """What the two references found.
-
-    Parameters
-    ----------
-    paths, power_max_db, power_rms_db, phase_max_rad, phase_rms_rad
-        Against Sionna's own coefficients: paths compared, worst and root-mean-square differences.
-    link_rss_max_db : float
-        Of the coherent RSS of links whose paths are all shorter than ``PHASE_RANGE_M``, against Sionna.
-    reference_links, reference_paths, h_max_error, rss_max_error_db, rank_differs
-        Against the second implementation: largest difference of H, relative; of RSS; links with another rank.
-    attitude_rows, attitude_max_rad
-        Logged attitudes turned into rotations a second time.
-    missing_paths, phantom_paths : int
-        Paths that a reference has and whose existence is beyond doubt; paths that cannot exist.
-    doubtful : int
-        Paths and links that were not judged, since a micrometre decides (float32: two millimetres).
-    failures : tuple of str
-        What is out of tolerance, in words.
-    not_covered : tuple of str
-    """
-
-    paths: int = 0
-    power_max_db: float = 0.0
-    power_rms_db: float = 0.0
-    phases: int = 0
-    phase_max_rad: float = 0.0
-    phase_rms_rad: float = 0.0
-    link_rss_max_db: float = 0.0
-    reference_links: int = 0
-    reference_paths: int = 0
-    h_max_error: float = 0.0
-    rss_max_error_db: float = 0.0
-    rank_differs: int = 0
-    attitude_rows: int = 0
-    attitude_max_rad: float = 0.0
-    missing_paths: int = 0
-    phantom_paths: int = 0
-    doubtful: int = 0
-    failures: tuple[str, ...] = ()
-    not_covered: tuple[str, ...] = ()
-
-    @property
-    def failed(self) -> int:
-        """Number of checks out of tolerance."""
-        return len(self.failures)
-
-    def __add__(self, other: FieldAudit) -> FieldAudit:
-        """Both together: counts add up, the worst stays."""
-        values: dict[str, Any] = {}
-        for name in self.__slots__:
-            one, two = getattr(self, name), getattr(other, name)
-            if name in ("failures", "not_covered"):
-                values[name] = tuple(dict.fromkeys((*one, *two)))
-            elif name.endswith(("_max_db", "_max_rad", "_max_error", "_max_error_db")):
-                values[name] = max(one, two)
-            elif not name.endswith(("_rms_db", "_rms_rad")):
-                values[name] = one + two
-        values["power_rms_db"] = _rms(self.paths, self.power_rms_db, other.paths, other.power_rms_db)
-        values["phase_rms_rad"] = _rms(self.phases, self.phase_rms_rad, other.phases, other.phase_rms_rad)
-        return FieldAudit(**values)
-
-    def as_dict(self) -> dict[str, object]:
-        """For ``metrics.json``."""
-        found: dict[str, object] = {name: getattr(self, name) for name in self.__slots__}
-        return {**found, "failed": self.failed, "failures": list(self.failures), "not_covered": list(self.not_covered)}
-
-
-def _rms(n: int, one: float, m: int, two: float) -> float:
-    return math.sqrt((n * one**2 + m * two**2) / max(n + m, 1))
 
 
 # ---------------------------------------------------------------- the second implementation
@@ -205,6 +133,20 @@ def against_reference(
             except LookupError as error:
                 total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
     return total
+
+
+def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
+    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist."""
+    count = 0
+    for row in rows:
+        tower = int(replay.paths.tower[row])
+        reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
+        link = _OneLink(reference, replay, poses, int(replay.paths.pose[row]), tower, np.array([row]))
+        sequence = link.sequence(int(row))
+        if not replay.paths.off_crown[row] and (sequence is None or reference.verdict(sequence, link.target) is False):
+            count += 1
+    failures = (f"{count} paths that cannot exist",) if count else ()
+    return FieldAudit(phantom_paths=count, failures=failures)
 
 
 @dataclass(frozen=True, slots=True)
@@ -354,9 +296,9 @@ def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
     ):
         if pose in seen:
             seen[pose].add((tower, *faces))
-    picked: list[int] = [int(chosen[0]), int(chosen[len(chosen) // 2])]
-    met = set().union(*(seen[row] for row in picked))
-    rest = [row for row in seen if row not in picked]
+    picked: list[int] = []
+    met: set[tuple[int, ...]] = set()
+    rest = list(seen)
     while len(picked) < count:
         best = max(rest, key=lambda row: (len(seen[row] - met), len(seen[row])))
         picked.append(best)

@@ -19,11 +19,12 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, Point, Polygon
 
-from ..common.units import FloatArray
+from ..common.units import ComplexArray, FloatArray
 from ..site.site import Site, Tower, Trees
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]
+Wave = tuple[complex, complex, complex]
 Pattern = Callable[[float, float], tuple[complex, complex]]
 """``(theta_rad, phi_rad) -> (E_theta, E_phi)`` in the device frame."""
 
@@ -444,7 +445,7 @@ class Reference:
         spreading = min(1.0, wavelength / (4 * math.pi * length))
         return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
 
-    def _reflected(self, mirror: Mirror, wave: tuple[complex, ...], ray: Vector, onward: Vector) -> tuple[complex, ...]:
+    def _reflected(self, mirror: Mirror, wave: Wave, ray: Vector, onward: Vector) -> Wave:
         cosine = min(1.0, abs(_dot(mirror.normal, ray)))
         across = _cross(ray, mirror.normal)
         size = math.sqrt(_dot(across, across))
@@ -462,7 +463,8 @@ class Reference:
         te, tm = fresnel(cosine, *found, C_MPS / self.link.carrier_hz)
         e_s = sum(a * b for a, b in zip(s, wave, strict=True))
         e_p = sum(a * b for a, b in zip(p_in, wave, strict=True))
-        return tuple(te * e_s * s[k] + tm * e_p * p_out[k] for k in range(3))
+        e = [te * e_s * s[k] + tm * e_p * p_out[k] for k in range(3)]
+        return e[0], e[1], e[2]
 
     def loss_db(self, sequence: Sequence[Mirror], target: Vector, bounced: Sequence[int] = ()) -> float | None:
         """Foliage and reflection loss of a path; None where an opaque tree is only just touched."""
@@ -485,7 +487,7 @@ class Reference:
 
     def matrix(
         self, paths: Sequence[tuple[Sequence[Mirror], float]], target: Vector, turn: Matrix
-    ) -> tuple[FloatArray, float]:
+    ) -> tuple[ComplexArray, float]:
         """H (uav elements, tower elements) of paths with their losses [dB], and the mean power of each added up."""
         uav, tower = len(self.link.uav.positions_m), len(self.link.towers[self.tower].positions_m)
         h = np.zeros((uav, tower), dtype=np.complex128)
@@ -511,7 +513,7 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
     return te * (1 - echo) / (1 - te * te * echo), tm * (1 - echo) / (1 - tm * tm * echo)
 
 
-def _element(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> tuple[complex, complex, complex]:
+def _element(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> Wave:
     """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2."""
     back: Matrix = tuple(zip(*turn, strict=True))  # type: ignore[assignment]
     x, y, z = _times(back, ray)
@@ -548,7 +550,7 @@ def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
     """ITU-R P.833 woodland or Weissberger; leafless trees attenuate 1/1.2 of it."""
     if loss.model == "weissberger":
         f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
-        return f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588)
+        return float(f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588))
     gamma, largest = _p833(carrier_hz / 1e6)
     gamma = gamma / (1.0 if loss.in_leaf else 1.2) if loss.gamma_db_per_m is None else loss.gamma_db_per_m
     largest = largest if loss.maximum_db is None else loss.maximum_db

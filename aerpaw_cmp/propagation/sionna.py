@@ -456,7 +456,7 @@ def _raw_paths(
     """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
     found = finder.trace(target, max_depth, samples)
     real, imaginary = (np.asarray(part.numpy()) for part in found.a)
-    raw = {
+    raw: dict[str, Any] = {
         "valid": found.valid.numpy()[: len(poses)],
         "kind": found.interactions.numpy()[:, : len(poses)],
         "shape": found.objects.numpy()[:, : len(poses)],
@@ -464,7 +464,8 @@ def _raw_paths(
     }
     receiver, tower, path = np.nonzero(raw["valid"])
     steps = min(max_depth, len(raw["kind"]))
-    good = np.isin(raw["kind"][:, receiver, tower, path], (0, 1)).all(axis=0)
+    kinds = raw["kind"][:, receiver, tower, path]
+    good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
     receiver, tower, path = receiver[good], tower[good], path[good]
     pose, source, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
     points = np.full((len(pose), max_depth, 3), np.nan)
@@ -479,7 +480,7 @@ def _lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> Fl
     total, last = np.zeros(len(paths)), sources_m[paths.tower]
     for step in range(paths.vertices_m.shape[1] + 1):
         end = paths.vertices_m[:, step] if step < paths.vertices_m.shape[1] else targets_m[paths.pose]
-        used = np.isfinite(end).all(axis=1)
+        used = np.asarray(np.isfinite(end).all(axis=1))
         total[used] += np.linalg.norm(end[used] - last[used], axis=1)
         last = np.where(used[:, None], end, last)
     return total

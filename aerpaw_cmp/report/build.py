@@ -34,6 +34,7 @@ def report_data(
     *,
     speed: Sequence[record.SpeedRow] = (),
     notes: Sequence[str] = (),
+    other_inputs: Sequence[record.InputFile] = (),
     stages_s: Mapping[str, float] | None = None,
     paths: Sequence[record.PosePaths] = (),
 ) -> record.ReportData:
@@ -49,6 +50,8 @@ def report_data(
         The table of speed against error.
     notes : sequence of str
         Remarks beside those of the flight file.
+    other_inputs : sequence of InputFile
+        Files besides the logs: settings, site, antennas.
     stages_s : mapping of str to float
         Seconds per stage.
     """
@@ -65,7 +68,7 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=inputs_of(data),
+        inputs=(*inputs_of(data), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(

@@ -214,6 +214,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
+    failed += [f"audit of the field: {text}" for text in (audit.get("field") or {}).get("failures", ())]
     return tuple(failed)
 
 

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line
-from . import archives
+from . import archives, blocks
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
@@ -25,8 +25,8 @@ from .records import has_wall_clock
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_BYTES = 512 * 2**20
-"""Largest file read, and largest content of a gzip file: a log of a day is a hundred times smaller."""
+MAX_BYTES = 2**32
+"""Largest content of a gzip file that is unpacked in memory: larger logs are read in blocks, or are no logs."""
 
 FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
@@ -75,9 +75,6 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
             raise InputError("a folder stands where a log is expected", path=place)
         if not place.is_file() and place.exists():
             raise InputError("not a regular file", expected="a log", path=place)
-        size = place.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=place)
         if limit is None:
             return place.read_bytes()
         with place.open("rb") as file:
@@ -281,12 +278,44 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
             expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
             path=path,
         )
-    if reader is None and not head.startswith(_GZIP) and not hides_its_content(head):
+    packed = head.startswith(_GZIP)
+    if packed and place.stat().st_size > blocks.FROM_BYTES // 16:
+        head, packed = _unpacked_head(head), False
+    if reader is None and not packed and not hides_its_content(head):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
+    if (large := _in_blocks(place, reader, options)) is not None:
+        return large
     data, digest = read_bytes(place)
     if not data.strip() or data.startswith(b"version https://git-lfs"):
         identify(data, path=str(path))  # raises the message for an empty file or a pointer
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
+
+
+def _unpacked_head(head: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, HEAD_BYTES)
+    except zlib.error:
+        return head  # damaged: reading it says so
+
+
+def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -> IngestedFile | None:
+    """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
+    from . import limits
+
+    least = blocks.FROM_BYTES // 16 if _raw(place, 2) == _GZIP else blocks.FROM_BYTES
+    if place.stat().st_size < least or reader is None or reader.apart is None:
+        return None
+    given = _options(place, options, _beside(place))
+    try:
+        result, digest = blocks.read(place, reader, given)
+    except blocks.Whole:
+        return None
+    return IngestedFile(str(place), digest, limits.check(result)) if result.accepted else None
+
+
+def _options(path: Path, options: OptionsFor | None, beside: Callable[[str], bytes | None]) -> ReadOptions:
+    given = options(path) if callable(options) else options or ReadOptions()
+    return replace(given, file_name=path.name, beside=beside)
 
 
 def _beside(path: Path) -> Callable[[str], bytes | None]:
@@ -309,8 +338,7 @@ def _read(
 ) -> IngestedFile:
     from . import limits  # loads pandas, as any reader does
 
-    given = options(path) if callable(options) else options or ReadOptions()
-    given = replace(given, file_name=path.name, beside=beside or _beside(path))
+    given = _options(path, options, beside or _beside(path))
     try:
         result = limits.check(reader.read(data, given))
     except (InputError, UsageError) as error:

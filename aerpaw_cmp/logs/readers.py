@@ -6,6 +6,7 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -87,6 +88,9 @@ class Reader:
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool
         Is a file of a few records a piece of the log that its folder holds?
+    apart : re.Pattern, optional
+        Lines that are read alone, one record each: between two of them a large file may be cut. None where a line
+        needs others (a header, a block it stands in).
     """
 
     name: str
@@ -96,6 +100,7 @@ class Reader:
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
+    apart: re.Pattern[bytes] | None = None
 
 
 @cache
@@ -214,8 +219,6 @@ def nearest(head: bytes) -> str:
 
 
 def _shape(text: str) -> str:
-    import re
-
     return re.sub(r"a+", "a", re.sub(r"[A-Za-z]", "a", re.sub(r"\d", "0", text)))
 
 

@@ -53,7 +53,7 @@ def gps_utc_s(week: FloatArray, milliseconds: FloatArray) -> FloatArray:
 
 def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
     """UTC minus the autopilot's clock; None where no message carries both."""
-    known = (utc_s > 1e9) & np.isfinite(time_s)
+    known = (utc_s > 1e9) & (utc_s < _MOST_S) & (np.abs(time_s) < _MOST_S)
     return float(np.median(utc_s[known] - time_s[known])) if known.any() else None
 
 

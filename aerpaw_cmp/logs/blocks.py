@@ -38,7 +38,7 @@ class Whole(Exception):  # noqa: N818 - no error: the caller reads the file in o
 def _contents(place: Path, digest: Any) -> Iterator[bytes]:
     """Chunks of a file, gunzipped where needed; the digest is that of the bytes on disk."""
     machine: Any = None
-    first, packed, unpacked = True, 0, 0
+    first, inside, packed, unpacked = True, False, 0, 0
     with place.open("rb") as file:
         while chunk := file.read(_CHUNK):
             digest.update(chunk)
@@ -50,6 +50,7 @@ def _contents(place: Path, digest: Any) -> Iterator[bytes]:
                 continue
             packed += len(chunk)
             while chunk:
+                inside = True
                 piece = machine.decompress(chunk, _CHUNK)
                 unpacked += len(piece)
                 if unpacked > _MOST_RATIO * packed + _CHUNK:
@@ -57,9 +58,9 @@ def _contents(place: Path, digest: Any) -> Iterator[bytes]:
                 yield piece
                 chunk = machine.unconsumed_tail
                 if machine.eof:
-                    chunk = machine.unused_data
+                    chunk, inside = machine.unused_data, False
                     machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
-    if machine is not None and not machine.eof and machine.unconsumed_tail:
+    if inside:
         raise InputError("the gzip file ends too early", cause="a cut download", path=place)
 
 

@@ -67,20 +67,20 @@ def _contents(place: Path, digest: Any) -> Iterator[bytes]:
 def _blocks(chunks: Iterator[bytes], apart: re.Pattern[bytes]) -> Iterator[tuple[bytes, bool]]:
     """Blocks of whole lines, and whether the first line is the last of the block before."""
     parts: list[bytes] = []
-    size, overlaps = 0, False
+    size, overlaps, enough = 0, False, BLOCK_BYTES
     for chunk in chunks:
         parts.append(chunk)
         size += len(chunk)
-        if size < BLOCK_BYTES:
+        if size < enough:
             continue
         data = b"".join(parts)
         cut = _cut(data, apart)
         if cut is None:  # one run of suppressed samples, or one line: more is needed
-            parts, size = [data], len(data)
+            parts, enough = [data], 2 * size
             continue
         last = data.rfind(b"\n", 0, cut - 1) + 1
         yield data[:cut], overlaps
-        parts, overlaps = [data[last:]], True
+        parts, overlaps, enough = [data[last:]], True, BLOCK_BYTES
         size = len(parts[0])
     data = b"".join(parts)
     if data:

@@ -99,7 +99,7 @@ def test_large_logs_go_through_blocks_packed_or_not(tmp_path: Path, monkeypatch:
 
 def test_an_hour_that_came_twice_is_read_in_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     times = np.datetime64("2025-11-02T05:30:00", "ns") + np.arange(400) * np.timedelta64(10, "s")
-    data = format_power_log(times, np.full(400, -40.0), "America/New_York")
+    data = format_power_log(times, np.linspace(-40.0, -50.0, 400), "America/New_York")
     place = tmp_path / "a_power_log.txt"
     place.write_bytes(data)
     monkeypatch.setattr(blocks, "FROM_BYTES", 1000)

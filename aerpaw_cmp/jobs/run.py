@@ -90,10 +90,13 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
+    recommend: Path | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
+
+    With ``recommend``, the flight file with the settings of the model that the ladder recommends is written there.
 
     Raises
     ------
@@ -107,12 +110,31 @@ def run_report(
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
-    with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
-        record = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+    with ExitStack() as outputs:
+        output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
+        target = None
+        if recommend is not None:
+            _beside(recommend, flight, logs_root)
+            target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
+        record, ladder = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+        if target is not None:
+            from .ladder import recommended_text
+
+            target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
             write_report(record, place)
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
+    """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
+    if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
+        raise UsageError(
+            f"--recommend in another folder than {flight}",
+            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
+            path=recommend,
+        )
 
 
 def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
@@ -135,7 +157,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
-    """The record of a report: read, replay, compare, audit."""
+    """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
     from ..flight.data import gather, read_logs
 
     with stages("read"):
@@ -144,7 +166,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    found = run_flight(data, stages)
+    found = run_flight(data, stages, ladder=True)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links:
@@ -156,7 +178,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from ..report.build import report_data
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
+    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds), found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:

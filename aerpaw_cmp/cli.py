@@ -208,6 +208,13 @@ def report(
         typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    figures: Annotated[
+        str,
+        typer.Option(help="What is drawn: page (what it shows), none, or every figure as svg, png, pdf, all."),
+    ] = "page",
+    style: Annotated[
+        str, typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded).")
+    ] = "screen",
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -222,6 +229,8 @@ def report(
         audit=audit,
         recommend=recommend,
         force=force,
+        figures=figures,
+        style=style,
         progress=_say,
     )
     if as_json:

@@ -14,7 +14,8 @@ from ..common.stages import Stages
 from ..compare.ladder import ladder_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
-from .compare_flight import audit_replays, compare_flight
+from .audit_flight import audit_replays
+from .compare_flight import compare_flight
 from .ladder import FlightLadder, flight_ladder
 from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
 

@@ -92,11 +92,29 @@ def run_report(
     audit: str | None = None,
     recommend: Path | None = None,
     force: bool = False,
+    figures: str = "page",
+    style: str = "screen",
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
 
     With ``recommend``, the flight file with the settings of the model that the ladder recommends is written there.
+
+    Parameters
+    ----------
+    flight : Path
+    out, logs_root : Path, optional
+        Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
+    engine, audit : str, optional
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+    recommend : Path, optional
+        Where to write it.
+    force : bool
+        Replace what this tool did not write.
+    figures : {"page", "none", "svg", "png", "pdf", "all"}
+        What is drawn: what the page shows, nothing, or every figure in one format or in all.
+    style : {"screen", "paper"}
+    progress : Progress
 
     Raises
     ------
@@ -105,8 +123,11 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
-    from ..report.write import write_report
+    from ..report.write import FIGURES, STYLES, write_report
 
+    for given, known in ((figures, FIGURES), (style, STYLES)):
+        if given not in known:
+            raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
@@ -116,13 +137,14 @@ def run_report(
         if recommend is not None:
             _beside(recommend, flight, logs_root)
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
-        record, ladder = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+        stages = Stages(progress)
+        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
         if target is not None:
             from .ladder import recommended_text
 
             target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
-            write_report(record, place)
+            record = write_report(record, place, drawn=figures, style=style, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
@@ -174,11 +196,20 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
             from .speed_table import speed_rows
 
             speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
-    stages.progress("report")
     from ..report.build import report_data
+    from .manifest import other_inputs
+    from .pose_paths import pose_paths
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds), found.ladder
+    record = report_data(
+        data,
+        found.result,
+        speed=speed,
+        notes=notes,
+        other_inputs=other_inputs(settings, flight, logs_root),
+        paths=pose_paths(data, found.replays),
+    )
+    return record, found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -208,6 +239,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
+    failed += [f"audit of the field: {text}" for text in (audit.get("field") or {}).get("failures", ())]
     return tuple(failed)
 
 

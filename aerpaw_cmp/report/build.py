@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -15,7 +16,8 @@ from ..compare import rss
 from ..compare.rank import RankFit
 from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference
-from ..flight.data import FlightData
+from ..flight.data import FlightData, RssSeries
+from ..flight.settings import FlightFile
 from . import data as record
 from .export import merge
 
@@ -32,7 +34,9 @@ def report_data(
     *,
     speed: Sequence[record.SpeedRow] = (),
     notes: Sequence[str] = (),
+    other_inputs: Sequence[record.InputFile] = (),
     stages_s: Mapping[str, float] | None = None,
+    paths: Sequence[record.PosePaths] = (),
 ) -> record.ReportData:
     """Everything a report shows.
 
@@ -46,6 +50,8 @@ def report_data(
         The table of speed against error.
     notes : sequence of str
         Remarks beside those of the flight file.
+    other_inputs : sequence of InputFile
+        Files besides the logs: settings, site, antennas.
     stages_s : mapping of str to float
         Seconds per stage.
     """
@@ -62,10 +68,14 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=inputs_of(data),
+        inputs=(*inputs_of(data), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
-        rss=tuple(rss_panel(one) for one in result.rss),
+        rss=tuple(
+            dataclasses.replace(rss_panel(one), source=source_of(series, settings))
+            for one, series in zip(result.rss, data.rss, strict=True)
+        ),
+        paths=tuple(paths),
         rank=tuple(rank_panel(one) for one in result.rank),
         pairs=tuple(pair_panel(one) for one in result.pairs),
         extra_metrics=metrics_beyond_panels(result),
@@ -126,6 +136,13 @@ def rss_panel(result: RssResult) -> record.RssPanel:
             if name in result.variants
         },
     )
+
+
+def source_of(series: RssSeries, settings: FlightFile) -> record.Source | None:
+    """Where the samples of a series stand in its logs."""
+    if len(series.line) != len(series.time):
+        return None
+    return record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
 
 
 def _baseline(name: str, model: ModelLevel, paired: PairedDifference | None) -> record.Baseline:

@@ -163,6 +163,33 @@ class ErrorSpan:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Where samples stand in the logs: names of the files, and per sample its file's number and its line, (n,)."""
+
+    files: tuple[str, ...]
+    file: IntArray
+    line: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PosePaths:
+    """Propagation paths of some poses of a tower, to be drawn.
+
+    Parameters
+    ----------
+    tower : str
+    time : (poses,) datetime64[ns]
+        Samples of the tower's first channel.
+    lines : tuple of tuples
+        Per pose its paths: points (depth + 2, 3) [m] from tower to UAV, and the number of reflections.
+    """
+
+    tower: str
+    time: AnyArray
+    lines: tuple[tuple[tuple[FloatArray, int], ...], ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RssPanel:
     """RSS of one tower and channel, measured against simulated.
 
@@ -239,6 +266,7 @@ class RssPanel:
     extra: Mapping[str, Any] = field(default_factory=dict)
     per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
     """Further columns (n,) of rss.csv, by name with unit."""
+    source: Source | None = None
 
     @property
     def name(self) -> str:
@@ -442,3 +470,4 @@ class ReportData:
     settings: Mapping[str, Any] = field(default_factory=dict)
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
+    paths: tuple[PosePaths, ...] = ()

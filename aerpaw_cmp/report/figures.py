@@ -54,6 +54,7 @@ def plates(data: ReportData) -> list[Plate]:
                 "difference to the best model on the same samples. Filled: the recommended model.",
                 alt=f"RMSE of {len({row.model for row in data.ladder})} models on stretches left out.",
                 draw=lambda: ladder(data.ladder),
+                page=True,
             )
         )
     for rank in data.rank:

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..common.jsonable import fields_of, json_safe
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray, IntArray, db_from_amplitude
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
@@ -257,8 +257,8 @@ def _clock_entry(clock: ClockResult) -> dict[str, Any]:
 def rank_panel(result: RankResult) -> record.RankPanel:
     """The rank of one tower."""
     score, position = result.score, result.position_m
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio_db = 20.0 * np.log10(result.sigma[:, 1:] / result.sigma[:, :1])
+    with np.errstate(invalid="ignore"):  # no channel: 0 / 0
+        ratio_db = db_from_amplitude(result.sigma[:, 1:] / result.sigma[:, :1])
     return record.RankPanel(
         tower=result.tower,
         time=result.time,

@@ -504,7 +504,7 @@ def test_a_ratio_to_noise_is_not_taken_for_a_level_in_silence(tmp_path: Path) ->
     assert said[0].startswith("quality.csv: 'quality'")
 
 
-@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308"])
+@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308", "strong"])
 def test_one_absurd_level_changes_no_number_and_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], absurd: str
 ) -> None:
@@ -518,11 +518,12 @@ def test_one_absurd_level_changes_no_number_and_is_told(
     (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
     metrics = report_completes(path, capsys)
     found = metrics["rss"]["LW1"]["USRP1"]
-    if absurd in ("inf", "-inf"):  # no number for the reader of plain tables: no signal
+    if absurd == "-inf":  # of decibels: no signal
         assert found["n_out_of_coverage"] == 1
     else:
-        assert found["n_flagged"] == {"level_out_of_range": 1}
-        assert any("level_out_of_range" in text for text in metrics["warnings"])
+        flag = "level_out_of_range" if absurd[0].isdigit() else "no_number"
+        assert found["n_flagged"] == {flag: 1}
+        assert any(f"1 row is flagged {flag}" in text for text in metrics["warnings"])
         assert found["n_out_of_coverage"] == 0
     for key in ("offset_db", "rmse_db", "n", "at_search_edge"):
         assert found[key] == pytest.approx(want[key]), key

@@ -319,6 +319,21 @@ def simulate(
         print(path)
 
 
+@app.command(help=COMMANDS["sample"])
+def sample(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder that gets flight.yaml and the logs.")] = Path(
+        "sample"
+    ),
+    force: Force = False,
+) -> None:
+    """Copy the sample flight into a folder of your own."""
+    from .jobs.sample import write_sample
+
+    flight = write_sample(out, force=force)
+    print(f"flight: {flight}")
+    print(f"next: aerpaw-cmp report {flight}")
+
+
 @app.command(help=COMMANDS["doctor"])
 def doctor(as_json: Json = False) -> int:
     """Check this machine."""

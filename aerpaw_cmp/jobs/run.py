@@ -30,6 +30,20 @@ def run_ingest(
 
     With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
     With ``force``, the two may replace files that this tool did not write, but no input.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Log files and folders.
+    out : Path, optional
+        The flight file (HDF5) to write.
+    draft : Path, optional
+        The flight.yaml to write.
+    reader : str, optional
+        Of all files, in place of recognising them.
+    force : bool
+    options
+        Fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
     """
     from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -62,6 +76,16 @@ def run_simulate(
     """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``.
 
     A log that is not marked as synthetic (in truth.json) is replaced with ``force`` only.
+
+    Parameters
+    ----------
+    flight : Path
+        flight.yaml with ``flight.plan``.
+    out : Path, optional
+        Folder of the logs.
+    force : bool
+    progress : Progress
+        Gets the name of each log.
     """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
@@ -250,7 +274,23 @@ def run_bench(
     ratios: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
+
+    Parameters
+    ----------
+    poses : int
+        Of the flight that is replayed.
+    samples : tuple of int
+        Rays per tower of the sionna engine.
+    ratios : bool
+        Compare with the peers, too.
+    progress : Progress
+
+    Returns
+    -------
+    dict
+        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+    """
     from ..propagation.bench import path_search, random_scene, speed_against_error
     from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
 
@@ -276,7 +316,21 @@ def run_bench(
 def run_site_import(
     files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
 ) -> list[str]:
-    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
+    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them.
+
+    Parameters
+    ----------
+    files : list of Path
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ.
+    out : Path
+        The site.yaml to write.
+    base : str
+        Site whose towers and settings are kept.
+    untagged : str, optional
+        What areas without a tag are: building, forest or geofence.
+    force : bool
+        Replace a file that this tool did not write.
+    """
     from ..site.footprints import import_site, site_yaml
 
     with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
@@ -299,6 +353,23 @@ def run_site_show(
     """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
 
     Without a site the flight's own is shown; with neither, the packaged one.
+
+    Parameters
+    ----------
+    site : str, optional
+        site.yaml, or the name of a packaged site.
+    out : Path
+        Folder of the pictures.
+    flight : Path, optional
+        flight.yaml whose track is drawn.
+    logs_root : Path, optional
+        Folder against which its logs resolve.
+    pose : int, optional
+        Point of the track whose paths are drawn.
+    export : bool
+        Also the scene as PLY and Mitsuba XML.
+    force : bool
+        Replace files that this tool did not write.
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
@@ -516,6 +587,22 @@ def run_campaign(
     progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
+
+    Parameters
+    ----------
+    path : Path
+        campaign.yaml.
+    out : Path, optional
+        Folder of the results.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    workers : int
+        Processes.
+    cluster : str, optional
+        Address of a Dask scheduler, in place of processes.
+    force : bool
+        Write into a folder that holds files of others.
+    progress : Progress
 
     Raises
     ------

@@ -379,7 +379,21 @@ def same_place(
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[str, dict[float, OffsetFit]]:
-    """As :func:`same_footing`, with both sides averaged over stretches of path: ``result[name][length]``."""
+    """As :func:`same_footing`, with both sides averaged over stretches of path: ``result[name][length]``.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+        In time order; a sample without a position belongs to no stretch.
+    measured_db : array_like, (n,)
+        Levels [dB]; NaN does not count.
+    simulations : mapping of str to array_like, (n,)
+        Levels [dB] by name.
+    lengths_m : sequence of float
+        Lengths of the stretches.
+    step_db, span_db : float, (float, float)
+        Of the offset search [dB].
+    """
     measured = _levels(measured_db)
     result: dict[str, dict[float, OffsetFit]] = {name: {} for name in simulations}
     for length in lengths_m:
@@ -730,7 +744,23 @@ def channel_difference(
     part_db: float = PART_DB,
     window_s: float = 1.0,
 ) -> ChannelDifference:
-    """Difference of two channels, and where they part by more than ``part_db`` [dB]."""
+    """Difference of two channels, and where they part by more than ``part_db`` [dB].
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+        Instants: seconds or datetime64.
+    first_db, second_db : array_like, (n,)
+        Levels of the two channels at these instants [dB].
+    position_m : (n, 3), optional
+        For the places at which they part.
+    context : mapping of str to array_like (n,), optional
+        Geometry that may explain it, as in :func:`error_spans`.
+    part_db : float
+        Difference beyond which they part, after their mean difference.
+    window_s : float
+        Averaging of the difference before its spans are sought.
+    """
     one, two = _levels(first_db), _levels(second_db)
     ok = np.isfinite(one) & np.isfinite(two)
     if not ok.any():

@@ -90,7 +90,22 @@ def rank_study(
     selection: Literal["nearest", "random"] = "nearest",
     seed: int = 0,
 ) -> Study:
-    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`."""
+    """:func:`interpolation_study` of the joint rank maps; see :func:`rank_fields`.
+
+    Parameters
+    ----------
+    result : MapResult
+    lowest_altitude_m : float
+        Maps below it are left out.
+    out_of_coverage : {"missing", "zero"}
+        A position without a channel as no sample, or as rank 0.
+    neighbours, radius_m : int, float
+        M and r0 of the interpolators.
+    selection : {"nearest", "random"}
+        Which M samples within r0 count.
+    seed : int
+        Of the random selection.
+    """
     _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
     return interpolation_study(
         result.grid, rank, result.towers_m, neighbours=neighbours, radius_m=radius_m, selection=selection, seed=seed

@@ -80,6 +80,7 @@ def report_data(
         pairs=tuple(pair_panel(one) for one in result.pairs),
         extra_metrics=metrics_beyond_panels(result),
         engine=result.engine,
+        ladder=result.ladder,
         speed=tuple(speed),
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
@@ -230,7 +231,8 @@ def pair_panel(result: PairResult) -> record.ChannelPair:
 
 def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     """Numbers for metrics.json alone: tables of residuals, pairs of channels."""
-    found: dict[str, Any] = {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
+    found: dict[str, Any] = {"ladder": [json_safe(fields_of(row)) for row in result.ladder]} if result.ladder else {}
+    found |= {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
         merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})

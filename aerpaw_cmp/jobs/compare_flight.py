@@ -336,7 +336,17 @@ def _positions(replayed: Replayed) -> FloatArray:
 
 
 def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
-    """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit."""
+    """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit.
+
+    Parameters
+    ----------
+    site : Site
+    tower : str
+    replayed : Replayed
+        Its poses, arrays and which samples have a pose.
+    rt : RtSettings
+        ``foliage`` says whether the depth of foliage counts.
+    """
     place, link = site.towers[tower], replayed.link
     seen = rss.link_geometry(
         place.position_m,

@@ -5,6 +5,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
+READY_DEV := .venv/.ready-dev
 LLVM := .venv/.llvm
 REPORT := reports/sample
 
@@ -18,21 +19,26 @@ export PIP_DISABLE_PIP_VERSION_CHECK := 1
 help:
 	@echo "make report   replay the sample flight and write $(REPORT)/report.html"
 	@echo "make test     ruff, mypy, import-linter, pytest"
-	@echo "make setup    only the environment: .venv and an LLVM for Dr.Jit"
+	@echo "make setup    only the environment, developers' tools included: .venv and an LLVM for Dr.Jit"
 	@echo "make bench    speed against error on this machine"
 	@echo "make clean    remove .venv, caches and $(REPORT)/"
 
-setup: $(READY) $(LLVM)
+setup: $(READY_DEV) $(LLVM)
 
-$(READY): pyproject.toml tools/setup_venv
+# running needs the package alone; testing needs the developers' tools on top
+$(READY): pyproject.toml constraints.txt tools/setup_venv
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv
+	@touch $@
+
+$(READY_DEV): $(READY)
+	@PYTHON="$(PYTHON)" tools/setup_venv .venv dev
 	@touch $@
 
 $(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/machine/llvm.py
 	@$(BIN)/python tools/setup_llvm.py
 	@touch $@
 
-report: setup
+report: $(READY) $(LLVM)
 	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT)
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
@@ -41,9 +47,9 @@ test: setup
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q
+	$(BIN)/python -m pytest -q -n auto --dist loadfile
 
-bench: setup
+bench: $(READY_DEV) $(LLVM)
 	$(BIN)/aerpaw-cmp bench
 
 clean:

@@ -327,6 +327,7 @@ def tap(
 
         print(export_csv(out, out / "tap.csv", force=force))
         return 0
+    _needs_posix("tap")
     from .live.log import LogSettings
     from .live.session import TapSettings, format_status
     from .live.tap import run_tap
@@ -370,6 +371,21 @@ def tap(
     return int(summary.exit_code)
 
 
+def _needs_posix(command: str) -> None:
+    """Ports are opened with termios and locked with fcntl, which not every system has."""
+    import importlib
+
+    for name in ("fcntl", "termios", "pty"):
+        try:
+            importlib.import_module(name)
+        except ImportError:
+            raise UsageError(
+                f"'{command}' needs Python's {name}, which this system does not have",
+                expected="Linux (another POSIX system may do)",
+                cause="Windows; logs of a tap can be read, reported and exported on every system",
+            ) from None
+
+
 @app.command("modem-sim", help=COMMANDS["modem-sim"])
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
@@ -380,6 +396,7 @@ def modem_sim(
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
+    _needs_posix("modem-sim")
     from .live.simulator import ModemSimSettings, run_modem_sim
 
     settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there

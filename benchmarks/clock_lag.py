@@ -41,12 +41,12 @@ def one(duration_s: float, rng: np.random.Generator) -> tuple[float, float, bool
     lag, drift = rng.uniform(-10, 10), rng.uniform(-5, 5) * 1e-3 / 60
     level = route(duration_s, rng)
     t = np.arange(0, duration_s, 0.1)
-    heard = level(t + lag + drift * (t - t[-1] / 2)) + rng.normal(0, NOISE_DB, len(t))
+    heard = level(t - lag - drift * (t - t[-1] / 2)) + rng.normal(0, NOISE_DB, len(t))
     fit = estimate_lag(t, heard, level)
     low, high = fit.drift_interval_s_per_s
     at_reference = lag + drift * (fit.reference - t[-1] / 2)
     return (
-        fit.lag_s - at_reference,
+        fit.radio_minus_telemetry_s - at_reference,
         (fit.drift_s_per_s - drift) * 60e3,
         fit.interval_s[0] <= at_reference <= fit.interval_s[1],
         low <= drift <= high,

@@ -25,6 +25,21 @@ from aerpaw_cmp.live.tap import TapSettings, run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
 show = values.pop("show_status", False)
+if capture := values.pop("capture", None):  # a copy of what the kernel gives, a file per opening of the port
+    import itertools
+    from aerpaw_cmp.live.ports import SerialPort
+    numbers, opened, read = itertools.count(), SerialPort.__init__, SerialPort.read
+
+    def begin(self, *arguments):
+        opened(self, *arguments)
+        self.copy = open(f"{capture}-{next(numbers):06}.bin", "ab", buffering=0)
+
+    def copied(self, *arguments):
+        data = read(self, *arguments)
+        self.copy.write(data)
+        return data
+
+    SerialPort.__init__, SerialPort.read = begin, copied
 try:
     summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values),
                       on_status=(lambda status: None) if show else None)

@@ -1,15 +1,26 @@
-"""Unplug and replug at random moments: is every answer that the modem saw read in the log, and every gap recorded?"""
+"""Unplug and replug at random moments: is every byte that the kernel gave in a record, and every gap recorded?
+
+Two accounts. By bytes: a copy of all that the tap's port gave (one file per opening) is cut into lines here, without
+the package, and held against the lines, unfinished lines and final results of the records. By answers: each answer
+that the modem saw read to its end (the tap had sent its next command) stands in the log, as often as it was given. The
+modem sends byte by byte, so that cables are pulled in the middle of lines. What it sent into a cable that was pulled
+before anybody read it is neither: it is counted as ``bytes_never_read``.
+"""
 
 from __future__ import annotations
 
 import argparse
 import json
 import random
+import re
 import signal
 import sys
 import tempfile
 import time
+from collections import Counter
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
 
 sys.path.insert(0, str(Path(__file__).parent))
 from tap_common import conditions, read_lines, show, start_tap
@@ -17,17 +28,49 @@ from tap_common import conditions, read_lines, show, start_tap
 from aerpaw_cmp.live.log import BadLine, read_log
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 
+FINAL = {"ok": "OK", "error": "ERROR", "cme": "+CME ERROR: ", "cms": "+CMS ERROR: "}
 
-def cycles(count: int, seed: int, folder: Path) -> dict[str, object]:
+
+def lines_given(pieces: Iterable[bytes]) -> Counter[str]:
+    """Lines that the kernel gave: cut at CR and LF, blank ones left out; each opening of the port for itself."""
+    given: Counter[str] = Counter()
+    for data in pieces:
+        given.update(line for text in re.split(rb"[\r\n]+", data) if (line := text.decode("latin-1").strip(" \t")))
+    return given
+
+
+def lines_recorded(records: Iterable[dict[str, Any]]) -> Counter[str]:
+    """Lines that the records hold: information, final results, and what was cut off."""
+    kept: Counter[str] = Counter()
+    for record in records:
+        if record["kind"] not in ("exchange", "late", "unsolicited", "gap"):
+            continue
+        kept.update(record.get("lines") or ())
+        if (status := record.get("status")) in FINAL:
+            kept[FINAL[status] + (record.get("code") or "")] += 1
+        # after a time-out the line goes on growing, and is recorded when it ends
+        if record.get("status") != "timeout" and (partial := (record.get("partial") or "").strip(" \t\r\n")):
+            kept[partial] += 1
+    return kept
+
+
+def size(lines: Counter[str]) -> int:
+    """Bytes of lines."""
+    return sum(len(text) * count for text, count in lines.items())
+
+
+def cycles(count: int, seed: int, folder: Path, bytewise_s: float = 3e-4) -> dict[str, Any]:
     """One tap through all cycles."""
     chance = random.Random(seed)
     link, log = folder / "modem", folder / "log"
     unplugged: list[tuple[int, int]] = []
     nodes = set()
-    with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=seed))) as modem:
+    faults = Faults(latency_s=0.001, jitter_s=0.01, bytewise_s=bytewise_s, seed=seed)
+    with ModemSimulator(ModemSimSettings(link=link, faults=faults)) as modem:
         process = start_tap(
-            link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, reconnect_min_s=0.02, reconnect_max_s=0.1
-        )
+            link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, reconnect_min_s=0.02, reconnect_max_s=0.1,
+            capture=str(folder / "given"),
+        )  # fmt: skip
         for _ in range(count):
             seen, until = len(modem.journal), time.monotonic() + 60
             while len(modem.journal) < seen + 6:  # the tap is back: probe, set-up, first polls
@@ -47,9 +90,16 @@ def cycles(count: int, seed: int, folder: Path) -> dict[str, object]:
         process.send_signal(signal.SIGTERM)
         summary = json.loads(process.communicate(timeout=30)[0])
         read = read_lines(modem.journal)
+        sent_bytes = modem.sent_bytes
     bad: list[BadLine] = []
     records = list(read_log(log, bad))
-    logged = [(r["command"], tuple(r["lines"])) for r in records if r["kind"] == "exchange" and r["status"] == "ok"]
+    logged = Counter(
+        (r["command"], tuple(r["lines"])) for r in records if r["kind"] == "exchange" and r["status"] == "ok"
+    )
+    pieces = [path.read_bytes() for path in sorted(folder.glob("given-*.bin"))]
+    given, kept = lines_given(pieces), lines_recorded(records)
+    received = sum(len(piece) for piece in pieces)
+    ends = [r["received_bytes"] for r in records if r["kind"] == "end"]
     closed = [r for r in records if r["kind"] == "gap" and r["state"] == "closed"]
     # both sides read the same monotonic clock: a gap record must cover each time without a port
     covered = 0
@@ -60,13 +110,34 @@ def cycles(count: int, seed: int, folder: Path) -> dict[str, object]:
     return {
         "cycles": count,
         "answers_read": len(read),
-        "lost": len(read) - sum(answer in set(logged) for answer in read),
+        "lost": (Counter(read) - logged).total(),
+        "received_bytes": received,
+        "received_bytes_by_the_tap": ends[-1] if ends else None,
+        "line_bytes_given": size(given),
+        "line_bytes_recorded": size(kept),
+        "line_bytes_in_gap_records": size(lines_recorded(r for r in records if r["kind"] == "gap")),
+        "line_bytes_missing": size(given - kept),
+        "line_bytes_invented": size(kept - given),
+        "bytes_sent": sent_bytes,
+        "bytes_never_read": sent_bytes - received,
         "gap_records": len(closed),
         "cycles_in_a_gap_record": covered,
         "gaps_in_summary": summary["gaps"],
         "nodes_used": len(nodes),
         "bad_lines": len(bad),
     }
+
+
+def failed(result: dict[str, Any]) -> bool:
+    """Whether a byte, an answer or a gap is missing."""
+    return bool(
+        result["lost"]
+        or result["bad_lines"]
+        or result["cycles_in_a_gap_record"] != result["cycles"]
+        or result["line_bytes_missing"]
+        or result["line_bytes_invented"]
+        or result["received_bytes"] != result["received_bytes_by_the_tap"]
+    )
 
 
 def main() -> None:
@@ -81,7 +152,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         result = cycles(10 if arguments.quick else arguments.cycles, arguments.seed, Path(folder))
     show({**result, "seconds": round(time.monotonic() - start, 1), **conditions()}, arguments.json)
-    if result["lost"] or result["bad_lines"] or result["cycles_in_a_gap_record"] != result["cycles"]:
+    if failed(result):
         sys.exit(1)
 
 

@@ -62,6 +62,42 @@ def test_streams_of_one_name_keep_apart() -> None:
     assert len(logs) == sum(len(file.result.streams) for file in logs.files)
 
 
+@pytest.fixture(scope="module")
+def flight() -> ac.Flight:
+    return ac.open_flight(SAMPLE / "flight.yaml", overrides={"rss.lag": "off", "rss.bootstrap": 20})
+
+
+def test_a_flight_gives_its_series_as_frames(flight: ac.Flight) -> None:
+    assert set(flight.rss.tower) <= set(flight.site.towers)
+    assert len(flight.rss) == sum(len(series.time) for series in flight.data.rss)
+    assert len(flight.rank) == sum(len(series.time) for series in flight.data.rank)
+    assert flight.track.time.is_monotonic_increasing
+    assert flight.track[["east_m", "north_m", "up_m"]].notna().all(axis=None)
+    assert "samples" in flight._repr_html_()
+    assert "RSS series" in repr(flight)
+
+
+def test_a_replayed_flight_has_levels_matrices_and_paths_that_agree(flight: ac.Flight) -> None:
+    replayed = flight.replay(max_depth=0, foliage="none")
+    key = next(key for key in replayed.series if key[1] != "rank")
+    level, h = replayed.rss_dbm[key], replayed.h[key]
+    one = replayed.series[key]
+    power = one.link.transmit_power_dbm + 10 * np.log10((np.abs(h) ** 2).mean(axis=(1, 2)))
+    known = np.isfinite(level[one.valid])
+    assert level[one.valid][known] == pytest.approx(power[known], abs=1e-9)
+    assert replayed.paths[key].depth.max() == 0
+    data = replayed.to_xarray()[key]
+    assert data.sizes["pose"] == one.valid.sum()
+    assert {"time", "east_m"} <= set(data.coords)
+    table = replayed.compare().to_frame()
+    assert len(table) == len(flight.data.rss)
+    assert {"rmse_db", "free_space_rmse_db", "two_ray_rmse_db"} <= set(table.columns)
+    with pytest.raises(Exception, match="did you mean 'max_depth'"):
+        flight.replay(max_deph=1)
+    with pytest.raises(Exception, match="as it stands"):
+        flight.report("nowhere")
+
+
 def test_trace_takes_plain_positions_and_equals_free_space_where_nothing_reflects() -> None:
     from aerpaw_cmp.propagation.arrays import single_element
 

@@ -13,8 +13,9 @@ from aerpaw_cmp.common.outputs import file_digest
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.report.build import rss_panel
+from aerpaw_cmp.report.build import report_data, rss_panel
 from aerpaw_cmp.report.data import RssPanel
+from aerpaw_cmp.report.export import metrics
 
 SAMPLE = Path(__file__).parents[1] / "sample_logs" / "flight.yaml"
 OFFSETS = {"LW1": {"USRP1": 12.3, "USRP2": -8.7}, "LW2": {"USRP1": 38.6}}
@@ -78,6 +79,33 @@ def test_planted_clock_shift_is_found_and_applied(tmp_path: Path) -> None:
         assert clock["applied"] == "estimated and applied"
         assert abs(clock["radio_minus_telemetry_s"] - shift) < 0.1
         assert abs(rss[tower]["USRP1"].offset_db - OFFSETS[tower]["USRP1"]) < 0.2
+
+
+def test_the_clock_has_one_sign_on_every_path(tmp_path: Path) -> None:
+    """A radio that is 2.5 s ahead: simulated, estimated, given by hand, compared, written."""
+    path = flight(tmp_path, clock_shift_s={"LW1": 2.5}, offsets_db={"LW1": {"USRP1": 12.3}})
+    content = yaml.safe_load(path.read_text())
+    content["logs"] = [log for log in content["logs"] if log.get("node", "LW1") == "LW1"]
+    content["report"] = {"speed_table": False}
+    path.write_text(yaml.safe_dump(content))
+    assert main(["simulate", str(path)]) == 0
+    settings = load_flight(path)
+    files = read_logs(settings, tmp_path)
+    found = {}
+    for lag in ("apply", 2.5, 0.0, -2.5):
+        changed = settings.model_copy(update={"rss": settings.rss.model_copy(update={"lag": lag})})
+        data = gather(changed, tmp_path, files)
+        result = run_flight(data, audit=False).result
+        found[lag] = metrics(report_data(data, result))["rss"]["LW1"]["USRP1"]
+    assert abs(found["apply"]["lag_s"] - 2.5) < 0.05
+    low, high = found["apply"]["clock"]["ci95_s"]
+    assert low <= 2.5 <= high
+    for lag in (2.5, 0.0, -2.5):
+        assert found[lag]["lag_s"] == found[lag]["clock"]["radio_minus_telemetry_s"] == lag
+    rmse = {lag: numbers["rmse_db"] for lag, numbers in found.items()}
+    assert rmse["apply"] < 0.3, rmse  # corners of the plan lie between telemetry rows
+    assert rmse[2.5] < 0.3, rmse
+    assert rmse[2.5] < 0.3 * rmse[0.0] < 0.3 * rmse[-2.5]
 
 
 def test_bad_lines_are_rejected_and_counted(tmp_path: Path) -> None:

@@ -25,6 +25,9 @@ SPAN_DB = (-50.0, 50.0)
 STEP_DB = 0.1
 """Search step of arXiv 2502.10324, section V [dB]."""
 
+MAXIMUM_OFFSETS = 10_000_000
+"""A longer grid is a mistake in the step or the span, and would not fit in memory."""
+
 _TIE = 1e-9
 """Distances that differ by less than this share of a step are ties (0.15 lies between 0.1 and 0.2)."""
 
@@ -90,6 +93,8 @@ def offset_grid(step_db: float = STEP_DB, span_db: tuple[float, float] = SPAN_DB
     low, high = span_db
     if not (step_db > 0 and np.isfinite([step_db, low, high]).all()):
         raise ValueError(f"offset step and span must be finite and the step positive, found {step_db}, {span_db}")
+    if (high - low) / step_db > MAXIMUM_OFFSETS:
+        raise ValueError(f"{(high - low) / step_db:.0e} offsets to try, at most {MAXIMUM_OFFSETS}")
     first = int(np.ceil(low / step_db - _TIE))
     last = int(np.floor(high / step_db + _TIE))
     if last < first:

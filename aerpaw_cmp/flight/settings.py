@@ -33,9 +33,9 @@ Positive = Annotated[float, Field(gt=0)]
 
 
 class Settings(BaseModel):
-    """Base of all settings: frozen, nothing unknown."""
+    """Base of all settings: frozen, nothing unknown, every number one."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
 
 
 class AntennaSettings(Settings):
@@ -75,7 +75,7 @@ class ArraySettings(Settings):
 
     layout: Literal["single", "linear", "tower_comparison", "uav_comparison", "custom"] = "single"
     elements: Annotated[int, Field(ge=1, le=64)] = 4
-    positions_m: list[tuple[float, float, float]] | None = None
+    positions_m: Annotated[list[tuple[float, float, float]], Field(max_length=64)] | None = None
     antenna: AntennaSettings = AntennaSettings()
     antennas: list[AntennaSettings] | None = None
     """One per element, in place of ``antenna``."""
@@ -341,14 +341,18 @@ class ReferencePowers(Settings):
     """The sounder logs dB re full scale minus its gain setting."""
 
 
+MAXIMUM_OFFSETS = 1_000_000
+"""The offset grid of a report may not be longer: 100 dB in steps of 0.0001 dB."""
+
+
 class RssSettings(Settings):
     """How RSS is compared."""
 
     step_db: Positive = 0.1
     span_db: tuple[float, float] = (-50.0, 50.0)
     lag: Literal["off", "estimate", "apply"] | float = "estimate"
-    """Clock offset: estimated and shown, estimated and applied, or applied as given [s]."""
-    lag_window_s: Positive = 15.0
+    """Radio minus telemetry clock: estimated and shown, estimated and applied, or taken off as given [s]."""
+    lag_window_s: Annotated[float, Field(gt=0, le=3600)] = 15.0
     field: Literal["coherent", "power", "local_mean"] = "coherent"
     """Which simulated RSS is compared."""
     window_s: Annotated[float, Field(ge=0)] = 0.0
@@ -364,6 +368,12 @@ class RssSettings(Settings):
             raise ValueError("field: local_mean averages over window_s, which must be above 0")
         return self
 
+    @model_validator(mode="after")
+    def _countable(self) -> RssSettings:
+        if (self.span_db[1] - self.span_db[0]) / self.step_db > MAXIMUM_OFFSETS:
+            raise ValueError(f"span_db over step_db gives more than {MAXIMUM_OFFSETS} offsets to try")
+        return self
+
     @field_validator("span_db")
     @classmethod
     def _ordered(cls, value: tuple[float, float]) -> tuple[float, float]:
@@ -376,7 +386,7 @@ class RankSettings(Settings):
     """How rank is compared."""
 
     tower: str = "LW1"
-    k: Annotated[list[Positive], Field(min_length=1)] = [10.0, 100.0, 1000.0]
+    k: Annotated[list[Positive], Field(min_length=1, max_length=64)] = [10.0, 100.0, 1000.0]
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000

@@ -10,6 +10,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterable
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +21,7 @@ from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.outputs import OutputSet
 from ..common.stages import Progress, silent
-from ..common.units import FloatArray, IntArray
+from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
@@ -60,6 +61,10 @@ class Trajectory:
         return np.asarray((np.diff(self.position_m, axis=0) / np.diff(self.time_s)[:, None])[leg])
 
 
+MAXIMUM_SAMPLES = 5_000_000
+"""Of one simulated log: 140 h at ten a second."""
+
+
 def plan_trajectory(plan: PlanSettings) -> Trajectory:
     """Corner times from speeds, climb rates and waiting times.
 
@@ -85,6 +90,13 @@ def plan_trajectory(plan: PlanSettings) -> Trajectory:
         if point.hold_s > 0:
             times.append(times[-1] + point.hold_s)
             positions.append(here)
+    shortest = min(plan.telemetry_interval_s, plan.rss_interval_s, plan.rank_interval_s)
+    if times[-1] / shortest > MAXIMUM_SAMPLES:
+        raise UsageError(
+            f"the plan lasts {times[-1]:.3g} s, with a sample every {shortest:g} s",
+            expected=f"at most {MAXIMUM_SAMPLES} samples of a log",
+            cause="a misplaced waypoint, a speed or an interval with too few digits",
+        )
     if len(times) < 2:
         raise UsageError("the plan does not move and does not wait", expected="waypoints that differ, or hold_s")
     return Trajectory(np.array(times), np.array(positions, dtype=np.float64))
@@ -151,6 +163,23 @@ def correlated_noise(
     return np.asarray(lfilter([1.0], [1.0, -keep], white) * standard_deviation)
 
 
+def _local_start(start: datetime, timezone: str) -> pd.Timestamp:
+    """The start in its zone; a wall time that never was, or was twice, or no clock can show, is refused."""
+    try:
+        local: pd.Timestamp = pd.Timestamp(start.replace(tzinfo=None)).tz_localize(
+            timezone, ambiguous="NaT", nonexistent="NaT"
+        )
+        if not 1980 <= start.year <= 2200:
+            why = "a clock that nothing flew by"
+        elif not pd.isna(local):
+            return local
+        else:
+            why = "the clocks changed then: it never was, or it was twice"
+    except (ValueError, OverflowError) as error:
+        why = str(error)
+    raise UsageError(f"flight.plan.start {start} in {timezone}", expected="a wall time", cause=why)
+
+
 class FlightSimulator:
     """Writes the logs of one planned flight.
 
@@ -204,7 +233,7 @@ class FlightSimulator:
         self.plan = plan
         self.generator = np.random.default_rng(plan.seed)
         self.trajectory = plan_trajectory(plan)
-        start = pd.Timestamp(plan.start.replace(tzinfo=None)).tz_localize(self.settings.timezone)
+        start = _local_start(plan.start, self.settings.timezone)
         self.start_utc = start.tz_convert("UTC").tz_localize(None)
         self.truth_: dict[str, Any] = {"flight": self.settings.flight.name, "synthetic": True, "rss": {}, "rank": {}}
         names = self._names(out)
@@ -246,6 +275,8 @@ class FlightSimulator:
 
     def _poses(self, time_s: FloatArray) -> Poses:
         position = self.trajectory.position_at(time_s)
+        # as the replay does: on the ground itself the two rays cancel
+        position[:, 2] = np.maximum(position[:, 2], MINIMUM_HEIGHT_M)
         if self.settings.rt.attitude == "ignored":
             return Poses(position, np.broadcast_to(np.eye(3), (len(time_s), 3, 3)))
         roll, pitch, yaw = plan_attitude(self.trajectory, time_s)

@@ -422,16 +422,17 @@ _FEWEST = 30
 """Fewer samples tell nothing about a lag."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LagFit:
     """Offset and drift between the radio and the telemetry clock.
 
     Parameters
     ----------
-    lag_s : float
-        To be **added to radio times** to get telemetry times [s], at ``reference``; NaN if failed.
+    radio_minus_telemetry_s : float
+        The lag [s] at ``reference``: positive where the radio's clock shows later times, to be **subtracted from radio
+        times**; NaN if failed.
     interval_s : (low, high)
-        95 % interval of ``lag_s``; the whole window where the data say nothing.
+        95 % interval of ``radio_minus_telemetry_s``; the whole window where the data say nothing.
     drift_s_per_s : float
         Growth of the lag; 0 where it was not fitted.
     drift_interval_s_per_s : (low, high)
@@ -441,7 +442,7 @@ class LagFit:
     reason : str
         Why not ok.
     reference : float
-        Instant at which the lag is ``lag_s``: seconds after the first radio sample.
+        Instant at which the lag is ``radio_minus_telemetry_s``: seconds after the first radio sample.
     n : int
         Samples used.
     rmse_db, rmse_unshifted_db : float
@@ -449,12 +450,12 @@ class LagFit:
     window_s : float
         Lags searched on either side [s].
     curve_lag_s, curve_rmse_db : (m,)
-        Residual against lag (without drift).
+        Residual against lag (without drift), of the same sign.
     evidence : (m,)
         Log-likelihood ratio by which every lag of the curve is worse than the best one.
     """
 
-    lag_s: float
+    radio_minus_telemetry_s: float
     interval_s: tuple[float, float]
     drift_s_per_s: float
     drift_interval_s_per_s: tuple[float, float]
@@ -472,8 +473,8 @@ class LagFit:
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None, the curve is left out."""
         names = {
-            "lag_s": self.lag_s,
-            "lag_ci95_s": list(self.interval_s),
+            "radio_minus_telemetry_s": self.radio_minus_telemetry_s,
+            "ci95_s": list(self.interval_s),
             "drift_ms_per_min": self.drift_s_per_s * 60e3,
             "drift_ci95_ms_per_min": [60e3 * v for v in self.drift_interval_s_per_s],
             "verdict": self.verdict,
@@ -491,15 +492,21 @@ class LagFit:
 
         return {name: known(value) for name, value in names.items()}
 
-    def apply(self, times: AnyArray) -> AnyArray:
-        """Radio times (datetime64 or seconds, the first sample first) on the telemetry clock."""
+    def at(self, times: AnyArray) -> FloatArray:
+        """Radio minus telemetry clock (n,) [s] at radio times (n,), datetime64 or seconds, in any order."""
         array = np.asarray(times)
+        if not len(array):
+            return np.zeros(0)
+        since = array - array.min()
+        elapsed = since / np.timedelta64(1, "s") if array.dtype.kind == "M" else since
+        return np.asarray(self.radio_minus_telemetry_s + self.drift_s_per_s * (elapsed - self.reference))
+
+    def apply(self, times: AnyArray) -> AnyArray:
+        """Radio times (n,), datetime64 or seconds, on the telemetry clock."""
+        array, lag = np.asarray(times), self.at(times)
         if array.dtype.kind == "M":
-            since = (array - array[0]) / np.timedelta64(1, "s")
-            lag = self.lag_s + self.drift_s_per_s * (since - self.reference)
-            return np.asarray(array + np.round(lag * 1e9).astype("timedelta64[ns]"))
-        lag = self.lag_s + self.drift_s_per_s * (array - array[0] - self.reference)
-        return np.asarray(array + lag)
+            return np.asarray(array - np.round(lag * 1e9).astype("timedelta64[ns]"))
+        return np.asarray(array - lag)
 
 
 class _Prediction:
@@ -643,20 +650,20 @@ def _symmetric(window: float, step: float) -> FloatArray:
 def _no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
     nan = float("nan")
     return LagFit(
-        nan,
-        (-window_s, window_s),
-        0.0,
-        (nan, nan),
-        "failed",
-        reason,
-        0.0,
-        n,
-        nan,
-        nan,
-        window_s,
-        lags,
-        np.full(len(lags), nan),
-        np.zeros(len(lags)),
+        radio_minus_telemetry_s=nan,
+        interval_s=(-window_s, window_s),
+        drift_s_per_s=0.0,
+        drift_interval_s_per_s=(nan, nan),
+        verdict="failed",
+        reason=reason,
+        reference=0.0,
+        n=n,
+        rmse_db=nan,
+        rmse_unshifted_db=nan,
+        window_s=window_s,
+        curve_lag_s=lags,
+        curve_rmse_db=np.full(len(lags), nan),
+        evidence=np.zeros(len(lags)),
     )
 
 
@@ -733,7 +740,7 @@ def _fit_lag(
     least = max(_FEWEST, len(ts) // 2)
 
     def residual(lag: float, rate: float, phi: float = 0.0) -> FloatArray:
-        at = ts + lag + rate * (ts - middle)
+        at = ts - lag - rate * (ts - middle)
         y = ms - prediction.at(at)
         return y - _explained(y, prediction.terms_at(at), phi) if prediction.terms.shape[1] else y
 
@@ -763,9 +770,21 @@ def _fit_lag(
         verdict, reason = "ambiguous", "at its best lag the prediction explains no more than a constant"
     nan = float("nan")
     return LagFit(
-        lag, interval, rate, (rate - rate_width, rate + rate_width) if drifting else (nan, nan), verdict, reason,
-        middle, len(t), rmse, float(np.sqrt(plain[len(lags) // 2])), float(lags[-1]), lags, np.sqrt(plain), ratio[:-1],
-    )  # fmt: skip
+        radio_minus_telemetry_s=lag,
+        interval_s=interval,
+        drift_s_per_s=rate,
+        drift_interval_s_per_s=(rate - rate_width, rate + rate_width) if drifting else (nan, nan),
+        verdict=verdict,
+        reason=reason,
+        reference=middle,
+        n=len(t),
+        rmse_db=rmse,
+        rmse_unshifted_db=float(np.sqrt(plain[len(lags) // 2])),
+        window_s=float(lags[-1]),
+        curve_lag_s=lags,
+        curve_rmse_db=np.sqrt(plain),
+        evidence=ratio[:-1],
+    )
 
 
 def _between(cost: FloatArray, lags: FloatArray, cost_at: Callable[[float], float]) -> float:
@@ -800,7 +819,7 @@ def _refine(
 
     def evaluate(shift: FloatArray, phi: float) -> tuple[FloatArray, FloatArray, FloatArray]:
         """Residual (n,); residual and Jacobian whitened, without what a constant and the free terms explain."""
-        at = t + shift @ relative
+        at = t - shift @ relative
         y, slope, terms = m - prediction.smooth_at(at), prediction.at(at, prediction.slope), prediction.terms_at(at)
         ok = np.isfinite(y) & np.isfinite(slope) & np.isfinite(terms).all(axis=1)
         y, slope, terms, along = y[ok], slope[ok], terms[ok], relative[:, ok]
@@ -809,7 +828,7 @@ def _refine(
         if terms.shape[1] > 1:  # the free terms move with the lag too
             moved = prediction.terms_at(at, prediction.term_slopes)[ok]
             slope = slope + np.einsum("ni,i->n", moved, coefficients)
-        jacobian = -slope * along
+        jacobian = slope * along  # of the residual: the lag is subtracted from the time
         columns = np.vstack([b, jacobian[:, 1:] - phi * jacobian[:, :-1]])
         columns = columns - np.einsum("ki,ni->kn", _on_terms(base, columns), base)
         return y - np.einsum("ni,i->n", terms, coefficients), columns[0], columns[1:]
@@ -913,7 +932,7 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
     """
     if not fits or any(len(fit.curve_lag_s) != len(fits[0].curve_lag_s) for fit in fits):
         raise ValueError("lags to combine must be at least one, and searched over the same window")
-    heard = [fit for fit in fits if np.isfinite(fit.lag_s)]
+    heard = [fit for fit in fits if np.isfinite(fit.radio_minus_telemetry_s)]
     if len(heard) < 2:
         return heard[0] if heard else fits[0]
     lags = heard[0].curve_lag_s
@@ -921,8 +940,8 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
     total = total - total.min()
     sharp = min(heard, key=lambda fit: fit.interval_s[1] - fit.interval_s[0])
     best = float(lags[_best(np.where(total > 0, total, 0.0) + 1.0, lags)])
-    near = abs(sharp.lag_s - best) <= lags[1] - lags[0]  # the sharpest fit is finer than the grid
-    lag = sharp.lag_s if near else best
+    near = abs(sharp.radio_minus_telemetry_s - best) <= lags[1] - lags[0]  # the sharpest fit is finer than the grid
+    lag = sharp.radio_minus_telemetry_s if near else best
     width = 0.5 * float(lags[1] - lags[0])
     if near and sharp.verdict == "ok":
         width = 0.5 * (sharp.interval_s[1] - sharp.interval_s[0])
@@ -934,9 +953,21 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
 
     curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in heard], axis=0) / count)
     return LagFit(
-        lag, interval, sharp.drift_s_per_s, sharp.drift_interval_s_per_s, verdict, reason, sharp.reference, count,
-        pooled("rmse_db"), pooled("rmse_unshifted_db"), heard[0].window_s, lags, curve, total,
-    )  # fmt: skip
+        radio_minus_telemetry_s=lag,
+        interval_s=interval,
+        drift_s_per_s=sharp.drift_s_per_s,
+        drift_interval_s_per_s=sharp.drift_interval_s_per_s,
+        verdict=verdict,
+        reason=reason,
+        reference=sharp.reference,
+        n=count,
+        rmse_db=pooled("rmse_db"),
+        rmse_unshifted_db=pooled("rmse_unshifted_db"),
+        window_s=heard[0].window_s,
+        curve_lag_s=lags,
+        curve_rmse_db=curve,
+        evidence=total,
+    )
 
 
 # --- whole hours ---------------------------------------------------------------------------------------------------
@@ -949,7 +980,7 @@ class ClockTrap:
     Parameters
     ----------
     hours : float
-        To be added to radio times.
+        To be added to radio times (whole hours of a time zone, no lag).
     overlap_s, shifted_overlap_s : float
         Overlap with the telemetry before and after the shift [s].
     explanation : str

@@ -189,19 +189,17 @@ def _estimated_clock(data: FlightData, series: RssSeries, predictions: _Predicti
 
 
 def _clock_of(fit: LagFit, by: str, time: Times, *, apply: bool) -> Clock:
-    """A fit as the clock of a series with these radio times (n,). The fit's lag is to be added to radio times."""
+    """A fit as the clock of a series with these radio times (n,)."""
     used = apply and fit.verdict == "ok"
-    elapsed = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
-    shift_s = -(fit.lag_s + fit.drift_s_per_s * (elapsed - fit.reference))
     found = ClockResult(
-        radio_minus_telemetry_s=-fit.lag_s,
-        ci95_s=(-fit.interval_s[1], -fit.interval_s[0]),
-        drift_s_per_s=-fit.drift_s_per_s,
+        radio_minus_telemetry_s=fit.radio_minus_telemetry_s,
+        ci95_s=fit.interval_s,
+        drift_s_per_s=fit.drift_s_per_s,
         verdict=fit.verdict,
         reason=f"by the {by}" + (f": {fit.reason}" if fit.reason else ""),
         applied="estimated and applied" if used else "estimated, not applied",
     )
-    return Clock(found=found, applied_s=shift_s if used else np.zeros(len(time)))
+    return Clock(found=found, applied_s=fit.at(time) if used else np.zeros(len(time)))
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:

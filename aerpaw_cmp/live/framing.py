@@ -292,6 +292,15 @@ class Framer:
             del self._owed[:-16]
         return answer
 
+    def leave(self) -> tuple[tuple[str, ...], str]:
+        """What is held and belongs to nothing: lines of owed answers, and the unfinished line. Forgotten here."""
+        lines, self._stray = tuple(self._stray), []
+        partial = self._buffer.peek()
+        for _ in self._buffer.flush():
+            pass
+        self._owed.clear()
+        return lines, partial
+
     def settle(self) -> list[Event]:
         """Forget what is owed (a probe was answered, so the modem is in step again)."""
         self._owed.clear()

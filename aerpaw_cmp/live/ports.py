@@ -14,6 +14,7 @@ import fnmatch
 import grp
 import os
 import pwd
+import re
 import select
 import stat
 import termios
@@ -21,7 +22,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..common.errors import AerpawCmpError, InputError
+from ..common.errors import AerpawCmpError, InputError, UsageError
 
 QUECTEL_VENDOR = "2c7c"
 AT_INTERFACES = ("02", "03")
@@ -134,8 +135,11 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     ------
     PortGoneError
         If it is not there.
+    UsageError
+        If it is a URL of pyserial.
     """
     roots = roots or Roots()
+    _refuse_url(port)
     if port is None:
         found = find_candidates(roots)
         if not found:
@@ -152,6 +156,27 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
             if link.resolve() == path.resolve():
                 return PortInfo(link, path.resolve(), "by-id", interface, product)
     return PortInfo(path, path.resolve(), "given", interface, product)
+
+
+_URL = re.compile(r"([A-Za-z][A-Za-z0-9+.]{1,12})://(.*)", re.DOTALL)
+
+
+def _refuse_url(port: str | Path | None) -> None:
+    """The tap opens devices itself (see the head of this file); what pyserial calls a URL is refused by name."""
+    found = _URL.fullmatch(port) if isinstance(port, str) else None
+    if found is None:
+        return
+    kind, rest = found[1].lower(), found[2]
+    bridge = {
+        "socket": f"socat pty,link=/tmp/modem,rawer tcp:{rest or 'HOST:PORT'}",
+        "loop": "aerpaw-cmp modem-sim --link /tmp/modem",
+    }
+    command = bridge.get(kind, "socat pty,link=/tmp/modem,rawer ...")
+    raise UsageError(
+        f"the port is a URL of pyserial ({kind}://)",
+        expected="a serial device, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+        cause=f"the tap opens devices only; '{command}' makes one, for 'aerpaw-cmp tap /tmp/modem'",
+    )
 
 
 def holders(path: Path, *, others_only: bool = True) -> list[Holder]:

@@ -378,6 +378,7 @@ class ModemSimulator:
         self._pending: Served | None = None
         self.journal: list[Served] = []
         self.unplugs: list[int] = []
+        self.sent_bytes = 0
         self.keep_journal = True
         self._node = self._plug()
         self._thread = threading.Thread(target=self._run, name="modem-sim", daemon=True)
@@ -509,7 +510,9 @@ class ModemSimulator:
                 if self._master < 0:
                     return False
                 try:
-                    data = data[os.write(self._master, data[:4096]) :]
+                    count = os.write(self._master, data[:4096])
+                    self.sent_bytes += count
+                    data = data[count:]
                     continue
                 except OSError as error:
                     if error.errno not in (errno.EAGAIN, errno.EINTR):

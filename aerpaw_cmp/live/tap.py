@@ -86,6 +86,7 @@ class Tap:
         self._info: PortInfo | None = None
         self._heard: bytearray | None = None
         self._early: list[Record] = []
+        self._received = 0
         self._log_open = False
         self._in_step = True
         self._initialise_again = False
@@ -192,6 +193,7 @@ class Tap:
             self._worker.close()
             self._log_predictions()
         self._flush_noise()
+        self._leave_framer()
         duration_s = (self._clock.mono_ns() - self._start_ns) / 1e9
         answers = {name: dict(counts) for name, counts in self._answers.items()}
         rates = {name: round(counts["ok"] / max(duration_s, 1e-9), 4) for name, counts in self._answers.items()}
@@ -205,6 +207,7 @@ class Tap:
             "gap_s": self._gap_ns / 1e9,
             "duration_s": duration_s,
             "redacted": self._redactor.count,
+            "received_bytes": self._received,
             "csi_restored": restored,
             **self._now(),
         }
@@ -282,6 +285,7 @@ class Tap:
         return found
 
     def _open_and_probe(self, info: PortInfo) -> None:
+        self._leave_framer()
         self._framer = Framer()
         self._port = SerialPort.open(info.path)
         self._heard = bytearray()
@@ -304,13 +308,36 @@ class Tap:
             self._port.close()
             self._port = None
 
+    def _leave_framer(self) -> None:
+        """What came and was finished by nothing is written down before it is forgotten."""
+        lines, partial = self._left()
+        if lines or partial:
+            self._record({"kind": "unsolicited", "lines": lines, "partial": partial, "dropped_bytes": 0, **self._now()})
+
+    def _left(self) -> tuple[list[str], str]:
+        lines, partial = self._framer.leave()
+        return [self._redactor.clean(line) for line in lines], self._redactor.clean(partial, cut=True)
+
     def _lost(self, reason: str) -> None:
+        with contextlib.suppress(PortGoneError):
+            self._drain()  # what still waits in the port, before it is closed
         self._close_port()
         if self._gap_open is not None:
             return
+        lines, partial = self._left()
         self._gaps += 1
         self._gap_open = (self._clock.utc_ns(), self._clock.mono_ns(), reason)
-        self._record({"kind": "gap", "state": "open", "reason": self._redactor.clean(reason), **self._now()})
+        self._record(
+            {
+                "kind": "gap",
+                "state": "open",
+                "reason": self._redactor.clean(reason),
+                "lines": lines,
+                "partial": partial,
+                "received_bytes": self._received,
+                **self._now(),
+            }
+        )
         self._log.sync()
         self._say(f"lost: {reason}; looking for it")
 
@@ -441,6 +468,7 @@ class Tap:
         """Take what the port has; everything but the answer in flight is recorded here."""
         assert self._port is not None
         data = self._port.read()
+        self._received += len(data)
         if self._heard is not None:
             self._heard += data[: 4096 - len(self._heard)]
         answer = None
@@ -477,7 +505,7 @@ class Tap:
         if answer.code is not None:
             record["code"] = self._redactor.clean(answer.code)
         if answer.partial:
-            record["partial"] = self._redactor.clean(answer.partial[:1000], cut=True)
+            record["partial"] = self._redactor.clean(answer.partial, cut=True)
         self._record(record)
         self._answers.setdefault(name, Counter())[answer.status] += 1
         self._note(name, answer, decoded, record)

@@ -11,7 +11,7 @@ import shutil
 import sys
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
-from importlib import metadata
+from importlib import import_module, metadata
 from pathlib import Path
 from typing import Any, Literal
 
@@ -225,16 +225,29 @@ def holders(device: str) -> list[str]:
 
 def serial_checks() -> Iterator[Check]:
     """Serial ports, whether this user may open them and who holds them; no port is opened."""
+    if missing := [name for name in ("fcntl", "termios") if not _importable(name)]:
+        found = f"this system has no {' and no '.join(missing)}: 'tap' and 'modem-sim' need Linux, all else works"
+        yield Check("Serial", "warn", found, "run the tap on Linux")
+        return
     try:
         from serial.tools import list_ports
-    except ImportError:
-        yield Check("Serial", "fail", "pyserial is not installed", "make setup")
+    except ImportError as error:
+        what = "pyserial is not installed" if not _importable("serial") else f"pyserial cannot be loaded ({error})"
+        yield Check("Serial", "fail", what, "make setup")
         return
     ports = sorted(port for port in list_ports.comports() if port.vid is not None or "ttyS" not in port.device)
     if not ports:
         yield Check("Serial", "ok", "no USB serial port: plug the modem in to use 'aerpaw-cmp tap'")
     for port in ports:
         yield serial_check(port.device, port.description or "")
+
+
+def _importable(name: str) -> bool:
+    try:
+        import_module(name)
+    except ImportError:
+        return False
+    return True
 
 
 def serial_check(device: str, description: str = "") -> Check:

@@ -18,6 +18,8 @@ from ..common.units import AnyArray, FloatArray, IntArray
 PAPER_SPACING_M = 30.0
 """Horizontal interval d_rx of the UAV positions."""
 
+MAXIMUM_CELLS_A_SIDE = 10_000
+
 OUT_OF_COVERAGE = "Z"
 """How plots and tables name a position without any path."""
 
@@ -68,11 +70,17 @@ class Grid:
         axes = []
         for low, high in ((east_min, east_max), (north_min, north_max)):
             # 1080 / 30 must not become 35.999 cells
-            cells = int(np.floor((high - low) / spacing_m + 1e-9)) if spacing_m > 0 else 0
+            cells = int(np.floor(min((high - low) / spacing_m, 1e9) + 1e-9)) if spacing_m > 0 else 0
             if cells < 1:
                 raise UsageError(
                     f"a map of {high - low:g} m with a spacing of {spacing_m:g} m has no cell",
                     expected="a positive spacing smaller than the area",
+                )
+            if cells > MAXIMUM_CELLS_A_SIDE:
+                raise UsageError(
+                    f"a map of {high - low:g} m in steps of {spacing_m:g} m has too many cells",
+                    expected=f"at most {MAXIMUM_CELLS_A_SIDE}",
+                    cause="a spacing with too few digits",
                 )
             axes.append((low + high) / 2 + spacing_m * (np.arange(cells) - (cells - 1) / 2))
         return cls(np.asarray(axes[0], dtype=np.float64), np.asarray(axes[1], dtype=np.float64), float(spacing_m))

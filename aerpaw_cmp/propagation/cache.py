@@ -8,7 +8,6 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import zipfile
 from dataclasses import asdict
 from importlib import metadata
 from pathlib import Path
@@ -21,8 +20,11 @@ from ..common.units import FloatArray
 from .paths import PathSet
 from .scene import Scene, Settings
 
-LAYOUT = 2
+LAYOUT = 3
 """Raised whenever the entries or the search change."""
+
+_SEAL = b"AERPAWCP"
+"""Stands behind the entry, before the SHA-256 of all bytes in front of it."""
 
 _COLUMNS = ("pose", "tower", "depth", "faces", "vertices_m")
 
@@ -34,10 +36,16 @@ class PathCache:
     ----------
     folder : Path
         Created when the first entry is saved.
+
+    Attributes
+    ----------
+    told : list of str
+        Entries that were damaged, for people.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
+        self.told: list[str] = []
 
     def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, settings: Settings) -> str:
         """Digest of everything that decides the paths."""
@@ -57,18 +65,28 @@ class PathCache:
         return digest.hexdigest()
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
-        """Paths and the seconds that their search took; None when the entry is missing or damaged."""
+        """Paths and the seconds that their search took; None when the entry is missing or damaged (see ``told``).
+
+        The seal is checked before any of it is parsed: damaged archives make their readers fail in a dozen ways.
+        """
+        place = self.folder / f"{key}.npz"
         try:
-            # in memory first: np.load leaves a damaged file open
-            data = io.BytesIO((self.folder / f"{key}.npz").read_bytes())
-            with np.load(data, allow_pickle=False) as entry:
-                return PathSet(*(entry[name] for name in _COLUMNS)), float(entry["seconds"])
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile):
+            content = place.read_bytes()
+        except OSError:
             return None
+        entry, seal = content[: -len(_SEAL) - 32], content[-len(_SEAL) - 32 :]
+        if seal == _SEAL + hashlib.sha256(entry).digest():
+            with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
+                return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
+        self.told.append(f"a damaged entry of the path cache was not used, the paths were searched anew: {place}")
+        return None
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
         with contextlib.suppress(OSError):  # a cache that cannot be written is no reason to fail
             self.folder.mkdir(parents=True, exist_ok=True)
-            with whole(self.folder / f"{key}.npz") as part, part.open("wb") as stream:
-                np.savez(stream, seconds=seconds, **{column: getattr(paths, column) for column in _COLUMNS})
+            columns = {column: getattr(paths, column) for column in _COLUMNS}
+            entry = io.BytesIO()
+            np.savez(entry, seconds=np.float64(seconds), **columns)
+            with whole(self.folder / f"{key}.npz") as part:
+                part.write_bytes(entry.getvalue() + _SEAL + hashlib.sha256(entry.getvalue()).digest())

@@ -173,9 +173,10 @@ def replay(
     if engine not in ("image", "sionna"):
         raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
     started = time.perf_counter()
+    poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
-    left_out += _buried_towers(site, link)
+    left_out += [*refused, *_buried_towers(site, link)]
     settings = Settings(engine, max_depth, samples, batch, variant)
     if relevance_db is not None:
         paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
@@ -184,6 +185,7 @@ def replay(
     else:
         cache = _cache(engine, cache_dir)
         paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+        left_out += cache.told if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
     if crowns is not None:
@@ -198,6 +200,37 @@ def replay(
         left_out=left_out,
         from_cache=from_cache,
     )
+
+
+REACH_M = 100_000.0
+"""Poses further than this from every tower [m] are no poses of the site."""
+
+
+def _within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
+    """Poses with those that cannot be replayed as unknown (NaN): each alone, so that the others keep their paths.
+
+    Tolerances grow with the size of the scene: one pose at 1e12 m would change the paths of all. A pose without a
+    rotation has no field.
+    """
+    towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+    known = np.isfinite(poses.position_m).all(axis=1)
+    turned = np.isfinite(poses.rotation).all(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        far = np.ones(len(poses), dtype=np.bool_)
+        for place in towers:
+            far &= ~(np.abs(poses.position_m - place).max(axis=1) <= REACH_M)
+    far &= known
+    bad = far | ~turned
+    if not bad.any():
+        return poses, []
+    told = [
+        (far, f"poses further than {REACH_M / 1000:g} km from every tower"),
+        (known & ~far & ~turned, "poses without a rotation"),
+    ]
+    lines = [f"{int(mask.sum())} {what}: no path was searched for them" for mask, what in told if mask.any()]
+    position = np.where(bad[:, None], np.nan, poses.position_m)
+    rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
+    return Poses(position, rotation), lines
 
 
 def _buried_towers(site: Site, link: Link) -> list[str]:

@@ -82,6 +82,7 @@ def style() -> Iterator[None]:
         "font.family": "sans-serif",
         "font.sans-serif": ["DejaVu Sans"],
         "font.size": 9.0,
+        "text.parse_math": False,  # names are drawn as they are: a waypoint may be called A_$
         "axes.titlesize": 10.0,
         "axes.titleweight": "bold",
         "axes.titlelocation": "left",

@@ -196,7 +196,7 @@ def cdfs(maps: Sequence[RssMap]) -> Figure:
             joint = one.tower == JOINT
             ax.plot(
                 level[shown], share[shown], color=COLOURS[number % 6], linestyle=LINES[number % 6],
-                linewidth=2.0 if joint else 1.2, label=one.tower,
+                linewidth=2.0 if joint else 1.2, label=f"tower {one.tower}" if one.tower.startswith("_") else one.tower,
             )  # fmt: skip
         ax.set_title(f"{height:g} m")
         ax.set_xlabel("RSS [dBm]")

@@ -173,7 +173,7 @@ def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, pane
     for column, (colour, marker) in enumerate((("#111111", "."), ("#0072B2", "."), ("#9AD0F0", "."))):
         ax.plot(
             seconds, values[:, column], linestyle="none", marker=marker, markersize=2, color=colour, rasterized=True,
-            label=rf"$\sigma_{column + 2}/\sigma_1$",
+            label=f"σ{chr(0x2082 + column)}/σ₁",
         )  # fmt: skip
     for number, at in enumerate(panel.simulated):
         level = -20 * np.log10(at.k)

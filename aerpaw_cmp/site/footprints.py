@@ -25,7 +25,7 @@ from ..common.outputs import OutputFile, is_sealed, sealed
 from ..common.units import FloatArray
 from ..common.yamlfile import dump_yaml
 from .mapfiles import read_map_file
-from .outlines import MapFile, Outline, Position, TreeLine
+from .outlines import MAX_CROSSINGS, MapFile, Outline, Position, TreeLine, is_tangled
 from .site import Building, Forest, Geofence
 from .siteyaml import SiteModel, extent_m, site_model
 from .tags import Kind, is_part, kind_of, levels_of, main_tag, material_of, metres, positive_metres
@@ -351,6 +351,9 @@ def _ring(positions: Sequence[Position], frame: SiteFrame) -> Polygon | None:
 def _repaired(ring: Polygon, notes: list[str], note: str) -> BaseGeometry:
     if ring.is_valid:
         return ring
+    if is_tangled(ring):
+        notes.append(f"a ring that crosses itself at more than {MAX_CROSSINGS} places was left out")
+        return Polygon()
     notes.append(f"{note} ({shapely.is_valid_reason(ring).split('[')[0].lower()})")
     return _areas_only(shapely.make_valid(ring, method="structure"))
 

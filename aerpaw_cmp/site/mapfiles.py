@@ -7,10 +7,14 @@ from __future__ import annotations
 
 import io
 import json
+import lzma
 import re
+import struct
 import zipfile
+import zlib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import cache
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree
@@ -20,7 +24,12 @@ from ..common.errors import InputError
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 
-MAX_BYTES = 512 * 1024 * 1024
+MAX_BYTES = 256 * 1024 * 1024
+"""A map of a whole county is smaller; a site needs a few kilometres."""
+
+MAX_TAGS = 1_500_000
+"""Tags of an XML map file, begin and end: each becomes an object in memory."""
+
 FORMATS = "GeoJSON, OSM XML, Overpass JSON, KML or KMZ"
 
 _OTHER_KINDS: tuple[tuple[bytes, str, str], ...] = (
@@ -69,6 +78,13 @@ def read_map_file(path: str | Path) -> MapFile:
     raise InputError("not a map file", expected=FORMATS, path=path)
 
 
+_BROKEN_ARCHIVE = (
+    zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, NotImplementedError, RuntimeError, EOFError, OSError,
+    ValueError, IndexError, OverflowError,
+)  # fmt: skip
+"""What damaged bytes make ``zipfile`` and its decompressors raise."""
+
+
 def _unzipped(data: bytes, path: Path) -> bytes:
     """The first KML file of a KMZ archive."""
     try:
@@ -83,7 +99,7 @@ def _unzipped(data: bytes, path: Path) -> bytes:
                 )
             with archive.open(main) as file:
                 return file.read(MAX_BYTES)
-    except (zipfile.BadZipFile, NotImplementedError, RuntimeError, EOFError, OSError, ValueError) as error:
+    except _BROKEN_ARCHIVE as error:
         raise InputError(f"not a KMZ archive ({error})", cause="the file was cut off", path=path) from None
 
 
@@ -112,23 +128,25 @@ def _from_json(data: bytes, path: Path) -> MapFile:
 
 
 def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
-    """Line of the n-th element of a list in a JSON text; the text is read again, so this is for messages only."""
+    """Line of the n-th element of a list in a JSON text; the text is read again, once, when the first is asked for."""
+    decoder, gap = json.JSONDecoder(), re.compile(r"[\s,]*")
 
-    def line(index: int) -> int | None:
+    @cache
+    def lines() -> list[int]:
         start = re.search(rf'"{member}"\s*:\s*\[', text)
-        if start is None:
-            return None
-        decoder, gap, at = json.JSONDecoder(), re.compile(r"[\s,]*"), start.end()
-        for _ in range(index + 1):
+        found: list[int] = []
+        at, counted, number = (start.end() if start else len(text)), 0, 1
+        while True:
             at = gap.match(text, at).end()  # type: ignore[union-attr]
-            begin = at
+            number += text.count("\n", counted, at)
+            counted = at
             try:
                 _, at = decoder.raw_decode(text, at)
-            except json.JSONDecodeError:
-                return None
-        return text.count("\n", 0, begin) + 1
+            except (json.JSONDecodeError, RecursionError):
+                return found
+            found.append(number)
 
-    return line
+    return lambda index: lines()[index] if index < len(lines()) else None
 
 
 # ---------------------------------------------------------------- GeoJSON (RFC 7946)
@@ -228,6 +246,13 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
         raise InputError("a web page", expected=FORMATS, cause="the server's message was saved, not the map", path=path)
     if b"<!DOCTYPE" in data[:65536] or b"<!ENTITY" in data[:65536]:
         raise InputError("the XML declares entities", expected="plain OSM or KML", path=path)
+    if (tags := data.count(b"<")) > MAX_TAGS:
+        raise InputError(
+            f"the XML has {tags} tags",
+            expected=f"at most {MAX_TAGS}",
+            cause="a map of a whole country: cut out the site ('osmium extract')",
+            path=path,
+        )
     try:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
@@ -238,7 +263,7 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
     if tag == "kml":
         return _kml(root, path, data)
     if tag == "osm":
-        return read_elements("OSM XML", _osm_elements(root), path, lambda n: _xml_line(data, None, n))
+        return read_elements("OSM XML", _osm_elements(root), path, _xml_lines(data, None))
     raise InputError(f"XML of '{tag}'", expected="OSM ('osm') or KML ('kml')", path=path)
 
 
@@ -247,23 +272,26 @@ def _plain(tag: str) -> str:
     return tag.rpartition("}")[2]
 
 
-def _xml_line(data: bytes, name: str | None, index: int) -> int | None:
-    """Line of the n-th element of a name, or child of the root; the data are read again, for messages only."""
-    lines: list[int] = []
-    depth = [0]
-    parser = expat.ParserCreate()
+def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
+    """Line of the n-th outermost element of a name, or child of the root; read again, once, when one is asked for."""
 
-    def start(tag: str, _: Any) -> None:
-        depth[0] += 1
-        if (depth[0] == 2) if name is None else (tag.rpartition(":")[2] == name):
-            lines.append(parser.CurrentLineNumber)
+    @cache
+    def lines() -> list[int]:
+        found: list[int] = []
+        inside: list[bool] = []
+        parser = expat.ParserCreate()
 
-    def end(_: str) -> None:
-        depth[0] -= 1
+        def start(tag: str, _: Any) -> None:
+            wanted = len(inside) == 1 if name is None else tag.rpartition(":")[2] == name and not any(inside[-1:])
+            if wanted:
+                found.append(parser.CurrentLineNumber)
+            inside.append(name is not None and (wanted or any(inside[-1:])))
 
-    parser.StartElementHandler, parser.EndElementHandler = start, end
-    parser.Parse(data, True)
-    return lines[index] if index < len(lines) else None
+        parser.StartElementHandler, parser.EndElementHandler = start, lambda _: inside.pop()
+        parser.Parse(data, True)
+        return found
+
+    return lambda index: lines()[index] if index < len(lines()) else None
 
 
 def _osm_elements(root: ElementTree.Element) -> Iterator[dict[str, Any]]:
@@ -292,36 +320,57 @@ def _named(root: ElementTree.Element, name: str) -> Iterator[ElementTree.Element
 
 
 def _kml(root: ElementTree.Element, path: Path, data: bytes) -> MapFile:
-    result, lines = MapFile("KML"), Counter[str]()
-    for number, placemark in enumerate(_named(root, "Placemark"), start=1):
+    result, lines, line_of = MapFile("KML"), Counter[str](), _xml_lines(data, "Placemark")
+    for number, placemark in enumerate(_outermost(root, {"Placemark"}), start=1):
         name = next((str(n.text or "").strip() for n in placemark if _plain(n.tag) == "name"), "")
         identity = name or f"placemark {number}"
-        outline = Outline(identity, f"{path.name}: {identity}", _kml_tags(placemark))
+        parts = list(_outermost(placemark, _PLACEMARK_PARTS)) if len(placemark) else []
+        outline = Outline(identity, f"{path.name}: {identity}", _kml_tags(parts))
         try:
-            for polygon in _named(placemark, "Polygon"):
-                outer = [_kml_ring(b, outline, path) for b in _named(polygon, "outerBoundaryIs")]
-                holes = [_kml_ring(b, outline, path) for b in _named(polygon, "innerBoundaryIs")]
+            for polygon in (part for part in parts if _plain(part.tag) == "Polygon"):
+                bounds = list(_outermost(polygon, {"outerBoundaryIs", "innerBoundaryIs"}))
+                outer = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "outerBoundaryIs"]
+                holes = [_kml_ring(b, outline, path) for b in bounds if _plain(b.tag) == "innerBoundaryIs"]
                 outline.parts += [(ring, holes) for ring in outer]
         except BROKEN_ELEMENT as error:
-            line = _xml_line(data, "Placemark", number - 1)
-            result.notes.append(left_out(path, line, f"placemark '{identity}'", error))
+            result.notes.append(left_out(path, line_of(number - 1), f"placemark '{identity}'", error))
             continue
         if outline.parts:
             result.outlines.append(outline)
             continue
-        for what in ("LineString", "Point", "LinearRing", "Model", "Track"):
-            lines[what] += sum(1 for _ in _named(placemark, what))
+        lines.update(tag for tag in (_plain(part.tag) for part in parts) if tag in _NO_AREAS)
     if listed := ", ".join(f"{count} {what}" for what, count in lines.most_common() if count):
         result.notes.append(f"{path.name}: left out, not areas: {listed}")
     return result
 
 
-def _kml_tags(placemark: ElementTree.Element) -> dict[str, str]:
+_NO_AREAS = ("LineString", "Point", "LinearRing", "Model", "Track")
+_PLACEMARK_PARTS = {*_NO_AREAS, "Polygon", "Data", "SimpleData"}
+
+
+def _outermost(root: ElementTree.Element, names: set[str]) -> Iterator[ElementTree.Element]:
+    """Elements below a root with one of the names, in order; what lies inside a found one is not looked at.
+
+    KML nests none of them in itself: a file that does would be walked through once per level.
+    """
+    walk = [iter(root)]
+    while walk:
+        element = next(walk[-1], None)
+        if element is None:
+            walk.pop()
+        elif _plain(element.tag) in names:
+            yield element
+        elif len(element):
+            walk.append(iter(element))
+
+
+def _kml_tags(parts: list[ElementTree.Element]) -> dict[str, str]:
     tags = {}
-    for data in _named(placemark, "Data"):
-        tags[data.get("name", "")] = next((str(v.text or "") for v in _named(data, "value")), "")
-    for data in _named(placemark, "SimpleData"):
-        tags[data.get("name", "")] = str(data.text or "")
+    for data in parts:
+        if _plain(data.tag) == "Data":
+            tags[data.get("name", "")] = next((str(v.text or "") for v in _named(data, "value")), "")
+        elif _plain(data.tag) == "SimpleData":
+            tags[data.get("name", "")] = str(data.text or "")
     return tags
 
 

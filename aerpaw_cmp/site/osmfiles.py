@@ -11,7 +11,7 @@ from typing import Any
 import shapely
 from shapely.geometry import Polygon
 
-from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
+from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, is_tangled, left_out, lonlat
 from .tags import kind_of
 
 Element = dict[str, Any]
@@ -190,7 +190,10 @@ def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:
 def _inside(ring: list[Position], other: list[Position]) -> bool:
     if len(set(ring)) < 3 or len(set(other)) < 3:
         return False
-    one, two = (shapely.make_valid(Polygon(line)) for line in (ring, other))
+    shapes = [Polygon(line) for line in (ring, other)]
+    if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
+        return False
+    one, two = (shapely.make_valid(shape) for shape in shapes)
     return bool(one.area < two.area and shapely.covers(two, one))
 
 

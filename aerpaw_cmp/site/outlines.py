@@ -8,6 +8,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import shapely
+from shapely.geometry import Polygon
+
 from ..common.errors import InputError
 
 Position = tuple[float, float]
@@ -65,6 +69,24 @@ class MapFile:
         self.outlines += other.outlines
         self.trees += other.trees
         self.notes += other.notes
+
+
+MAX_CROSSINGS = 1000
+"""A ring that crosses itself more often is no outline that could be repaired: the time to try grows without bound."""
+
+
+def is_tangled(ring: Polygon) -> bool:
+    """Whether a ring crosses itself at more than :data:`MAX_CROSSINGS` places; asked in pieces, with an early end."""
+    line = np.asarray(ring.exterior.coords)[:, :2]
+    segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
+    if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
+        return False
+    tree, found = shapely.STRtree(segments), 0
+    for start in range(0, len(segments), 64):
+        found += tree.query(segments[start : start + 64], predicate="crosses").shape[1]
+        if found > 2 * MAX_CROSSINGS:  # every place is seen from both sides
+            return True
+    return False
 
 
 def lonlat(point: Any, where: str, path: Path) -> Position:

@@ -259,3 +259,8 @@ def test_the_edge_of_the_span_is_told_for_any_input(level: float) -> None:
 def test_inside_the_span_is_not_its_edge() -> None:
     assert not grid_offset([0.0], [49.9]).at_edge
     assert not grid_offset([0.0, 0.0], [1e308, -1e308]).at_edge
+
+
+def test_a_grid_that_fits_in_no_memory_is_refused() -> None:
+    with pytest.raises(ValueError, match="2e\\+16 offsets to try"):
+        offset_grid(1e-7, (-1e9, 1e9))

@@ -9,8 +9,9 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.data import FlightData, choose_site, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.simulate import FlightSimulator
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 
@@ -81,3 +82,43 @@ def test_names_in_the_flight_file_that_fit_nothing_are_told(tmp_path: Path) -> N
     settings = load_flight(tmp_path / "flight.yaml")
     (warning,) = gather(settings, tmp_path, read_logs(settings, tmp_path)).warnings
     assert "link.channels names USRP1: no log is of such a channel" in warning
+
+
+@pytest.mark.parametrize(
+    ("keys", "words"),
+    [
+        ("rss: {step_db: 1.0e-7, span_db: [-1.0e+9, 1.0e+9]}", "more than 1000000 offsets to try"),
+        ("rss: {step_db: .inf}", "finite number"),
+        ("rss: {lag_window_s: 1.0e+12}", "less than or equal to 3600"),
+        ("rt: {maximum_gap_s: .nan}", "finite number|greater than 0"),
+    ],
+)
+def test_settings_that_no_memory_could_hold_are_refused_in_the_file(tmp_path: Path, keys: str, words: str) -> None:
+    (tmp_path / "flight.yaml").write_text(f"flight: f\nlogs: [{{path: a.txt}}]\n{keys}\n")
+    with pytest.raises(UsageError, match=words):
+        load_flight(tmp_path / "flight.yaml")
+
+
+@pytest.mark.parametrize(
+    ("plan", "words"),
+    [
+        ("rss_interval_s: 1.0e-9", "at most 5000000 samples"),
+        ("speed_mps: 1.0e-300", "at most 5000000 samples"),
+        ("start: 2025-03-09T02:30:00", "the clocks changed then"),
+        ("start: 2025-11-02T01:30:00", "the clocks changed then"),
+        ("start: 9999-12-31T00:00:00", "a wall time"),
+    ],
+)
+def test_plans_that_cannot_be_flown_are_refused(tmp_path: Path, plan: str, words: str) -> None:
+    given = {
+        "start": "2025-06-01T10:00:00",
+        "waypoints": "[{east_m: 0, north_m: 0, height_m: 5}, {east_m: 9, north_m: 0, height_m: 5}]",
+    }
+    key, _, value = plan.partition(": ")
+    body = ", ".join(f"{k}: {v}" for k, v in (given | {key: value}).items())
+    (tmp_path / "flight.yaml").write_text(
+        f"flight: {{name: f, plan: {{{body}}}}}\ntimezone: America/New_York\nlogs: [{{path: v.txt, reader: vehicle_out}}]\n"
+    )
+    settings = load_flight(tmp_path / "flight.yaml")
+    with pytest.raises(UsageError, match=words):
+        FlightSimulator(settings, choose_site(settings.site, tmp_path), tmp_path).run(tmp_path / "out")

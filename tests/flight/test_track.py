@@ -268,12 +268,12 @@ def test_a_planted_lag_comes_back_within_a_tenth_of_a_second(lag):
     level = two_ray_flight(300)
     t = np.arange(0, 300, 0.1)
     noise = np.random.default_rng(1).normal(0, 3, len(t))
-    fit = estimate_lag(t, level(t + lag) - 47 + noise, level)
+    fit = estimate_lag(t, level(t - lag) - 47 + noise, level)
     assert fit.verdict == "ok", fit.reason
-    assert abs(fit.lag_s - lag) < 0.1
+    assert abs(fit.radio_minus_telemetry_s - lag) < 0.1
     assert fit.interval_s[0] - 0.02 <= lag <= fit.interval_s[1] + 0.02
     assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
-    np.testing.assert_allclose(fit.apply(t), t + lag, atol=0.1)
+    np.testing.assert_allclose(fit.apply(t), t - lag, atol=0.1)
     assert json.loads(json.dumps(fit.as_dict(), allow_nan=False))["drift_ci95_ms_per_min"] == [None, None]
 
 
@@ -284,13 +284,13 @@ def test_a_planted_drift_comes_back_within_half_a_millisecond_per_minute(drift_m
     drift = drift_ms_per_min * 1e-3 / 60
     middle = t[-1] / 2
     noise = np.random.default_rng(2).normal(0, 3, len(t))
-    fit = estimate_lag(t, level(t - 4.2 + drift * (t - middle)) + noise, level)
+    fit = estimate_lag(t, level(t - 4.2 - drift * (t - middle)) + noise, level)
     assert fit.verdict == "ok", fit.reason
-    assert abs(fit.lag_s + 4.2) < 0.1
+    assert abs(fit.radio_minus_telemetry_s - 4.2) < 0.1
     assert abs(fit.drift_s_per_s - drift) * 60e3 < 0.5
     low, high = fit.drift_interval_s_per_s
     assert low - 1e-6 < drift < high + 1e-6
-    np.testing.assert_allclose(fit.apply(t), t - 4.2 + drift * (t - middle), atol=0.05)
+    np.testing.assert_allclose(fit.apply(t), t - 4.2 - drift * (t - middle), atol=0.05)
 
 
 def test_lag_with_time_stamps_and_slow_shadowing():
@@ -300,9 +300,9 @@ def test_lag_with_time_stamps_and_slow_shadowing():
     t = np.arange(0, 300, 0.1)
     shadow = 4 * np.sqrt(1 - 0.99**2) * lfilter([1], [1, -0.99], np.random.default_rng(3).normal(size=len(t)))
     origin = START.astype(np.int64) * 1e-9
-    fit = estimate_lag(at(t), level(t + 1.5) + shadow, lambda asked: level(asked.astype(np.int64) * 1e-9 - origin))
+    fit = estimate_lag(at(t), level(t - 1.5) + shadow, lambda asked: level(asked.astype(np.int64) * 1e-9 - origin))
     assert fit.verdict == "ok"
-    assert abs(fit.lag_s - 1.5) < 0.1
+    assert abs(fit.radio_minus_telemetry_s - 1.5) < 0.1
     assert (fit.apply(at(t)) - at(t) - np.timedelta64(1_500_000_000, "ns")).astype(int).max() < 1e8
 
 
@@ -356,7 +356,7 @@ def test_too_little_data_fails():
     fit = estimate_lag(t + 5000, level(t), level)
     assert fit.verdict == "failed"
     assert "overlap" in fit.reason
-    assert np.isnan(fit.lag_s)
+    assert np.isnan(fit.radio_minus_telemetry_s)
     assert estimate_lag(t, np.full(len(t), np.nan), level).verdict == "failed"
     with pytest.raises(ValueError, match="times and"):
         estimate_lag(t, np.zeros(3), level)
@@ -397,8 +397,8 @@ def test_unknown_patterns_are_fitted_while_the_lag_is_found():
     measured = level(t + 1.7) - 30 + np.random.default_rng(2).normal(0, 3, len(t))
     fit = estimate_lag(t, measured, predictor)
     assert fit.verdict == "ok", fit.reason
-    assert abs(fit.lag_s - 1.7) < 0.1
-    assert fit.interval_s[0] <= 1.7 <= fit.interval_s[1]
+    assert abs(fit.radio_minus_telemetry_s + 1.7) < 0.1
+    assert fit.interval_s[0] <= -1.7 <= fit.interval_s[1]
     assert fit.rmse_db == pytest.approx(3.0, abs=0.2)
     # without the terms, the pattern that turns with the UAV hides the lag
     assert estimate_lag(t, measured, free_space).verdict != "ok"
@@ -412,10 +412,10 @@ def test_channels_that_share_a_clock_add_their_evidence():
         measured = level(t - 2.2) + np.random.default_rng(seed).normal(0, 3, len(t))
         fits.append(estimate_lag(t, measured, predictor))
     both = combine_lags(fits)
-    assert abs(both.lag_s + 2.2) < 0.5
+    assert abs(both.radio_minus_telemetry_s - 2.2) < 0.5
     assert both.n == sum(fit.n for fit in fits)
     assert np.ptp(both.interval_s) <= max(np.ptp(fit.interval_s) for fit in fits)
-    assert both.interval_s[0] <= -2.2 <= both.interval_s[1]
+    assert both.interval_s[0] <= 2.2 <= both.interval_s[1]
     assert combine_lags(fits[:1]) is fits[0]
     failed = estimate_lag(t[:5], t[:5], predictor)
     assert combine_lags([failed, fits[0]]) is fits[0]
@@ -440,11 +440,11 @@ def test_no_drift_where_none_shows():
 def test_predictor_gaps_and_missing_levels_do_not_matter():
     level = two_ray_flight(300)
     t = np.arange(0, 300, 0.1)
-    measured = level(t + 2.0) + np.random.default_rng(7).normal(0, 3, len(t))
+    measured = level(t - 2.0) + np.random.default_rng(7).normal(0, 3, len(t))
     measured[::3] = np.nan
     fit = estimate_lag(t, measured, lambda x: np.where((x > 100) & (x < 110), np.nan, level(x)))
     assert fit.verdict == "ok"
-    assert abs(fit.lag_s - 2.0) < 0.1
+    assert abs(fit.radio_minus_telemetry_s - 2.0) < 0.1
 
 
 def test_whole_hours_are_recognised():
@@ -519,7 +519,7 @@ def test_real_clocks_agree_as_far_as_the_data_can_tell(name):
     assert alone.verdict == "ambiguous"
     both = combine_lags([estimate_lag(epoch, level, predictor, resolution_s=0.1) for level in channels])
     assert both.verdict != "failed"
-    assert abs(both.lag_s) < 1.5
+    assert abs(both.radio_minus_telemetry_s) < 1.5
     assert both.interval_s[0] < 1.0
     assert np.ptp(both.interval_s) < 0.6 * np.ptp(alone.interval_s)
     assert both.rmse_db < 3.7

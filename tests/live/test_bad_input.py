@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.ports import PortGoneError, Roots, SerialPort, find_candidates, find_port, holders
 from aerpaw_cmp.live.session import TapSettings
@@ -427,3 +427,36 @@ def test_a_read_only_disk(modem, small_disk, tmp_path):
     subprocess.run(["mount", "-o", "remount,ro", small_disk], check=True)
     with pytest.raises(InputError, match=r"Read-only file system.*the disk is mounted read-only"):
         run_tap(TapSettings(small_disk / "log", str(sim.port)))
+
+
+@pytest.mark.parametrize(
+    ("url", "words"),
+    [
+        (
+            "socket://10.0.0.2:4001",
+            r"a URL of pyserial \(socket://\).*socat pty,link=/tmp/modem,rawer tcp:10.0.0.2:4001",
+        ),
+        ("rfc2217://host:7000", r"a URL of pyserial \(rfc2217://\).*socat"),
+        ("loop://", r"a URL of pyserial \(loop://\).*modem-sim"),
+        ("spy:///dev/ttyUSB2?file=x", r"a URL of pyserial \(spy://\)"),
+    ],
+)
+def test_urls_of_pyserial_are_refused_by_name(tmp_path, url, words):
+    with pytest.raises(UsageError, match=words):
+        run_tap(TapSettings(tmp_path / "log", url))
+    assert not (tmp_path / "log").exists()
+
+
+@pytest.mark.parametrize("command", ["tap", "modem-sim"])
+@pytest.mark.parametrize("module", ["fcntl", "termios"])
+def test_a_system_without_fcntl_is_told_what_is_supported(command, module):
+    code = (
+        "import sys\n"
+        f"sys.modules[{module!r}] = None\n"
+        "from aerpaw_cmp.__main__ import main\n"
+        f"sys.exit(main([{command!r}]))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 2, done.stderr
+    assert f"'{command}' needs Python's {module}, which this system does not have; expected Linux" in done.stderr
+    assert "Traceback" not in done.stderr

@@ -30,6 +30,8 @@ def test_replug():
     code, result = run("tap_replug.py", "--cycles", "2")
     assert code == 0
     assert (result["lost"], result["cycles_in_a_gap_record"], result["gap_records"]) == (0, 2, 2)
+    assert result["line_bytes_given"] == result["line_bytes_recorded"] > 0
+    assert result["received_bytes"] == result["received_bytes_by_the_tap"]
 
 
 @pytest.mark.parametrize(

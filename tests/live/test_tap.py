@@ -457,3 +457,24 @@ def test_schedule_catches_up_after_a_short_stall_and_not_after_a_long_one():
             polls += 1
         assert schedule.missed["ri"] == missed
         assert polls + missed == 1 + stall // 500, "every slot is polled or missed, once"
+
+
+def test_an_unfinished_line_between_commands_is_in_the_gap_record(modem, tap, tools, tmp_path):
+    """It belonged to no command, and went with the old framer: not a byte of it was in the log."""
+    sim = modem(faults=Faults(latency_s=0.0))
+    session = tap(sim.port, ri_hz=0.2, other_hz=0.0, reconnect_min_s=0.02, reconnect_max_s=0.05)
+    session.wait(lambda: len(served_and_read(sim, CSI)) >= 1 or len(sim.journal) >= 5)
+    time.sleep(0.3)  # nothing is in flight now
+    sim._write(b'\r\n+QIND: "csq",2')
+    time.sleep(0.2)
+    sim.unplug()
+    session.wait(lambda: any("lost" in text for text in session.said))
+    sim.replug()
+    count = len(sim.journal)
+    session.wait(lambda: len(sim.journal) > count + 3)
+    session.end()
+    records, _ = tools.records_of(tmp_path / "log")
+    (gap,) = [r for r in records if r["kind"] == "gap" and r["state"] == "open"]
+    assert gap["partial"] == '+QIND: "csq",2'
+    ends = [r for r in records if r["kind"] == "end"]
+    assert ends[0]["received_bytes"] == sim.sent_bytes

@@ -144,3 +144,37 @@ def test_audit_sees_what_a_shallow_replay_lacks(case):
     assert report.rss_max_error_db > 0.5
     turned = audit(site, link, poses, deep, reference="image", links=None, max_depth=0)
     assert turned.extra_paths == report.missing_paths
+
+
+def test_every_damage_of_an_entry_is_seen_and_told(case, tmp_path):
+    first = replay(*case, cache_dir=tmp_path)
+    (entry,) = tmp_path.glob("*.npz")
+    whole = entry.read_bytes()
+    generator = np.random.default_rng(3)
+    for at in generator.integers(0, len(whole), 60).tolist():
+        entry.write_bytes(whole[:at] + bytes([whole[at] ^ int(generator.integers(1, 256))]) + whole[at + 1 :])
+        again = replay(*case, cache_dir=tmp_path)
+        assert not again.from_cache, at
+        assert any("damaged entry of the path cache" in line for line in again.left_out)
+        assert np.array_equal(again.rss_dbm, first.rss_dbm, equal_nan=True)
+    entry.write_bytes(whole[:-1])
+    assert any("damaged entry" in line for line in replay(*case, cache_dir=tmp_path).left_out)
+    assert replay(*case, cache_dir=tmp_path).from_cache, "mended by the last search"
+
+
+@pytest.mark.parametrize("fault", ["far", "far_nan_turn", "no_turn"])
+def test_a_pose_that_cannot_be_is_refused_alone(case, fault):
+    site, link, poses = case
+    clean = replay(site, link, poses)
+    position, rotation = poses.position_m.copy(), np.array(poses.rotation)
+    if fault.startswith("far"):
+        position[0] = (1e12, -1e300, 50.0)
+    if fault != "far":
+        rotation[0] = np.nan
+    broken = replay(site, link, type(poses)(position, rotation))
+    assert not broken.has_path[0].any()
+    assert np.isnan(broken.rss_dbm[0]).all()
+    assert (broken.h[0] == 0).all()
+    assert np.array_equal(broken.has_path[1:], clean.has_path[1:])
+    assert np.array_equal(broken.rss_dbm[1:], clean.rss_dbm[1:], equal_nan=True), "to the last digit"
+    assert any("poses without a rotation" in t or "further than 100 km" in t for t in broken.left_out)

@@ -342,3 +342,34 @@ def test_both_antennas_are_shown_in_their_own_frames(small_report):
         "Azimuth of the tower, UAV antenna frame [deg]",
     ]
     assert {tuple(row) for row in axes[1].collections[0].get_offsets().tolist()} == {(12.0, -8.0)}
+
+
+ODD_NAMES = ("A_$", r"$\frac{", "_hidden", "a$b$c_{", "<b>&amp;", "%s {0} \\")
+
+
+def test_names_are_drawn_as_they_are(small_report):
+    """A waypoint may be called ``A_$``: no name is a formula, and none hides its line of the legend."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.text import Text
+
+    points = tuple(
+        dataclasses.replace(point, label=ODD_NAMES[i % len(ODD_NAMES)])
+        for i, point in enumerate(small_report.waypoints)
+    )
+    towers = {f"{ODD_NAMES[i]} {i}": tower for i, tower in enumerate(list(small_report.site.towers.values())[:3])}
+    data = dataclasses.replace(
+        small_report,
+        waypoints=points,
+        site=dataclasses.replace(small_report.site, towers=towers),
+        rss=tuple(dataclasses.replace(p, tower="$x_{", channel="_$") for p in small_report.rss[:1]),
+        rank=tuple(dataclasses.replace(p, tower=r"$\alpha") for p in small_report.rank[:1]),
+    )
+    seen = set()
+    for plate, fig in drawn(data):
+        texts = [text for text in fig.findobj(Text) if text.get_text()]
+        assert not any(text.get_parse_math() for text in texts), plate.name
+        seen |= {text.get_text() for text in texts}
+        if plate.name == "trajectory" or plate.name.startswith("rank_singular"):
+            FigureCanvasAgg(fig).draw()
+    assert "A_$" in seen
+    assert "σ₂/σ₁" in seen

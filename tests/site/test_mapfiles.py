@@ -13,7 +13,9 @@ import shapely
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.site import mapfiles
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
+from aerpaw_cmp.site.mapfiles import MAX_TAGS, read_map_file
 from aerpaw_cmp.site.siteyaml import load_site
 
 FRAME = SiteFrame(35.7275, -78.696)
@@ -412,3 +414,76 @@ def test_openstreetmap_is_named_in_the_notes(tmp_path: Path) -> None:
     (tmp_path / "b.json").write_text(json.dumps(collection(feature(polygon(square(100, 0)), **BARN))))
     model, _ = import_site([tmp_path / "a.osm", tmp_path / "b.json"])
     assert [note for note in model.notes if "OpenStreetMap" in note] == ["a.osm: (c) OpenStreetMap contributors, ODbL"]
+
+
+def test_a_kmz_with_any_byte_damaged_is_read_or_refused(tmp_path: Path) -> None:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("doc.kml", kml(placemark(square(0, 0)), placemark(square(40, 40), "other")))
+    whole, path = packed.getvalue(), tmp_path / "m.kmz"
+    refused = 0
+    for at in range(len(whole)):
+        for flip in (0x01, 0x80, 0xFF):
+            path.write_bytes(whole[:at] + bytes([whole[at] ^ flip]) + whole[at + 1 :])
+            try:
+                read_map_file(path)
+            except InputError:
+                refused += 1
+    assert refused > len(whole)
+
+
+def test_too_many_tags_are_refused_before_any_is_an_object(tmp_path: Path) -> None:
+    path = tmp_path / "m.kml"
+    path.write_bytes(b"<kml>" + b"<Placemark/>" * (MAX_TAGS + 1) + b"</kml>")
+    with pytest.raises(InputError, match="the XML has 1500003 tags; expected at most 1500000"):
+        read_map_file(path)
+
+
+@pytest.mark.parametrize("tag", ["Placemark", "Polygon", "Data"])
+def test_tags_in_themselves_are_walked_through_once(tmp_path: Path, tag: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Twenty thousand of them took minutes: each level was searched to the bottom again."""
+    asked = [0]
+    plain = mapfiles._plain
+
+    def counted(name: str) -> str:
+        asked[0] += 1
+        return plain(name)
+
+    monkeypatch.setattr(mapfiles, "_plain", counted)
+    path = tmp_path / "m.kml"
+    path.write_bytes(
+        b"<kml><Placemark>" + f"<{tag}>".encode() * 20_000 + f"</{tag}>".encode() * 20_000 + b"</Placemark></kml>"
+    )
+    read_map_file(path)
+    assert asked[0] < 100_000
+
+
+def test_lines_of_many_broken_elements_are_found_in_one_reading(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    made = [0]
+    create = mapfiles.expat.ParserCreate
+
+    def counted() -> Any:
+        made[0] += 1
+        return create()
+
+    monkeypatch.setattr(mapfiles.expat, "ParserCreate", counted)
+    path = tmp_path / "m.kml"
+    bad = (
+        "<Placemark><Polygon><outerBoundaryIs><coordinates>a,b</coordinates></outerBoundaryIs></Polygon></Placemark>\n"
+    )
+    path.write_text("<kml>\n" + bad * 500 + "</kml>")
+    notes = read_map_file(path).notes
+    assert made[0] == 1
+    assert "line 2:" in notes[0]
+    assert "line 501:" in notes[-1]
+
+
+def test_a_ring_of_a_million_crossings_is_left_out_and_said(tmp_path: Path) -> None:
+    corners = np.random.default_rng(1).uniform(-0.001, 0.001, (4000, 2)) + np.array([-78.6959, 35.7275])
+    ring = [*corners.tolist(), corners[0].tolist()]
+    good = feature(polygon(square(0, 0)), building="yes")
+    found = read(tmp_path, collection(feature(polygon(ring), building="yes"), good))
+    assert len(found.buildings) == 1
+    assert said(found, "crosses itself at more than 1000 places was left out")

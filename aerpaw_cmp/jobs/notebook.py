@@ -1,0 +1,365 @@
+"""A flight in a notebook: ``open_flight("flight.yaml")`` and what can be asked of it."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Mapping, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from ..common.errors import UsageError
+from ..common.units import ComplexArray, FloatArray
+from ..compare.result import FlightResult
+from ..flight.data import FlightData, gather, rank_positions, read_logs
+from ..flight.overrides import overridden
+from ..flight.settings import FlightFile, load_flight
+from ..propagation.paths import PathSet
+from ..site.site import Site
+from .compare_flight import compare_flight
+from .flight_run import replay_flight
+from .replay import FlightReplay, Replayed
+
+Series = tuple[str, str]
+"""Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""
+
+
+RANK_NUMBERS = ("agreement", "kappa", "total_variation", "wasserstein")
+
+
+def open_flight(
+    path: str | Path,
+    *,
+    logs_root: str | Path | None = None,
+    overrides: Mapping[str, Any] | None = None,
+) -> Flight:
+    """Read a flight.yaml and its logs.
+
+    Parameters
+    ----------
+    path : path
+        The flight file.
+    logs_root : path, optional
+        Folder against which the paths of its logs resolve; default its own folder.
+    overrides : mapping, optional
+        Keys of the flight file in dotted form, changed: ``{"rt.max_depth": 1, "rss.lag": "off"}``.
+
+    Returns
+    -------
+    Flight
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+
+    Examples
+    --------
+    >>> flight = open_flight("sample_logs/flight.yaml")  # doctest: +SKIP
+    >>> flight.compare().to_frame()  # doctest: +SKIP
+    """
+    file = Path(path)
+    settings = overridden(load_flight(file), overrides or {})
+    root = None if logs_root is None else Path(logs_root)
+    data = gather(settings, file.parent, read_logs(settings, file.parent, root), root)
+    return Flight(file, data, root, changed=tuple(overrides or ()))
+
+
+class Flight:
+    """A checked flight.yaml with its logs read; nothing is replayed before it is asked for.
+
+    Parameters
+    ----------
+    path : Path
+        Of the flight file.
+    data : FlightData
+        Settings, site, logs, track and series.
+    logs_root : Path, optional
+        As given.
+    changed : tuple of str
+        Keys in which its settings are not those of the file.
+    """
+
+    def __init__(
+        self, path: Path, data: FlightData, logs_root: Path | None = None, *, changed: tuple[str, ...] = ()
+    ) -> None:
+        self.path = path
+        self.data = data
+        self.logs_root = logs_root
+        self.changed = changed
+
+    @property
+    def settings(self) -> FlightFile:
+        """Everything that the flight file says, defaults included."""
+        return self.data.settings
+
+    @property
+    def site(self) -> Site:
+        """Towers, buildings, trees and heights."""
+        return self.data.site
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """What must be known before any number is believed."""
+        return self.data.warnings
+
+    @cached_property
+    def track(self) -> pd.DataFrame:
+        """Telemetry as poses: ``time east_m north_m up_m heading_deg attitude_known``, one row per instant."""
+        if self.data.track is None:
+            return _together([], ["time", "east_m", "north_m", "up_m", "heading_deg", "attitude_known"])
+        times = self._telemetry_times()
+        poses = self.data.track.pose_at(times)
+        frame = pd.DataFrame(poses.position_m, columns=["east_m", "north_m", "up_m"])
+        frame.insert(0, "time", times)
+        frame["heading_deg"] = poses.heading_deg
+        frame["attitude_known"] = poses.attitude_known
+        kept: pd.DataFrame = frame[poses.valid].reset_index(drop=True)
+        return kept
+
+    @cached_property
+    def rss(self) -> pd.DataFrame:
+        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``; NaN where nothing was heard."""
+        frames = []
+        for series in self.data.rss:
+            position = np.full((len(series.time), 3), np.nan)
+            if self.data.track is not None:
+                position = self.data.track.pose_at(series.time).position_m
+            level = {"measured_db": series.measured_db, **_place(position)}
+            what = {"tower": series.tower, "channel": series.channel, "unit": series.unit}
+            frames.append(pd.DataFrame({"time": series.time, **what, **level}))
+        return _together(frames, ["time", "tower", "channel", "unit", "measured_db", "east_m", "north_m", "up_m"])
+
+    @cached_property
+    def rank(self) -> pd.DataFrame:
+        """Reported ranks: ``time tower rank sinr_db east_m north_m up_m``; NaN where the modem had no CSI."""
+        frames = []
+        for series in self.data.rank:
+            position, _ = rank_positions(series, self.data.track)
+            columns = {"tower": series.tower, "rank": series.rank, "sinr_db": series.sinr_db, **_place(position)}
+            frames.append(pd.DataFrame({"time": series.time, **columns}))
+        return _together(frames, ["time", "tower", "rank", "sinr_db", "east_m", "north_m", "up_m"])
+
+    def replay(self, engine: str | None = None, **overrides: Any) -> ReplayedFlight:
+        """Ray-trace every series along the flight.
+
+        Parameters
+        ----------
+        engine : {"image", "sionna"}, optional
+            Default: what the flight file says.
+        overrides
+            Keys below ``rt`` of the flight file: ``max_depth=1``, ``foliage="none"``, ``attitude="logged"``. A key
+            elsewhere goes in by a mapping: ``**{"rss.lag": "off"}``.
+
+        Raises
+        ------
+        UsageError
+            A key that flight files do not have, a value of the wrong kind.
+        """
+        keys = {key if "." in key else f"rt.{key}": value for key, value in overrides.items()}
+        if engine is not None:
+            keys["rt.engine"] = engine
+        settings = overridden(self.settings, keys)
+        data = self.data
+        if keys:
+            root = self.logs_root
+            data = gather(settings, self.path.parent, data.files, root)
+        return ReplayedFlight(data, replay_flight(data))
+
+    def compare(self, engine: str | None = None, **overrides: Any) -> Comparison:
+        """Replay and compare; arguments as :meth:`replay`."""
+        return self.replay(engine, **overrides).compare()
+
+    def report(self, folder: str | Path, *, force: bool = False, **options: Any) -> Path:
+        """Write the whole report, as ``aerpaw-cmp report`` does, and give the path of its page.
+
+        Parameters
+        ----------
+        folder : path
+            A report of this tool that stands there is replaced whole; anything else only with ``force``.
+        force : bool
+        options
+            Further arguments of :func:`aerpaw_cmp.jobs.run.run_report`.
+
+        Raises
+        ------
+        UsageError
+            If this flight was opened with overrides: a report is of a file.
+        """
+        if self.changed:
+            raise UsageError(
+                f"a report of {self.path.name} with other settings ({', '.join(self.changed)})",
+                expected="the flight file as it stands",
+                cause="open_flight(overrides=...): write them into a flight.yaml of their own",
+            )
+        from .run import run_report
+
+        out = Path(folder)
+        run_report(self.path, out=out, logs_root=self.logs_root, force=force, **options)
+        return out / "report.html"
+
+    def _telemetry_times(self) -> Any:
+        frames = [s.frame for f in self.data.files for s in f.result.streams if s.kind == "telemetry"]
+        times = pd.concat([frame["time"] for frame in frames]).dropna().to_numpy("datetime64[ns]")
+        track = self.data.track
+        assert track is not None
+        inside = (times.view("int64") >= track.start_ns) & (times.view("int64") <= track.end_ns)
+        return np.unique(times[inside])
+
+    def __repr__(self) -> str:
+        """Name, series and track in one line."""
+        name = self.settings.flight.name
+        return f"Flight({name!r}: {len(self.data.rss)} RSS series, {len(self.data.rank)} rank series, {self._span()})"
+
+    def _repr_html_(self) -> str:
+        """A table of the series for notebooks."""
+        rows = [(s.tower, s.channel, f"RSS [{s.unit}]", len(s.time)) for s in self.data.rss]
+        rows += [(s.tower, "", "rank", len(s.time)) for s in self.data.rank]
+        return _table(("tower", "channel", "quantity", "samples"), rows, self.settings.flight.name)
+
+    def _span(self) -> str:
+        return "no track" if self.data.track is None else f"{len(self.track)} poses"
+
+
+class ReplayedFlight:
+    """A flight, ray-traced at its samples.
+
+    Parameters
+    ----------
+    data : FlightData
+    replays : FlightReplay
+        Poses, paths and fields of every series.
+    """
+
+    def __init__(self, data: FlightData, replays: FlightReplay) -> None:
+        self.data = data
+        self.replays = replays
+
+    @property
+    def series(self) -> dict[Series, Replayed]:
+        """Every series with what was replayed of it, RSS first."""
+        keys: list[Series] = [(s.tower, s.channel) for s in self.data.rss] + [(s.tower, "rank") for s in self.data.rank]
+        return dict(zip(keys, self.replays.all, strict=True))
+
+    @property
+    def rss_dbm(self) -> dict[Series, FloatArray]:
+        """Simulated level (n,) [dBm] at every sample of a series; NaN without a pose or a path."""
+        return {key: one.spread(one.replay.rss_dbm[:, 0]) for key, one in self.series.items()}
+
+    @property
+    def h(self) -> dict[Series, ComplexArray]:
+        """Channel matrices (poses, n_rx, n_tx), complex128, at the poses that are known."""
+        return {key: one.replay.h[:, 0] for key, one in self.series.items()}
+
+    @property
+    def paths(self) -> dict[Series, PathSet]:
+        """Paths of each series; ``pose`` counts the poses that are known."""
+        return {key: one.replay.paths for key, one in self.series.items()}
+
+    def to_xarray(self) -> dict[Series, Any]:
+        """An ``xarray.Dataset`` per series, with ``time`` and position as coordinates of its poses.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        times = {(s.tower, s.channel): s.time for s in self.data.rss}
+        times |= {(s.tower, "rank"): s.time for s in self.data.rank}
+        out = {}
+        for key, one in self.series.items():
+            place = _place(one.poses.position_m)
+            where = {name: ("pose", values) for name, values in place.items()}
+            out[key] = one.replay.to_xarray().assign_coords(time=("pose", times[key][one.valid]), **where)
+        return out
+
+    def compare(self) -> Comparison:
+        """Offsets, errors, baselines and ranks of every series."""
+        return Comparison(compare_flight(self.data, self.replays))
+
+    def __repr__(self) -> str:
+        """One line per series."""
+        return "\n".join(["ReplayedFlight", *(f"  {' '.join(k)}: {v.replay!r}" for k, v in self.series.items())])
+
+
+class Comparison:
+    """The numbers of a flight.
+
+    Parameters
+    ----------
+    result : FlightResult
+        All of them, as records (:mod:`aerpaw_cmp.compare.result`).
+    """
+
+    def __init__(self, result: FlightResult) -> None:
+        self.result = result
+
+    def to_frame(self) -> pd.DataFrame:
+        """One row per RSS series, with its baselines.
+
+        Columns: ``tower channel n offset_db rmse_db rmse_low_db rmse_high_db correlation at_search_edge`` and
+        ``<baseline>_rmse_db``.
+        """
+        rows = []
+        for one in self.result.rss:
+            low, high = one.score.rmse_ci95_db or (np.nan, np.nan)
+            rows.append(
+                {
+                    "tower": one.tower,
+                    "channel": one.channel,
+                    "n": one.score.n,
+                    "offset_db": one.score.offset_db,
+                    "rmse_db": one.score.rmse_db,
+                    "rmse_low_db": low,
+                    "rmse_high_db": high,
+                    "correlation": one.score.correlation,
+                    "at_search_edge": one.score.at_edge,
+                    **{f"{name}_rmse_db": fit.rmse_db for name, fit in one.baselines.items()},
+                }
+            )
+        table: pd.DataFrame = pd.DataFrame(rows)
+        return table
+
+    def rank_to_frame(self) -> pd.DataFrame:
+        """One row per tower and K: ``tower k n agreement kappa total_variation wasserstein``."""
+        rows = []
+        for one in self.result.rank:
+            for k, fit in one.score.simulated.items():
+                numbers = {
+                    name: getattr(fit, name) for name in ("agreement", "kappa", "total_variation", "wasserstein")
+                }
+                rows.append({"tower": one.tower, "k": k, "n": one.score.n, **numbers})
+        table: pd.DataFrame = pd.DataFrame(rows)
+        return table
+
+    def __repr__(self) -> str:
+        """The tables as text."""
+        tables = [table for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
+        return "\n\n".join(table.round(2).to_string(index=False) for table in tables) or "Comparison: no series"
+
+    def _repr_html_(self) -> str:
+        """The tables for notebooks."""
+        tables = [table for table in (self.to_frame(), self.rank_to_frame()) if len(table)]
+        return "".join(table.round(2).to_html(index=False, border=0) for table in tables)
+
+
+def _place(position_m: FloatArray) -> dict[str, FloatArray]:
+    return {"east_m": position_m[:, 0], "north_m": position_m[:, 1], "up_m": position_m[:, 2]}
+
+
+def _together(frames: Sequence[pd.DataFrame], columns: Sequence[str]) -> pd.DataFrame:
+    table: pd.DataFrame = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
+    return table
+
+
+def _table(titles: Sequence[str], rows: Sequence[Sequence[object]], caption: str) -> str:
+    head = "".join(f"<th>{html.escape(title)}</th>" for title in titles)
+    body = "".join("<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>" for row in rows)
+    name = html.escape(caption)
+    return f"<table><caption>{name}</caption><thead><tr>{head}</tr></thead><tbody>{body}</tbody></table>"
+
+
+__all__ = ["Comparison", "Flight", "ReplayedFlight", "open_flight"]

@@ -1,0 +1,726 @@
+"""Damaged inputs: whatever a file holds, the answer is a result that accounts for it, or one message of the package.
+
+Every reader of the catalogue, flight.yaml, site.yaml, campaign.yaml, map files, MATLAB files, flight files, antenna
+files, the path cache and elevation models are given mutated seeds. Seeds are the samples of the tests, pieces of a few
+lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; mutations change bytes, lines, numbers (infinities, 1e30,
+-0, integers of forty digits), encodings and clocks. Checked for each input: the accounting law; no exception but the
+package's own; at most 2 s and 300 MiB; the process lives. Input ``i`` of a target depends on the seed, the target and
+``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
+
+``--account FILE`` appends a line of JSON per block and goes on where the file ends.
+"""
+
+from __future__ import annotations
+
+import argparse
+import fnmatch
+import hashlib
+import io
+import json
+import mmap
+import multiprocessing
+import os
+import re
+import resource
+import signal
+import struct
+import sys
+import tempfile
+import time
+import warnings
+import zipfile
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
+
+import numpy as np  # noqa: E402
+
+from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
+from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
+from aerpaw_cmp.logs import limits  # noqa: E402
+from aerpaw_cmp.logs.readers import Reader, ReadOptions, catalogue, head_of  # noqa: E402
+from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
+
+LIMIT_S = 2.0
+LIMIT_MIB = 300
+WATCHDOG_S = 20.0
+"""A worker that finishes no input for so long hangs in native code, where no alarm reaches it."""
+
+BLOCK = 2000
+SEED_BYTES = 1500
+MEDIUM_BYTES = 4000
+
+FRAME = SiteFrame(35.7275, -78.696)
+OPTIONS = (
+    ReadOptions(
+        timezone="America/New_York", time_origin="2025-03-02T15:00:00Z", kind="rss",
+        columns={"time": "Time", "rss_db": "Level"}, unit="dBm", ri_base="one",
+    ),
+    ReadOptions(
+        timezone="Europe/Berlin", clock="local_as_utc", kind="rank", ri_base="zero",
+        columns={"time": "Time", "ri_raw": "Level"}, channel="c", node="LW1",
+    ),
+    ReadOptions(
+        timezone="America/New_York", clock="utc", kind="telemetry",
+        columns={"time": "Time", "latitude_deg": "Level", "longitude_deg": "Level", "altitude_m": "Level"},
+    ),
+)  # fmt: skip
+
+
+class ViolationError(Exception):
+    """The input broke a promise."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """Something that reads: ``run`` gives whether it took the input; the package's errors are its other answer."""
+
+    name: str
+    seeds: tuple[bytes, ...]
+    run: Callable[[bytes, int], bool]
+
+
+# --- mutations -------------------------------------------------------------------------------------------------------
+
+NUMBERS = (
+    b"inf", b"-inf", b"nan", b"1e30", b"-1e30", b"-0", b"-0.0", b"0", b"1", b"1e308", b"1e999", b"-1e-320", b"9" * 40,
+    b"-" + b"9" * 40, b"9223372036854775807", b"9223372036854775808", b"-9223372036854775809", b"4294967296", b"65535",
+    b"-32768", b"255", b"256", b"-1", b"0x10", b"1_000", b"1,5", b"0777", b"1e", b"+", b"", b"1e-9", b"360", b"90.0001",
+    b"\xd9\xa1\xd9\xa2", b"5e8", b"true", b"null", b"~", b".inf", b".nan", b"1" * 5000,
+)  # fmt: skip
+WORDS = (
+    b"", b"\0", b"\xff", b"\xfe\xff", b"\xef\xbb\xbf", b"\r", b"\n", b"\r\n", b"\n\n", b",", b";", b'"', b"'", b"[",
+    b"]", b"{", b"}", b"(", b")", b"<", b">", b"&#0;", b"&lt;", b"%s", b"$", b"\\", b"*", b"&a", b"*a",
+    b"!!python/object:os", b"\xe2\x80\xa8", b"\xc3", b"a" * 70_000, b"-" * 300, b"\t", b"\x1b[31m", b"NaN", b"=1+1",
+    b": ", b"- ", b"#", b"PK\3\4", b"\x1f\x8b", b"\x89HDF\r\n\x1a\n", b"<<: *a", b"../../../etc/passwd",
+)  # fmt: skip
+DATES = (
+    b"0000-00-00", b"0001-01-01", b"1677-09-21", b"1969-12-31", b"2262-04-12", b"9999-12-31", b"2025-02-30",
+    b"2024-02-29", b"2025-13-01", b"2025-03-09", b"2025-11-02", b"10000-01-01", b"-001-01-01",
+)  # fmt: skip
+HOURS = (
+    b"24:00:00",
+    b"23:59:60",
+    b"02:30:00",
+    b"01:30:00",
+    b"25:61:61",
+    b"00:00:00",
+    b"12:00",
+    b"99:99:99",
+    b"-1:00:00",
+)
+ENCODINGS = ("utf-16", "utf-16-le", "utf-32", "utf-7", "cp037", "utf-8-sig")
+
+_NUMBER = re.compile(rb"[-+]?\d+(?:\.\d+)?(?:[eE][-+]?\d+)?")
+_DATE = re.compile(rb"\d{4}-\d{2}-\d{2}")
+_HOUR = re.compile(rb"\d{2}:\d{2}:\d{2}")
+
+
+def _span(data: bytes, chance: np.random.Generator, most: int = 64) -> tuple[int, int]:
+    start = int(chance.integers(0, len(data) + 1))
+    return start, min(len(data), start + int(chance.integers(0, most)))
+
+
+def _replace_one(
+    pattern: re.Pattern[bytes], values: tuple[bytes, ...], data: bytes, chance: np.random.Generator
+) -> bytes:
+    start = int(chance.integers(0, len(data) + 1))
+    found = pattern.search(data, start) or pattern.search(data)
+    if found is None:
+        return data
+    return data[: found.start()] + values[int(chance.integers(len(values)))] + data[found.end() :]
+
+
+def _bytes(data: bytes, chance: np.random.Generator) -> bytes:
+    out = bytearray(data)
+    for _ in range(int(chance.integers(1, 4))):
+        if out:
+            out[int(chance.integers(len(out)))] ^= int(chance.integers(1, 256))
+    return bytes(out)
+
+
+def _cut(data: bytes, chance: np.random.Generator) -> bytes:
+    start, end = _span(data, chance)
+    return data[:start] + data[end:]
+
+
+def _truncate(data: bytes, chance: np.random.Generator) -> bytes:
+    return data[: int(chance.integers(0, len(data) + 1))]
+
+
+def _copy(data: bytes, chance: np.random.Generator) -> bytes:
+    start, end = _span(data, chance, 400)
+    at = int(chance.integers(0, len(data) + 1))
+    return data[:at] + data[start:end] * int(chance.choice([1, 1, 2, 30])) + data[at:]
+
+
+def _insert(data: bytes, chance: np.random.Generator) -> bytes:
+    start, end = _span(data, chance, 8)
+    return data[:start] + WORDS[int(chance.integers(len(WORDS)))] + data[end:]
+
+
+def _number(data: bytes, chance: np.random.Generator) -> bytes:
+    return _replace_one(_NUMBER, NUMBERS, data, chance)
+
+
+def _clock(data: bytes, chance: np.random.Generator) -> bytes:
+    if chance.random() < 0.5:
+        return _replace_one(_DATE, DATES, data, chance)
+    return _replace_one(_HOUR, HOURS, data, chance)
+
+
+def _lines(data: bytes, chance: np.random.Generator) -> bytes:
+    lines = data.splitlines(keepends=True)
+    if len(lines) < 2:
+        return data
+    i, j = (int(k) for k in chance.integers(0, len(lines), 2))
+    what = int(chance.integers(4))
+    if what == 0:
+        lines[i], lines[j] = lines[j], lines[i]
+    elif what == 1:
+        lines.insert(i, lines[j])
+    elif what == 2:
+        del lines[i]
+    else:
+        lines[i] = lines[i].rstrip(b"\r\n") + lines[j]
+    return b"".join(lines)
+
+
+def _encode(data: bytes, chance: np.random.Generator) -> bytes:
+    what = int(chance.integers(6))
+    if what == 0:
+        return data.replace(b"\n", b"\r\n")
+    if what == 1:
+        return data.replace(b"\r\n", b"\n").replace(b"\n", b"\r")
+    if what == 2:
+        return b"\xef\xbb\xbf" + data
+    if what == 3:
+        return data.replace(b"\n", b"")
+    text = data.decode("latin-1")
+    return text.encode(ENCODINGS[int(chance.integers(len(ENCODINGS)))], errors="replace")
+
+
+def _case(data: bytes, chance: np.random.Generator) -> bytes:
+    start, end = _span(data, chance, 200)
+    return data[:start] + data[start:end].swapcase() + data[end:]
+
+
+MUTATIONS = (_bytes, _cut, _truncate, _copy, _insert, _number, _number, _number, _clock, _lines, _lines, _encode, _case)
+
+
+def mutated(target: Target, seed: int, index: int) -> bytes:
+    """Input ``index`` of a target: one of its seeds (or two, joined), changed one to five times."""
+    name = int.from_bytes(hashlib.sha256(target.name.encode()).digest()[:8], "big")
+    chance = np.random.default_rng([seed, name, index])
+    data = target.seeds[int(chance.integers(len(target.seeds)))]
+    if chance.random() < 0.05:
+        other = target.seeds[int(chance.integers(len(target.seeds)))]
+        data = data[: int(chance.integers(len(data) + 1))] + other[int(chance.integers(len(other) + 1)) :]
+    for _ in range(int(chance.integers(1, 6))):
+        data = MUTATIONS[int(chance.integers(len(MUTATIONS)))](data, chance)
+    return data[:200_000]
+
+
+# --- what must hold --------------------------------------------------------------------------------------------------
+
+
+def check_law(result: ReadResult, data: bytes, binary: bool) -> None:
+    """The accounting law of a read file, and what frames of records promise."""
+    if result.lines != result.accepted + len(result.rejected) + result.blank:
+        raise ViolationError("lines are not accepted + rejected + blank")
+    if not binary and result.lines != data.count(b"\n") + (not data.endswith(b"\n") and len(data) > 0):
+        raise ViolationError(f"{result.lines} lines counted, the file has {data.count(10)} line ends")
+    numbers = [line.number for line in result.rejected]
+    if numbers != sorted(set(numbers)):
+        raise ViolationError("rejected lines are not in order, or come twice")
+    if not all(line.reason and len(line.text) <= 500 for line in result.rejected):
+        raise ViolationError("a rejected line without a reason, or with too long a text")
+    records: set[int] = set()
+    for stream in result.streams:
+        frame = stream.frame
+        if frame["time"].dtype != np.dtype("datetime64[ns]") or frame["time"].isna().any():
+            raise ViolationError(f"{stream.name}: a record without a time")
+        if len(frame) and not frame["line"].between(1, max(result.lines, 1)).all():
+            raise ViolationError(f"{stream.name}: a record of no line")
+        if not frame["flag"].map(type).eq(str).all():
+            raise ViolationError(f"{stream.name}: a flag that is no text")
+        if stream.kind == "rank" and not (np.isnan(frame["rank"]) | (frame["rank"] >= 1)).all():
+            raise ViolationError(f"{stream.name}: a rank below 1")
+        for limit in limits.LIMITS:
+            for name, (low, high) in zip(limit.columns, limit.ranges, strict=True):
+                if name in frame and not (np.isnan(frame[name]) | frame[name].between(low, high)).all():
+                    raise ViolationError(f"{stream.name}: {name} beyond its range")
+        if stream.kind == "rss" and np.isinf(frame["rss_db"]).any():
+            raise ViolationError(f"{stream.name}: an infinite level")
+        records |= set(frame["line"].tolist())
+    if records & set(numbers):
+        raise ViolationError("a rejected line gave a record")
+    if len(records) > result.accepted:
+        raise ViolationError("more lines gave records than were accepted")
+
+
+def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
+    head = head_of(data)
+    for one in catalogue():
+        one.sniff(head)
+    result = limits.check(reader.read(data, OPTIONS[index % len(OPTIONS)]))
+    check_law(result, data, binary)
+    return result.accepted > 0
+
+
+# --- targets ---------------------------------------------------------------------------------------------------------
+
+
+def _pieces(data: bytes) -> Iterator[bytes]:
+    """A few lines from the beginning of a log, and a few from its middle behind the first line."""
+    yield data[:SEED_BYTES].rpartition(b"\n")[0] + b"\n" if len(data) > SEED_BYTES else data
+    if len(data) > 4 * SEED_BYTES:
+        middle = data.find(b"\n", len(data) // 2) + 1
+        yield data[: data.find(b"\n") + 1][:500] + data[middle : data.find(b"\n", middle + 600) + 1]
+
+
+def _small_mat(data: bytes) -> bytes:
+    """A MATLAB 5 file with the first rows of each array."""
+    import scipy.io
+
+    content = scipy.io.loadmat(io.BytesIO(data))
+    arrays = {
+        k: v[:6] if np.asarray(v).shape[0] > 6 else v[:, :6] for k, v in content.items() if not k.startswith("__")
+    }
+    out = io.BytesIO()
+    scipy.io.savemat(out, arrays, do_compression=len(data) % 2 == 0)
+    return out.getvalue()
+
+
+def _log_files() -> Iterator[Path]:
+    roots = [ROOT / "sample_logs"]
+    if field := os.environ.get("AERPAW_CMP_FIELD_DATA"):
+        roots.append(Path(field))
+    for root in roots:
+        yield from sorted(p for p in root.rglob("*") if p.is_file() and p.stat().st_size < 40_000_000)
+
+
+def _log_seeds() -> dict[str, list[bytes]]:
+    """Pieces of real logs and of the samples, by the reader that knows them."""
+    from tests.parsers.samples import SAMPLES
+
+    found: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
+    for name, samples in SAMPLES.items():
+        found.setdefault(name, []).extend(data for data, *_ in samples.values())
+    for path in _log_files():
+        data = path.read_bytes()
+        if data.startswith(b"\x1f\x8b"):
+            import gzip
+
+            data = gzip.decompress(data)
+        readers = [r for r in catalogue() if r.sniff(head_of(data))]
+        if len(readers) != 1:
+            continue
+        if data.startswith(b"MATLAB 5"):
+            try:
+                found[readers[0].name].append(_small_mat(data))
+            except (ValueError, IndexError, TypeError, NotImplementedError):
+                continue
+        elif b"\0" not in data[:1000]:
+            found[readers[0].name] += [p for p in _pieces(data) if len(p) <= MEDIUM_BYTES]
+    return {name: list(dict.fromkeys(seeds)) for name, seeds in found.items() if seeds}
+
+
+@contextmanager
+def _file(data: bytes, name: str) -> Iterator[Path]:
+    path = SCRATCH / f"{os.getpid()}-{name}"
+    path.write_bytes(data)
+    try:
+        yield path
+    finally:
+        path.unlink(missing_ok=True)
+
+
+SCRATCH = Path("/dev/shm" if os.access("/dev/shm", os.W_OK) else tempfile.gettempdir())
+
+
+def _by_path(name: str, read: Callable[[Path], Any], data: bytes, _index: int) -> bool:
+    with _file(data, name) as path:
+        return read(path) is not None
+
+
+FLIGHT = b"""flight: {name: f, title: "A $", plan: {start: 2025-06-01T10:00:00, waypoints: [{label: A, east_m: 0,
+  north_m: 0, height_m: 5}, {east_m: 90, north_m: 0, height_m: 30, hold_s: 2}], seed: 1}}
+site: {file: lake_wheeler, without_buildings: true}
+timezone: America/New_York
+logs:
+  - {path: a_vehicleOut.txt, reader: vehicle_out}
+  - {path: b.txt, reader: sounder_log, node: LW1, channel: USRP1, clock: local, floor_db: -200, skip: [quality]}
+link: {rss: {carrier_hz: 3.3e9, tower: {layout: linear, elements: 2, slant_deg: [45, -45], antenna: {model: dipole}}}}
+rt: {engine: image, max_depth: 1, attitude: logged, foliage: attenuating}
+rss: {step_db: 0.1, span_db: [-50, 50], lag: apply, window_s: 1}
+rank: {tower: LW1, k: [10, 100], bootstrap: 50}
+report: {title: t, waypoints: [{label: W, east_m: 1, north_m: 2, height_m: 3}]}
+"""
+CAMPAIGN = b"""campaign: c
+title: "A campaign"
+flights: [a.yaml, b.yaml]
+settings:
+  one: {}
+  two: {rt.max_depth: 0, link.rss.uav.yaw_deg: 315}
+calibration: channel
+held_out: {setting: two, fit: {link.rss.uav.yaw_deg: [0, 10, 20]}}
+"""
+
+
+def _flight(path: Path) -> bool:
+    from aerpaw_cmp.flight.settings import load_flight
+    from aerpaw_cmp.flight.simulate import plan_trajectory
+
+    settings = load_flight(path)
+    for link in (settings.link.rss, settings.link.rank, *settings.link.channels.values()):
+        link.build(["LW1"], path.parent)
+    for log in settings.logs:
+        log.options(settings.timezone)
+    if settings.flight.plan is not None:
+        plan_trajectory(settings.flight.plan)
+    return True
+
+
+def _campaign(path: Path) -> bool:
+    from aerpaw_cmp.jobs.campaign import load_campaign
+
+    return load_campaign(path) is not None
+
+
+def _site(path: Path) -> Any:
+    from aerpaw_cmp.site.siteyaml import load_site
+
+    return load_site(path)
+
+
+def _map(path: Path) -> Any:
+    from aerpaw_cmp.site.footprints import import_footprints
+
+    return import_footprints([path], FRAME)
+
+
+def _dem(path: Path) -> Any:
+    from aerpaw_cmp.site.dem import read_dem
+
+    return read_dem(path, FRAME, crs="local" if path.suffix == ".asc" else None)
+
+
+def _pattern(path: Path) -> Any:
+    from aerpaw_cmp.site.antennas import read_pattern_text
+
+    return read_pattern_text(path)
+
+
+def _mat(data: bytes, _index: int) -> bool:
+    from aerpaw_cmp.logs.matfile import read_arrays
+
+    return bool(read_arrays(data, None))
+
+
+def _flight_file(path: Path) -> Any:
+    from aerpaw_cmp.logs.flight_file import read_flight
+
+    return read_flight(path)
+
+
+def _gzipped(data: bytes, index: int) -> bool:
+    from aerpaw_cmp.logs.ingest import read_file
+
+    with _file(data, "log.gz") as path:
+        return read_file(path, options=OPTIONS[index % len(OPTIONS)]).result.accepted > 0
+
+
+def _path_cache(data: bytes, _index: int) -> bool:
+    from aerpaw_cmp.propagation.cache import PathCache
+
+    with _file(data, "key.npz") as path:
+        return PathCache(path.parent).load(path.stem) is not None
+
+
+def _cache_entry() -> bytes:
+    from aerpaw_cmp.propagation.cache import PathCache
+    from aerpaw_cmp.propagation.paths import PathSet
+
+    with tempfile.TemporaryDirectory() as folder:
+        paths = PathSet(
+            np.arange(4), np.zeros(4, np.int64), np.array([0, 1, 0, 1]), np.full((4, 1), -1), np.zeros((4, 1, 3))
+        )
+        PathCache(Path(folder)).save("key", paths, 1.0)
+        return (Path(folder) / "key.npz").read_bytes()
+
+
+def _flight_bytes(log: bytes) -> bytes:
+    from aerpaw_cmp.logs.flight_file import IngestedFile, flight_bytes
+    from aerpaw_cmp.logs.readers import identify
+
+    return flight_bytes([IngestedFile("a.txt", "0" * 64, identify(log).read(log, OPTIONS[0]))])
+
+
+def _geotiff() -> bytes | None:
+    try:
+        import rasterio
+        from rasterio.transform import from_origin
+    except ImportError:
+        return None
+    with rasterio.MemoryFile() as memory:
+        profile = {"driver": "GTiff", "height": 5, "width": 5, "count": 1, "dtype": "float32", "crs": "EPSG:4326"}
+        with memory.open(**profile, transform=from_origin(-78.6985, 35.73, 0.001, 0.001)) as image:
+            image.write(np.arange(25, dtype=np.float32).reshape(1, 5, 5))
+        return bytes(memory.read())
+
+
+def _zipped(name: str, data: bytes, kind: int) -> bytes:
+    packed = io.BytesIO()
+    with zipfile.ZipFile(packed, "w", kind) as archive:
+        archive.writestr(name, data)
+    return packed.getvalue()
+
+
+def targets() -> list[Target]:
+    """Everything that reads a file, with its seeds."""
+    import gzip
+
+    from tests.site import test_mutilated_files as maps
+
+    logs = _log_seeds()
+    readers = {r.name: r for r in catalogue()}
+    out = []
+    for name, seeds in sorted(logs.items()):
+        binary = any(b"\0" in seed[:200] for seed in seeds)
+        out.append(Target(f"reader:{name}", tuple(seeds), partial(_read_log, readers[name], binary)))
+    some = [seeds[0] for name, seeds in sorted(logs.items()) if name != "generic_csv"]
+    out.append(Target("ingest:gzip", tuple(gzip.compress(s, mtime=0) for s in some), _gzipped))
+    mats = [s for seeds in logs.values() for s in seeds if s.startswith((b"MATLAB", b"\x89HDF"))]
+    out.append(Target("matfile", tuple(mats), _mat))
+    vehicle = next(iter(logs["vehicle_out"]))
+    out.append(Target("flight_file", (_flight_bytes(vehicle),), partial(_by_path, "f.h5", _flight_file)))
+    out.append(Target("path_cache", (_cache_entry(),), _path_cache))
+    yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any]]] = [
+        ("flight.yaml", (FLIGHT, (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]), _flight),
+        ("campaign.yaml", (CAMPAIGN,), _campaign),
+        ("site.yaml", (maps.SITE,), _site),
+    ]
+    for name, seeds, read in yamls:
+        out.append(Target(name, seeds, partial(_by_path, name, read)))
+    fence = [p.read_bytes() for p in _log_files() if p.name.endswith("Geofence.kml")]
+    plain = {"geojson": (maps.GEOJSON,), "overpass": (maps.OVERPASS,), "osm": (maps.OSM,)}
+    for name, seeds in {**plain, "kml": (maps.KML, *(f[:MEDIUM_BYTES] for f in fence))}.items():
+        out.append(Target(f"map:{name}", seeds, partial(_by_path, f"m.{name}", _map)))
+    kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
+    kmz = tuple(_zipped("doc.kml", maps.KML, kind) for kind in kinds)
+    out.append(Target("map:kmz", kmz, partial(_by_path, "m.kmz", _map)))
+    out.append(Target("dem:asc", (maps.DEM,), partial(_by_path, "d.asc", _dem)))
+    if (tiff := _geotiff()) is not None:
+        out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem)))
+    out.append(Target("antenna:text", (maps.PATTERN,), partial(_by_path, "p.txt", _pattern)))
+    return out
+
+
+# --- one input -------------------------------------------------------------------------------------------------------
+
+
+class TimeIsUpError(BaseException):
+    """The alarm; no ``except Exception`` of the package may swallow it."""
+
+
+def _alarm(_signal: int, _frame: Any) -> None:
+    raise TimeIsUpError
+
+
+def _room() -> int:
+    """Address space of this process now [bytes]."""
+    return int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
+
+
+def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) -> tuple[str, str, float]:
+    """Verdict (``read``, ``refused``, ``violation``), what it was, and seconds."""
+    data = mutated(target, seed, index)
+    if bounded:
+        resource.setrlimit(resource.RLIMIT_AS, (_room() + LIMIT_MIB * 2**20, resource.RLIM_INFINITY))
+        signal.signal(signal.SIGALRM, _alarm)
+        signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
+    start = time.perf_counter()
+    try:
+        took = target.run(data, index)
+        verdict, what = ("read" if took else "refused"), ""
+    except AerpawCmpError as error:
+        verdict, what = "refused", ""
+        if not all(c.isprintable() or c == "\n" for c in str(error)) or not str(error).strip():
+            verdict, what = "violation", f"a message that a terminal would take for commands: {str(error)[:200]!r}"
+    except TimeIsUpError:
+        verdict, what = "violation", f"more than {LIMIT_S:g} s"
+    except MemoryError:
+        verdict, what = "violation", f"more than {LIMIT_MIB} MiB"
+    except Exception as error:  # that is the question
+        verdict, what = "violation", f"{type(error).__name__}: {str(error)[:200]}"
+    finally:
+        seconds = time.perf_counter() - start
+        if bounded:
+            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
+    return verdict, what, seconds
+
+
+# --- blocks in worker processes --------------------------------------------------------------------------------------
+
+
+def _block(target: Target, seed: int, start: int, stop: int, place: mmap.mmap, send: Any) -> None:
+    warnings.simplefilter("ignore")
+    sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123 - native libraries talk there
+    counts = {"read": 0, "refused": 0, "violation": 0}
+    violations: list[dict[str, Any]] = []
+    slowest, seconds = 0.0, 0.0
+    for index in range(start, stop):
+        place[:8] = struct.pack("q", index)
+        verdict, what, took = one_input(target, seed, index)
+        counts[verdict] += 1
+        slowest, seconds = max(slowest, took), seconds + took
+        if verdict == "violation":
+            violations.append({"index": index, "what": what})
+    send.send({**counts, "violations": violations[:20], "slowest_ms": round(1e3 * slowest, 1), "reading_s": seconds})
+    send.close()
+
+
+def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any]:
+    """Inputs ``start`` to ``stop`` in a process of their own; if it ends or hangs, the input is at fault."""
+    parts: list[dict[str, Any]] = []
+    context = multiprocessing.get_context("fork")
+    while start < stop:
+        place = mmap.mmap(-1, 8)
+        place[:8] = struct.pack("q", start)
+        receive, send = context.Pipe(duplex=False)
+        worker = context.Process(target=_block, args=(target, seed, start, stop, place, send))
+        worker.start()
+        send.close()
+        at, since = start, time.monotonic()
+        while not receive.poll(0.2) and worker.is_alive():
+            (now,) = struct.unpack("q", place[:8])
+            if now != at:
+                at, since = now, time.monotonic()
+            elif time.monotonic() - since > WATCHDOG_S:
+                worker.kill()
+        try:
+            parts.append(receive.recv())
+            worker.join()
+            break
+        except EOFError:
+            worker.join()
+            (at,) = struct.unpack("q", place[:8])
+            told = {"index": at, "what": f"the process ended with {worker.exitcode}"}
+            # the account of the inputs before it went with the process: they are run again, up to the bad one
+            if at > start:
+                parts.append(run_block(target, seed, start, at))
+            parts.append(
+                {"read": 0, "refused": 0, "violation": 1, "violations": [told], "slowest_ms": 0, "reading_s": 0}
+            )
+            start = at + 1
+    return {
+        **{key: sum(p[key] for p in parts) for key in ("read", "refused", "violation", "reading_s")},
+        "violations": [v for p in parts for v in p["violations"]],
+        "slowest_ms": max((p["slowest_ms"] for p in parts), default=0.0),
+    }
+
+
+def done_before(account: Path | None, seed: int, commit: str) -> dict[str, int]:
+    """How many inputs of each target the account holds already, for this seed and this state of the package."""
+    done: dict[str, int] = {}
+    if account is not None and account.exists():
+        for line in account.read_text(encoding="utf-8").splitlines():
+            entry = json.loads(line)
+            if entry["seed"] == seed and entry["commit"] == commit and entry["from"] == done.get(entry["target"], 0):
+                done[entry["target"]] = entry["to"]
+    return done
+
+
+def commit_of() -> str:
+    """Hash of the package's own sources: the state that an account speaks of."""
+    digest = hashlib.sha256()
+    for folder in ("aerpaw_cmp", "parsers"):
+        for path in sorted((ROOT / folder).rglob("*.py")):
+            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    return digest.hexdigest()[:16]
+
+
+def run(
+    chosen: Iterable[Target], inputs: int, seed: int, account: Path | None, tell: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Blocks of all targets in turn, so that an account that was cut short holds as much of each."""
+    commit = commit_of()
+    done = done_before(account, seed, commit)
+    rows: dict[str, dict[str, Any]] = {}
+    pending = {t.name: t for t in chosen}
+    while pending:
+        for name, target in list(pending.items()):
+            start = done.get(name, 0)
+            stop = min(inputs, start + BLOCK)
+            if start >= stop:
+                del pending[name]
+                continue
+            began = time.perf_counter()
+            block = run_block(target, seed, start, stop)
+            entry = {
+                "target": name, "seed": seed, "commit": commit, "from": start, "to": stop,
+                "seconds": round(time.perf_counter() - began, 2), **block,
+            }  # fmt: skip
+            entry["reading_s"] = round(entry["reading_s"], 2)
+            done[name] = stop
+            if account is not None:
+                with account.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(entry) + "\n")
+            row = rows.setdefault(
+                name, {"target": name, "inputs": 0, "read": 0, "refused": 0, "violations": 0, "slowest_ms": 0.0}
+            )
+            row["inputs"] += stop - start
+            row["read"] += block["read"]
+            row["refused"] += block["refused"]
+            row["violations"] += block["violation"]
+            row["slowest_ms"] = max(row["slowest_ms"], block["slowest_ms"])
+            for violation in block["violations"]:
+                tell(f"{name} {violation['index']}: {violation['what']}")
+    return list(rows.values())
+
+
+def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
+    """Mutate, read, count."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--inputs", type=int, default=5000, help="per target; the recorded run: 200000")
+    parser.add_argument("--target", default="*", help="pattern of target names, e.g. 'reader:*'")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--account", type=Path, help="append a line of JSON per block here, and go on where it ends")
+    parser.add_argument("--reproduce", nargs=2, metavar=("TARGET", "I"), help="run one input here, with its traceback")
+    parser.add_argument("--save", type=Path, help="with --reproduce: write the input to this file")
+    parser.add_argument("--json", action="store_true")
+    arguments = parser.parse_args(argv)
+    known = {t.name: t for t in targets()}
+    if arguments.reproduce:
+        target, index = known[arguments.reproduce[0]], int(arguments.reproduce[1])
+        data = mutated(target, arguments.seed, index)
+        if arguments.save:
+            arguments.save.write_bytes(data)
+        print(f"{len(data)} bytes: {data[:2000]!r}")
+        print(target.run(data, index))
+        return []
+    chosen = [t for name, t in known.items() if fnmatch.fnmatchcase(name, arguments.target)]
+    start = time.perf_counter()
+    rows = run(chosen, arguments.inputs, arguments.seed, arguments.account, lambda text: print(text, file=sys.stderr))
+    if arguments.json:
+        print(json.dumps({"rows": rows, "seconds": round(time.perf_counter() - start, 1)}))
+    else:
+        print(f"{'target':26} {'inputs':>10} {'read':>10} {'refused':>10} {'violations':>10} {'slowest_ms':>10}")
+        for row in rows:
+            numbers = (row[key] for key in ("inputs", "read", "refused", "violations", "slowest_ms"))
+            print(f"{row['target']:26} " + " ".join(f"{number:10}" for number in numbers))
+    if any(row["violations"] for row in rows):
+        sys.exit(1)
+    return rows
+
+
+if __name__ == "__main__":
+    main()

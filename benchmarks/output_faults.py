@@ -138,8 +138,11 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
 
     What is tried here is the writing; reading, checking, pages, tables and exports are made anew in every run.
     """
+    from typer import main as typer_main
+
     from aerpaw_cmp.__main__ import main
     from aerpaw_cmp.jobs import campaign, coverage_map, run
+    from aerpaw_cmp.maps import export
     from aerpaw_cmp.report import campaign_figures, canvas, figures, maps_figures
 
     for room in (figures, campaign_figures, maps_figures):
@@ -148,6 +151,8 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     for room, name in ((run, "_replayed_and_compared"), (campaign, "run"), (coverage_map, "make_maps")):
         setattr(room, name, _remembered(getattr(room, name), lambda *_: ""))
     canvas.render = _remembered(canvas.render, lambda plate: str(plate.name))
+    export._legend = _remembered(export._legend, lambda layer, *_: str(layer.name))
+    typer_main.get_command = _remembered(typer_main.get_command, lambda *_: "")  # the options of all commands
     for job in jobs.values():
         for variant in VARIANTS if job.kind == "folder" else ():
             _variant[0] = variant
@@ -252,7 +257,8 @@ class Runs:
         """Which files two clean runs of a variant write alike: they tell the variants apart."""
         for variant in VARIANTS:
             seen = []
-            for _ in range(2):
+            for number in range(2):
+                time.sleep(1.1 * number)  # pages and numbers name the second of their run
                 self.reset()
                 self.clean(variant)
                 seen.append(self.content())

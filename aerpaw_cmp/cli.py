@@ -204,6 +204,13 @@ def report(
     engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
     audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    figures: Annotated[
+        str,
+        typer.Option(help="What is drawn: page (what it shows), none, or every figure as svg, png, pdf, all."),
+    ] = "page",
+    style: Annotated[
+        str, typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded).")
+    ] = "screen",
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -211,7 +218,15 @@ def report(
     from .jobs import run
 
     outcome = run.run_report(
-        flight, out=out, logs_root=logs_root, engine=engine, audit=audit, force=force, progress=_say
+        flight,
+        out=out,
+        logs_root=logs_root,
+        engine=engine,
+        audit=audit,
+        force=force,
+        figures=figures,
+        style=style,
+        progress=_say,
     )
     if as_json:
         _print_json(outcome.metrics)

@@ -14,7 +14,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from aerpaw_cmp.flight.track import estimate_lag
+from aerpaw_cmp.flight.lag import estimate_lag
 
 WAVELENGTH_M = 299_792_458.0 / 3.3e9
 NOISE_DB = 3.0
@@ -48,7 +48,7 @@ def one(duration_s: float, rng: np.random.Generator) -> tuple[float, float, bool
     return (
         fit.radio_minus_telemetry_s - at_reference,
         (fit.drift_s_per_s - drift) * 60e3,
-        fit.interval_s[0] <= at_reference <= fit.interval_s[1],
+        fit.ci95_s[0] <= at_reference <= fit.ci95_s[1],
         low <= drift <= high,
         fit.verdict == "ok",
     )

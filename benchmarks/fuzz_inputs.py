@@ -4,8 +4,8 @@ Every reader of the catalogue, flight.yaml, site.yaml, campaign.yaml, map files,
 files, the path cache and elevation models are given mutated seeds. Seeds are the samples of the tests, pieces of a few
 lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; mutations change bytes, lines, numbers (infinities, 1e30,
 -0, integers of forty digits), encodings and clocks. Checked for each input: the accounting law; no exception but the
-package's own; at most 2 s and 300 MiB; the process lives. Input ``i`` of a target depends on the seed, the target and
-``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
+package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a target depends on the
+seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
 
 ``--account FILE`` appends a line of JSON per block and goes on where the file ends.
 """
@@ -52,7 +52,7 @@ LIMIT_MIB = 300
 WATCHDOG_S = 20.0
 """A worker that finishes no input for so long hangs in native code, where no alarm reaches it."""
 
-BLOCK = 2000
+BLOCK = 1000
 SEED_BYTES = 1500
 MEDIUM_BYTES = 4000
 
@@ -243,32 +243,42 @@ def check_law(result: ReadResult, data: bytes, binary: bool) -> None:
         raise ViolationError("a rejected line without a reason, or with too long a text")
     records: set[int] = set()
     for stream in result.streams:
-        frame = stream.frame
-        if frame["time"].dtype != np.dtype("datetime64[ns]") or frame["time"].isna().any():
-            raise ViolationError(f"{stream.name}: a record without a time")
-        if len(frame) and not frame["line"].between(1, max(result.lines, 1)).all():
-            raise ViolationError(f"{stream.name}: a record of no line")
-        if not frame["flag"].map(type).eq(str).all():
-            raise ViolationError(f"{stream.name}: a flag that is no text")
-        if stream.kind == "rank" and not (np.isnan(frame["rank"]) | (frame["rank"] >= 1)).all():
-            raise ViolationError(f"{stream.name}: a rank below 1")
-        for limit in limits.LIMITS:
-            for name, (low, high) in zip(limit.columns, limit.ranges, strict=True):
-                if name in frame and not (np.isnan(frame[name]) | frame[name].between(low, high)).all():
-                    raise ViolationError(f"{stream.name}: {name} beyond its range")
-        if stream.kind == "rss" and np.isinf(frame["rss_db"]).any():
-            raise ViolationError(f"{stream.name}: an infinite level")
-        records |= set(frame["line"].tolist())
+        records |= _check_frame(stream.name, stream.kind, stream.frame, max(result.lines, 1))
     if records & set(numbers):
         raise ViolationError("a rejected line gave a record")
     if len(records) > result.accepted:
         raise ViolationError("more lines gave records than were accepted")
 
 
+RANGES = {name: bounds for limit in limits.LIMITS for name, bounds in zip(limit.columns, limit.ranges, strict=True)}
+
+
+def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:
+    """What a stream's frame promises; gives the lines that its records are of."""
+    time_, line = frame["time"].to_numpy(), frame["line"].to_numpy()
+    if time_.dtype != np.dtype("datetime64[ns]") or np.isnat(time_).any():
+        raise ViolationError(f"{name}: a record without a time")
+    if len(line) and (line.min() < 1 or line.max() > lines):
+        raise ViolationError(f"{name}: a record of no line")
+    if not all(type(flag) is str for flag in frame["flag"].to_numpy()):
+        raise ViolationError(f"{name}: a flag that is no text")
+    if kind == "rank" and (frame["rank"].to_numpy() < 1).any():
+        raise ViolationError(f"{name}: a rank below 1")
+    if kind == "rss" and np.isinf(frame["rss_db"].to_numpy()).any():
+        raise ViolationError(f"{name}: an infinite level")
+    for column in frame.columns.intersection(list(RANGES)):
+        low, high = RANGES[column]
+        values = frame[column].to_numpy()
+        if ((values < low) | (values > high)).any():
+            raise ViolationError(f"{name}: {column} beyond its range")
+    return set(line.tolist())
+
+
 def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
-    head = head_of(data)
-    for one in catalogue():
-        one.sniff(head)
+    if index % 8 == 0:
+        head = head_of(data)
+        for one in catalogue():
+            one.sniff(head)
     result = limits.check(reader.read(data, OPTIONS[index % len(OPTIONS)]))
     check_law(result, data, binary)
     return result.accepted > 0
@@ -298,6 +308,14 @@ def _small_mat(data: bytes) -> bytes:
     return out.getvalue()
 
 
+def _mat_of(arrays: dict[str, Any]) -> bytes:
+    import scipy.io
+
+    out = io.BytesIO()
+    scipy.io.savemat(out, arrays)
+    return out.getvalue()
+
+
 def _log_files() -> Iterator[Path]:
     roots = [ROOT / "sample_logs"]
     if field := os.environ.get("AERPAW_CMP_FIELD_DATA"):
@@ -308,11 +326,15 @@ def _log_files() -> Iterator[Path]:
 
 def _log_seeds() -> dict[str, list[bytes]]:
     """Pieces of real logs and of the samples, by the reader that knows them."""
-    from tests.parsers.samples import SAMPLES
+    from tests.parsers.samples import NO_LOGS, SAMPLES
 
     found: dict[str, list[bytes]] = {r.name: [] for r in catalogue()}
     for name, samples in SAMPLES.items():
-        found.setdefault(name, []).extend(data for data, *_ in samples.values())
+        found[name] += [data for data, *_ in samples.values()]
+    for name, data in NO_LOGS.items():
+        found[name].append(data)
+    found["antenna_grid"].append(_mat_of({"rad_pat": np.zeros((3, 4))}))
+    found["matlab_other"].append(_mat_of({"other": np.ones((2, 2))}))
     for path in _log_files():
         data = path.read_bytes()
         if data.startswith(b"\x1f\x8b"):
@@ -329,7 +351,7 @@ def _log_seeds() -> dict[str, list[bytes]]:
                 continue
         elif b"\0" not in data[:1000]:
             found[readers[0].name] += [p for p in _pieces(data) if len(p) <= MEDIUM_BYTES]
-    return {name: list(dict.fromkeys(seeds)) for name, seeds in found.items() if seeds}
+    return {name: [s for s in dict.fromkeys(seeds) if len(s) <= 40_000] for name, seeds in found.items() if seeds}
 
 
 @contextmanager
@@ -544,16 +566,16 @@ def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) ->
     data = mutated(target, seed, index)
     if bounded:
         resource.setrlimit(resource.RLIMIT_AS, (_room() + LIMIT_MIB * 2**20, resource.RLIM_INFINITY))
-        signal.signal(signal.SIGALRM, _alarm)
-        signal.setitimer(signal.ITIMER_REAL, LIMIT_S)
-    start = time.perf_counter()
+        signal.signal(signal.SIGPROF, _alarm)
+        signal.setitimer(signal.ITIMER_PROF, LIMIT_S)  # of the processor: the machine may be shared
+    start = time.process_time()
     try:
         took = target.run(data, index)
         verdict, what = ("read" if took else "refused"), ""
     except AerpawCmpError as error:
         verdict, what = "refused", ""
         if not all(c.isprintable() or c == "\n" for c in str(error)) or not str(error).strip():
-            verdict, what = "violation", f"a message that a terminal would take for commands: {str(error)[:200]!r}"
+            verdict, what = "violation", f"no message, or one with control characters: {str(error)[:200]!r}"
     except TimeIsUpError:
         verdict, what = "violation", f"more than {LIMIT_S:g} s"
     except MemoryError:
@@ -561,9 +583,9 @@ def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) ->
     except Exception as error:  # that is the question
         verdict, what = "violation", f"{type(error).__name__}: {str(error)[:200]}"
     finally:
-        seconds = time.perf_counter() - start
+        seconds = time.process_time() - start
         if bounded:
-            signal.setitimer(signal.ITIMER_REAL, 0.0)
+            signal.setitimer(signal.ITIMER_PROF, 0.0)
             resource.setrlimit(resource.RLIMIT_AS, (resource.RLIM_INFINITY, resource.RLIM_INFINITY))
     return verdict, what, seconds
 

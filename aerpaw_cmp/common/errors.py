@@ -29,6 +29,17 @@ def one_line(text: str) -> str:
     return "".join(c if c.isprintable() else c.encode("unicode_escape").decode("ascii") for c in text)
 
 
+def printable(text: str) -> str:
+    r"""Text that may have lines and holds nothing that a terminal takes for a command: a file's words may be in it.
+
+    Examples
+    --------
+    >>> print(printable("red: \x1b[31m"))
+    red: \x1b[31m
+    """
+    return "\n".join(one_line(line) for line in text.split("\n"))
+
+
 class AerpawCmpError(Exception):
     """A message for the user; never shown with a traceback.
 
@@ -80,7 +91,7 @@ class AerpawCmpError(Exception):
             text += f"; expected {self.expected}"
         if self.cause:
             text += f". Likely cause: {self.cause}"
-        return text
+        return printable(text)
 
 
 class CheckError(AerpawCmpError):

@@ -26,6 +26,21 @@ MINIMUM_HEIGHT_M = 0.5
 """Poses below this height above ground are raised to it (arXiv 2502.10324, section V)."""
 
 
+THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
+"""Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact)."""
+
+
+def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:
+    """Noise power of a receiver [dBm]: k T B F at 290 K (ITU-R P.372, eq. 1 to 4).
+
+    Examples
+    --------
+    >>> round(noise_floor_dbm(1e6, 5.0), 2)
+    -108.98
+    """
+    return THERMAL_NOISE_DBM_HZ + 10.0 * float(np.log10(bandwidth_hz)) + noise_figure_db
+
+
 def wavelength_m(frequency_hz: float) -> float:
     """Free-space wavelength [m] of a frequency [Hz]."""
     return SPEED_OF_LIGHT_MPS / frequency_hz

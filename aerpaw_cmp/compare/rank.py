@@ -23,6 +23,7 @@ from .statistics import (
     interval,
     memory,
     plain,
+    same_places,
     share_interval,
 )
 
@@ -812,6 +813,98 @@ def compare_ranks(
         shift_test(one, two),
         histogram_test(one, two, replicates=replicates, seed=seed),
     )  # fmt: skip
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CommonestRank:
+    """The forecast that needs no model: always the rank that was reported most often.
+
+    Its agreement is what a model has to beat; its kappa is 0 by definition. ``rank`` is 0 without a report.
+    """
+
+    rank: int
+    agreement: float
+    agreement_ci95: Interval
+
+
+def commonest_rank(measured: ArrayLike) -> CommonestRank:
+    """The commonest of the measured ranks (n,), NaN where none, and how often it is right.
+
+    Examples
+    --------
+    >>> found = commonest_rank([2, 2, 1, float("nan")])
+    >>> found.rank, round(found.agreement, 3)
+    (2, 0.667)
+    """
+    ri = _ranks(measured)
+    bars = histogram(ri)
+    if not np.isfinite(bars).all():
+        return CommonestRank(rank=0, agreement=float("nan"), agreement_ci95=NO_INTERVAL)
+    best = int(np.argmax(bars))
+    bounds = _histogram_intervals(ri[np.isfinite(ri)], REPLICATES, SEED)[best]
+    return CommonestRank(rank=best + 1, agreement=float(bars[best]), agreement_ci95=bounds)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankRepeat:
+    """What two passes of the same places agree to: no model can be expected to do better.
+
+    Parameters
+    ----------
+    kappa, agreement : float
+        Of the reported ranks of both passes; NaN without a pair.
+    kappa_ci95 : (low, high)
+    n : int
+        Pairs.
+    """
+
+    kappa: float
+    kappa_ci95: Interval
+    agreement: float
+    n: int
+
+
+def repeat_rank(
+    position_m: FloatArray,
+    rank: ArrayLike,
+    other_position_m: FloatArray,
+    other_rank: ArrayLike,
+    *,
+    radius_m: float = 2.0,
+    heading_deg: FloatArray | None = None,
+    other_heading_deg: FloatArray | None = None,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> RankRepeat:
+    """Kappa of the ranks that two passes report at the same places (two flights, or two parts of one).
+
+    Parameters
+    ----------
+    position_m, other_position_m : (n, 3), (m, 3)
+        Places [m].
+    rank, other_rank : array_like, (n,), (m,)
+        RI; NaN where none.
+    radius_m, heading_deg, other_heading_deg
+        As in :func:`~aerpaw_cmp.compare.statistics.same_places`.
+    replicates, seed : int
+        Bootstrap.
+    """
+    one, two = _ranks(rank), _ranks(other_rank)
+    heard, other_heard = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
+    here, there = same_places(
+        np.asarray(position_m)[heard],
+        np.asarray(other_position_m)[other_heard],
+        radius_m=radius_m,
+        heading_deg=None if heading_deg is None else heading_deg[heard],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+    )
+    first, second = one[heard[here]], two[other_heard[there]]
+    if not len(first):
+        return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
+    agree, kappa = agreement(first, second), cohen_kappa(first, second)
+    a, b = _pairs(first, second)
+    bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates, seed)
+    return RankRepeat(kappa=kappa, kappa_ci95=bounds[1], agreement=agree, n=len(first))
 
 
 def _pair_intervals(

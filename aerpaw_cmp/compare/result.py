@@ -13,24 +13,27 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .rank import RankComparison
+from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
-from .statistics import Interval
+from .statistics import Interval, PairedDifference
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockResult:
-    """Radio clock against telemetry clock, as far as it is a number.
+    """Radio clock of a receiver (a tower) against the telemetry clock, as far as it is a number.
 
     ``radio_minus_telemetry_s`` is positive where the radio's clock shows later times; subtracting it corrects them.
+    ``checks`` is what the verdict rests on, by name.
     """
 
+    receiver: str
     radio_minus_telemetry_s: float
     ci95_s: Interval
     drift_s_per_s: float
     verdict: str
     reason: str
     applied: str
+    checks: Mapping[str, object] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,8 +112,9 @@ class RssFurther:
     """Numbers of a tower and channel beside offset, RMSE and correlation, as metrics.json names them.
 
     A field without a default is always written; one whose default is None only where the flight has it.
-    ``n_flagged`` is by reason; ``same_footing`` by simulation and window; ``trimmed``, ``identifiable_db``,
-    ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
+    ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
+    the replay is better or worse on the same samples; ``same_footing`` is by simulation and window; ``trimmed``,
+    ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
     n_measured_out: int
@@ -123,6 +127,7 @@ class RssFurther:
     n_flagged: Mapping[str, int]
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
+    compared_with: Mapping[str, PairedDifference]
     same_footing: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
@@ -210,11 +215,14 @@ class PairResult:
 class RankFurther:
     """Numbers of a tower's rank beside those of :class:`~aerpaw_cmp.compare.rank.RankComparison`.
 
-    ``n_flagged`` is by reason, ``foliage`` by run and K.
+    ``n_flagged`` is by reason, ``foliage`` by run and K. ``commonest`` is the forecast that needs no model; ``repeat``
+    is how well the modem agrees with itself where the second half of the flight passes places of the first.
     """
 
     n_flagged: Mapping[str, int]
     kappa_ci95: Mapping[str, Interval]
+    commonest: CommonestRank
+    repeat: Mapping[str, RankRepeat]
     foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 
 

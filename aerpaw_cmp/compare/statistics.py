@@ -9,6 +9,7 @@ All statistics of this module are functions of column means, which block sums gi
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -31,9 +32,11 @@ _LONGER = 2.0
 FEWEST_INDEPENDENT = 10.0
 """Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it."""
 
-_UNSURE = 3.0
-"""The variance is widened by this over the number of independent samples, for what its estimate leaves open (chosen
-on simulated flights: benchmarks/coverage_of_intervals.py)."""
+_UNSURE_OF_SPREAD = 6.0
+"""As :attr:`Memory.unsure`, for an RMSE or a correlation: squares are skewed."""
+
+_FEWEST_OF_PAIR = 5.0
+"""The errors of two models must each be worth this many independent samples before they are compared."""
 
 _HELD = 1 << 21
 """Numbers held at once per bootstrap: bounds memory to tens of MiB."""
@@ -75,12 +78,16 @@ class Memory:
         Independent samples that would fix the mean equally well, 1 to ``n``; NaN below two samples.
     variance_factor : float
         What the variance of a block bootstrap of that length must be multiplied with (first-order bias).
+    unsure : float
+        The variance is widened by this over ``n_effective``, for what its estimate leaves open (chosen on simulated
+        flights: benchmarks/coverage_of_intervals.py).
     """
 
     n: int
     block_length: int
     n_effective: float
     variance_factor: float
+    unsure: float = 3.0
 
     @property
     def blocks(self) -> float:
@@ -96,7 +103,7 @@ class Memory:
         from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
         blocks = max(self.blocks, 2.0)
-        unsure = 1.0 + _UNSURE / self.n_effective if self.n_effective > 0 else 1.0
+        unsure = 1.0 + self.unsure / self.n_effective if self.n_effective > 0 else 1.0
         return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(unsure * self.variance_factor * blocks / (blocks - 1.0)))
 
     @property
@@ -336,9 +343,8 @@ class ErrorIntervals:
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN ("none given") where the samples are worth fewer than :data:`FEWEST_INDEPENDENT` independent ones for that
-        statistic, or where it does not exist. Squares forget sooner than levels, so an RMSE may have an interval
-        where the offset has none.
+        NaN ("none given") where the samples are worth fewer than :data:`FEWEST_INDEPENDENT` independent ones, or
+        where the statistic does not exist.
     memory : Memory
         Of the residual.
     """
@@ -370,9 +376,9 @@ def error_intervals(
     def drawn(columns: list[FloatArray], of: Memory) -> FloatArray:
         return bootstrap_means(np.column_stack(columns), of.block_length, replicates=replicates, seed=seed)
 
-    of_squares = memory(squared)
+    of_squares = _of_spread(known, memory(squared))
     mean, square = drawn([d, squared], of_squares).T
-    of_correlation = memory(_correlation_influence(spread, crossed, squared))
+    of_correlation = _of_spread(known, memory(_correlation_influence(spread, crossed, squared)))
     again, with_residual, residual = drawn([d, crossed, squared], of_correlation).T
     return ErrorIntervals(
         interval(float(difference.mean()), drawn([d], known)[:, 0] + difference.mean(), known),
@@ -392,6 +398,17 @@ def error_intervals(
             backward=np.tanh,
         ),
         known,
+    )
+
+
+def _of_spread(residual: Memory, influence: Memory) -> Memory:
+    """Memory for a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
+    return Memory(
+        residual.n,
+        max(residual.block_length, influence.block_length),
+        min(residual.n_effective, influence.n_effective),
+        max(residual.variance_factor, influence.variance_factor),
+        _UNSURE_OF_SPREAD,
     )
 
 
@@ -442,7 +459,7 @@ class PairedDifference:
         95 % interval of it [dB]: that of the mean square errors over the sum of the two RMSE, so that both have one
         sign; NaN where none can be given.
     standard_error_db : float
-        Of ``difference_db`` [dB].
+        Of ``difference_db`` [dB]; NaN where no interval can be given.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
     n_effective : float
@@ -474,7 +491,8 @@ class PairedDifference:
         if self.verdict == "no difference shown":
             return f"no difference from {other} shown ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
         near, far = sorted((abs(low), abs(high)))
-        return f"{self.verdict} than {other} by {size} [{near:.1f}, {far:.1f}]"
+        digits = 1 if near >= 0.05 else 2
+        return f"{self.verdict} than {other} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None."""
@@ -532,6 +550,8 @@ def paired_difference(
         one, two = one - one.mean(), two - two.mean()
     loss = one * one - two * two
     known = memory(loss)
+    if np.ptp(loss) > 0 and min(memory(one).n_effective, memory(two).n_effective) < _FEWEST_OF_PAIR:
+        known = dataclasses.replace(known, n_effective=1.0)
     columns = np.column_stack([loss, one, two])
     drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
     difference = drawn[:, 0]
@@ -541,7 +561,7 @@ def paired_difference(
     low, high = interval(estimate, difference, known)
     rmse, other = float(np.sqrt(np.mean(one * one))), float(np.sqrt(np.mean(two * two)))
     scale = 1.0 / (rmse + other) if rmse + other > 0 else 0.0
-    spread = _spread(difference) * known.half_width / 1.959964
+    spread = _spread(difference) * known.half_width / 1.959964 if known.enough else float("nan")
     return PairedDifference(
         n=len(one),
         rmse_db=rmse,

@@ -15,15 +15,16 @@ import pandas as pd
 from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
-from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray
+from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
 from ..logs.ingest import IngestedFile, ingest, read_bytes
 from ..logs.limits import UNSCORED, flagged
 from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
 from ..logs.records import Stream
 from ..site.site import Site
 from ..site.siteyaml import load_site
+from .clock import clock_trap
 from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
-from .track import Track, clock_trap
+from .track import Track
 
 Times = NDArray[np.datetime64]
 
@@ -42,6 +43,10 @@ class RssSeries:
     """Equal for series whose link settings are equal: they share a replay."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
+    log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Number of the log (n,) under ``logs:`` that holds each sample; empty where it is not known."""
+    line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Line (n,) of that log."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -343,6 +348,8 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         measured_db=frame["rss_db"].to_numpy(np.float64),
         link=link,
         settings_key=link.model_dump_json(),
+        log=np.full(len(frame), settings.logs.index(log), dtype=np.int64),
+        line=frame["line"].to_numpy(np.int64),
         flagged=left_out,
     )
 

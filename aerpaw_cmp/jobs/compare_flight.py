@@ -134,6 +134,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             n_flagged=dict(series.flagged),
             clock=None if clock is None else clock.found,
             baseline_rmse_ci95_db=score.baseline_intervals,
+            compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             same_footing=_same_footing(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
             expected_offset=_expected(data, series, score.offset_db),
@@ -162,6 +163,17 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
             rmse_ci95_db=score.baseline_intervals[name],
         )
         for name, level in levels.items()
+    }
+
+
+def _paired(
+    levels: Levels, others: Mapping[str, FloatArray], replicates: int
+) -> dict[str, statistics.PairedDifference]:
+    """The replay against each other model on the samples that both have, each with its own offset."""
+    error_db = levels.measured_db - levels.simulated_db
+    return {
+        name: statistics.paired_difference(error_db, levels.measured_db - level, replicates=max(replicates, 2))
+        for name, level in others.items()
     }
 
 
@@ -409,9 +421,35 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         further=RankFurther(
             n_flagged=dict(series.flagged),
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
+            commonest=ranks.commonest_rank(series.rank[rows]),
+            repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
             foliage=foliage_rank_difference(paired) or None,
         ),
     )
+
+
+def _repeated_rank(
+    time: Any, position_m: FloatArray, rank: FloatArray, replayed: Replayed, rows: IntArray
+) -> dict[str, ranks.RankRepeat]:
+    """How well the modem agrees with itself where the second half of the flight passes places of the first."""
+    elapsed = rss.seconds(time)
+    with np.errstate(invalid="ignore"):
+        late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
+    heading = None if replayed.track is None else replayed.track.heading_deg[rows]
+    found = {}
+    for name, turned in (("same_heading", heading), ("any_heading", None)):
+        if name == "same_heading" and turned is None:
+            continue
+        found[name] = ranks.repeat_rank(
+            position_m[~late],
+            rank[~late],
+            position_m[late],
+            rank[late],
+            radius_m=PASSES_WITHIN_M,
+            heading_deg=None if turned is None else turned[~late],
+            other_heading_deg=None if turned is None else turned[late],
+        )
+    return found
 
 
 # --- audit ---------------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,9 +12,11 @@ import numpy as np
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import ClockResult
+from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
+from ..flight.lag import direction_terms
 from ..flight.settings import RtSettings
-from ..flight.track import LagFit, Track, TrackPoses, estimate_lag
+from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
@@ -24,6 +26,9 @@ from ..site.site import Site, Trees
 
 COHERENT_STEP_S = 0.02
 """Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""
+
+POWER_STEP_S = 0.1
+"""Sampling of its power sum, which is smooth."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,27 +114,26 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
 
 
 def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
-    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks.
+    """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
     Predictions are the image engine's RSS along the track with at most one reflection.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
         return [None] * len(data.rss)
-    out: list[Clock | None] = []
-    predict = _Predictions(data)
-    for series in data.rss:
-        if isinstance(wanted, float):
-            out.append(_given_clock(wanted, len(series.time)))
-            continue
-        progress(f"clock {series.tower} {series.channel}")
-        out.append(_estimated_clock(data, series, predict, apply=wanted == "apply"))
-    return out
+    if isinstance(wanted, float):
+        return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
+    predict, found = _Predictions(data), dict[str, ClockEstimate]()
+    for tower in dict.fromkeys(series.tower for series in data.rss):
+        progress(f"clock {tower}")
+        found[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+    return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
-def _given_clock(radio_minus_telemetry_s: float, samples: int) -> Clock:
+def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
     """The clock of a flight file that states it."""
     found = ClockResult(
+        receiver=receiver,
         radio_minus_telemetry_s=radio_minus_telemetry_s,
         ci95_s=(radio_minus_telemetry_s, radio_minus_telemetry_s),
         drift_s_per_s=0.0,
@@ -160,46 +164,74 @@ class _Predictions:
         return self._kept[key][field]
 
 
-def _estimated_clock(data: FlightData, series: RssSeries, predictions: _Predictions, *, apply: bool) -> Clock:
-    """Lag by the coherent replay and by its power sum; the one that leaves the smaller residual decides.
+def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], predictions: _Predictions) -> ClockEstimate:
+    """Clock of one receiver by the coherent replay and by its power sum; the one that explains more decides.
 
     Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
     (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
     """
+    place = data.site.towers[channels[0].tower].position_m
 
-    def predictor(field: str) -> Callable[[Any], FloatArray]:
-        return lambda times: predictions(series, field, times)
+    def terms(times: Any) -> FloatArray:
+        track = _track_poses(data.track, times)
+        line = track.position_m - place
+        azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+        elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
+        return direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
 
-    measured = series.measured_db
-    if data.settings.rss.minimum_height_m is not None:
-        with np.errstate(invalid="ignore"):
-            low = ~(_track_poses(data.track, series.time).position_m[:, 2] >= data.settings.rss.minimum_height_m)
-        measured = np.where(low, np.nan, measured)
-    window = data.settings.rss.lag_window_s
-    fits = {
-        name: estimate_lag(series.time, measured, predictor(field), window_s=window, resolution_s=resolution)
-        for name, field, resolution in (
-            ("coherent replay", "rss_dbm", COHERENT_STEP_S),
-            ("power sum of the replay", "rss_power_dbm", 0.1),
+    def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
+        return ClockChannel(
+            name=series.channel,
+            times=series.time,
+            measured_db=_high_enough(data, series),
+            predictor=lambda times: predictions(series, field, times),
+            terms=terms,
+            resolution_s=resolution_s,
         )
-    }
-    by = min(fits, key=lambda name: np.nan_to_num(fits[name].rmse_db, nan=np.inf))
-    fit = fits[by]
-    return _clock_of(fit, by, series.time, apply=apply)
+
+    models = (
+        ("coherent replay", "rss_dbm", COHERENT_STEP_S),
+        ("power sum of the replay", "rss_power_dbm", POWER_STEP_S),
+    )
+    fits = [
+        judge_clock(
+            [channel(series, field, resolution) for series in channels],
+            model=name,
+            window_s=data.settings.rss.lag_window_s,
+        )
+        for name, field, resolution in models
+    ]
+    return max(fits, key=lambda fit: np.nan_to_num(fit.explained, nan=-np.inf))
 
 
-def _clock_of(fit: LagFit, by: str, time: Times, *, apply: bool) -> Clock:
-    """A fit as the clock of a series with these radio times (n,)."""
+def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
+    """Levels (n,), NaN below ``rss.minimum_height_m``."""
+    least = data.settings.rss.minimum_height_m
+    if least is None:
+        return series.measured_db
+    with np.errstate(invalid="ignore"):
+        low = ~(_track_poses(data.track, series.time).position_m[:, 2] >= least)
+    return np.where(low, np.nan, series.measured_db)
+
+
+def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
+    """The clock of a receiver as that of one of its series; only a verdict "ok" is applied."""
     used = apply and fit.verdict == "ok"
     found = ClockResult(
+        receiver=series.tower,
         radio_minus_telemetry_s=fit.radio_minus_telemetry_s,
-        ci95_s=fit.interval_s,
+        ci95_s=fit.ci95_s,
         drift_s_per_s=fit.drift_s_per_s,
         verdict=fit.verdict,
-        reason=f"by the {by}" + (f": {fit.reason}" if fit.reason else ""),
-        applied="estimated and applied" if used else "estimated, not applied",
+        reason=f"by the {fit.model}" + (f": {fit.reason}" if fit.reason else ""),
+        applied="estimated and applied"
+        if used
+        else "asked for, not applied"
+        if apply and fit.verdict != "agree"
+        else "estimated, not applied",
+        checks=fit.as_dict(),
     )
-    return Clock(found=found, applied_s=fit.at(time) if used else np.zeros(len(time)))
+    return Clock(found=found, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:

@@ -91,9 +91,25 @@ def run_report(
     engine: str | None = None,
     audit: str | None = None,
     force: bool = False,
+    figures: str = "page",
+    style: str = "screen",
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
+
+    Parameters
+    ----------
+    flight : Path
+    out, logs_root : Path, optional
+        Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
+    engine, audit : str, optional
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+    force : bool
+        Replace what this tool did not write.
+    figures : {"page", "none", "svg", "png", "pdf", "all"}
+        What is drawn: what the page shows, nothing, or every figure in one format or in all.
+    style : {"screen", "paper"}
+    progress : Progress
 
     Raises
     ------
@@ -102,15 +118,19 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
-    from ..report.write import write_report
+    from ..report.write import FIGURES, STYLES, write_report
 
+    for given, known in ((figures, FIGURES), (style, STYLES)):
+        if given not in known:
+            raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
-        record = _replayed_and_compared(settings, flight, logs_root, Stages(progress))
+        stages = Stages(progress)
+        record = _replayed_and_compared(settings, flight, logs_root, stages)
         with output.filling() as place:
-            write_report(record, place)
+            record = write_report(record, place, drawn=figures, style=style, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
@@ -152,11 +172,19 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
             from .speed_table import speed_rows
 
             speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
-    stages.progress("report")
     from ..report.build import report_data
+    from .manifest import other_inputs
+    from .pose_paths import pose_paths
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(data, found.result, speed=speed, notes=notes, stages_s=stages.seconds)
+    return report_data(
+        data,
+        found.result,
+        speed=speed,
+        notes=notes,
+        other_inputs=other_inputs(settings, flight, logs_root),
+        paths=pose_paths(data, found.replays),
+    )
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:

@@ -318,15 +318,15 @@ class _Materials:
         )
 
 
-def rss_dbm(power: FloatArray, transmit_power_dbm: float) -> FloatArray:
-    """Received power [dBm]; NaN where ``power`` is zero (no path).
+def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float = -np.inf) -> FloatArray:
+    """Received power [dBm]; NaN where ``power`` is zero (no path) or the level is below the noise floor [dBm].
 
     ``power`` is the mean over element pairs of ``|h|^2``: the transmit power is shared equally by the transmitting
     ports, which send independent signals, and the received power is the mean over the receiving ports. With one
     element at both ends it is ``|h|^2``.
     """
     level = transmit_power_dbm + db_from_power(power)
-    return np.asarray(np.where(power > 0.0, level, np.nan))
+    return np.asarray(np.where((power > 0.0) & (level >= noise_floor_dbm), level, np.nan))
 
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:

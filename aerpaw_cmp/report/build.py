@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from datetime import datetime, timezone
 from typing import Any
@@ -13,8 +14,10 @@ from ..common.units import AnyArray, FloatArray, IntArray
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
-from ..compare.result import FlightResult, ModelLevel, PairResult, RankResult, RssResult
-from ..flight.data import FlightData
+from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
+from ..compare.statistics import PairedDifference
+from ..flight.data import FlightData, RssSeries
+from ..flight.settings import FlightFile
 from . import data as record
 from .export import merge
 
@@ -31,7 +34,9 @@ def report_data(
     *,
     speed: Sequence[record.SpeedRow] = (),
     notes: Sequence[str] = (),
+    other_inputs: Sequence[record.InputFile] = (),
     stages_s: Mapping[str, float] | None = None,
+    paths: Sequence[record.PosePaths] = (),
 ) -> record.ReportData:
     """Everything a report shows.
 
@@ -45,11 +50,14 @@ def report_data(
         The table of speed against error.
     notes : sequence of str
         Remarks beside those of the flight file.
+    other_inputs : sequence of InputFile
+        Files besides the logs: settings, site, antennas.
     stages_s : mapping of str to float
         Seconds per stage.
     """
     settings = data.settings
     warnings = [
+        *clock_warnings(result),
         *data.warnings,
         *(text for one in result.rss for text in rss_warnings(one)),
         *(text for one in result.rank for text in rank_warnings(one)),
@@ -60,10 +68,14 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=inputs_of(data),
+        inputs=(*inputs_of(data), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
-        rss=tuple(rss_panel(one) for one in result.rss),
+        rss=tuple(
+            dataclasses.replace(rss_panel(one), source=source_of(series, settings))
+            for one, series in zip(result.rss, data.rss, strict=True)
+        ),
+        paths=tuple(paths),
         rank=tuple(rank_panel(one) for one in result.rank),
         pairs=tuple(pair_panel(one) for one in result.pairs),
         extra_metrics=metrics_beyond_panels(result),
@@ -105,7 +117,9 @@ def rss_panel(result: RssResult) -> record.RssPanel:
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
-        baselines=tuple(_baseline(name, model) for name, model in result.baselines.items()),
+        baselines=tuple(
+            _baseline(name, model, result.further.compared_with.get(name)) for name, model in result.baselines.items()
+        ),
         offset_curve=record.OffsetCurve(offset_db=result.curve_offset_db, rmse_db=result.curve_rmse_db),
         east_m=position[:, 0],
         north_m=position[:, 1],
@@ -123,8 +137,17 @@ def rss_panel(result: RssResult) -> record.RssPanel:
     )
 
 
-def _baseline(name: str, model: ModelLevel) -> record.Baseline:
-    return record.Baseline(name=name, level_dbm=model.level_dbm, offset_db=model.offset_db, rmse_db=model.rmse_db)
+def source_of(series: RssSeries, settings: FlightFile) -> record.Source | None:
+    """Where the samples of a series stand in its logs."""
+    if len(series.line) != len(series.time):
+        return None
+    return record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
+
+
+def _baseline(name: str, model: ModelLevel, paired: PairedDifference | None) -> record.Baseline:
+    return record.Baseline(
+        name=name, level_dbm=model.level_dbm, offset_db=model.offset_db, rmse_db=model.rmse_db, paired=paired
+    )
 
 
 def _variant(name: str, model: ModelLevel) -> record.Variant:
@@ -148,16 +171,40 @@ def _spans(time: AnyArray, spans: Sequence[rss.ErrorSpan]) -> tuple[record.Error
     )
 
 
+def clocks_of(result: FlightResult) -> dict[str, ClockResult]:
+    """One clock per receiver."""
+    return {clock.receiver: clock for one in result.rss if (clock := one.further.clock) is not None}
+
+
+def clock_warnings(result: FlightResult) -> tuple[str, ...]:
+    """What the reader must know of each receiver's clock; a correction that was asked for and not made comes first."""
+    asked, other = [], []
+    for receiver, clock in clocks_of(result).items():
+        low, high = clock.ci95_s
+        shown = f"{clock.radio_minus_telemetry_s:+.2f} s ({low:+.2f} .. {high:+.2f})"
+        if clock.applied == "asked for, not applied":
+            asked.append(
+                f"{receiver}: rss.lag: apply was asked for, but the radio clock was NOT corrected: the check is "
+                f"{clock.verdict} ({clock.reason})."
+            )
+        elif clock.applied == "estimated and applied":
+            other.append(f"{receiver}: the radio clock shows {shown} more than the telemetry clock; it was corrected.")
+        elif clock.verdict == "ok":
+            other.append(
+                f"{receiver}: the radio clock shows {shown} more than the telemetry clock; not corrected "
+                "(rss.lag: apply would)."
+            )
+        elif clock.verdict in ("ambiguous", "failed"):
+            other.append(
+                f"{receiver}: the check of the radio clock against the telemetry clock is {clock.verdict} "
+                f"({clock.reason})."
+            )
+    return (*asked, *other)
+
+
 def rss_warnings(result: RssResult) -> tuple[str, ...]:
     """What the reader must know of one tower and channel before believing its numbers."""
-    out, clock = [], result.further.clock
-    if clock is not None and clock.verdict == "ok" and clock.applied == "estimated, not applied":
-        low, high = clock.ci95_s
-        if low > 0 or high < 0:
-            out.append(
-                f"{result.name}: the radio clock shows {clock.radio_minus_telemetry_s:+.2f} s "
-                f"({low:+.2f} .. {high:+.2f}) too much; not applied (rss.lag: apply would)."
-            )
+    out = []
     if result.score.n == 0:
         out.append(f"{result.name}: no sample could be compared; its numbers are missing, not zero.")
     elif result.score.at_edge:
@@ -183,13 +230,25 @@ def pair_panel(result: PairResult) -> record.ChannelPair:
 
 def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     """Numbers for metrics.json alone: tables of residuals, pairs of channels."""
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
         merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
     for pair in result.pairs:
         merge(found, {"pairs": {pair.tower: {f"{pair.first} - {pair.second}": pair.score.as_dict()}}})
     return found
+
+
+def _clock_entry(clock: ClockResult) -> dict[str, Any]:
+    """``clock.<receiver>`` of metrics.json: numbers, verdict, whether applied, and the checks it rests on."""
+    return {
+        **json_safe(clock.checks),
+        "radio_minus_telemetry_s": clock.radio_minus_telemetry_s,
+        "ci95_s": list(clock.ci95_s),
+        "verdict": clock.verdict,
+        "reason": clock.reason,
+        "applied": clock.applied in ("estimated and applied", "given in flight.yaml"),
+    }
 
 
 # --- rank ----------------------------------------------------------------------------------------------------------

@@ -17,7 +17,7 @@ from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .canvas import Picture
 from .export import write_file
-from .html import CONTENT_POLICY, by_section, environment
+from .html import by_section, environment, policy
 from .names import k_key
 
 FEW_PAIRS = 0.25
@@ -254,7 +254,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         rss_flights=rss_flights(data),
         pretty=canvas.pretty,
         files=files,
-        content_policy=CONTENT_POLICY,
+        content_policy=policy(),
     )
     return text
 

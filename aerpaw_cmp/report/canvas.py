@@ -8,7 +8,7 @@ are rasterised and long lines thinned (extremes kept), so that an SVG stays smal
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.stages import Progress, silent
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
@@ -50,7 +51,7 @@ WIDE = (9.2, 4.2)
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Plate:
-    """A figure that can be drawn, with the words that go with it."""
+    """A figure that can be drawn, with the words that go with it; ``page``: the page itself shows it."""
 
     name: str
     section: str
@@ -58,24 +59,34 @@ class Plate:
     caption: str
     alt: str
     draw: Callable[[], Figure]
+    page: bool = False
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """A drawn plate."""
+    """A drawn plate: its words, and the picture by format ("png", "svg", "pdf")."""
 
     name: str
     section: str
     title: str
     caption: str
     alt: str
-    svg: bytes
-    png: bytes
+    formats: Mapping[str, bytes]
+
+
+STYLES = ("screen", "paper")
+FORMATS = ("png", "svg", "pdf")
+
+IEEE_WIDTH_IN = 7.16
+"""Width of two columns of an IEEE page."""
 
 
 @contextmanager
-def style() -> Iterator[None]:
-    """The look of every figure, without touching the user's settings."""
+def style(kind: str = "screen") -> Iterator[None]:
+    """The look of every figure, without touching the user's settings.
+
+    ``paper``: Times-like letters of the size of an IEEE page once a figure is scaled to its width, fonts embedded.
+    """
     import matplotlib
 
     settings = {
@@ -105,6 +116,15 @@ def style() -> Iterator[None]:
         "figure.autolayout": False,  # the layout is set here, and is switched off again when it is done
         "figure.constrained_layout.use": False,
     }
+    if kind == "paper":
+        settings |= {
+            "font.family": "serif",
+            "font.serif": ["Liberation Serif", "Times New Roman", "Nimbus Roman", "DejaVu Serif"],
+            "font.size": 10.3,  # 8 pt once scaled to the width of the page
+            "axes.titleweight": "normal",
+            "pdf.fonttype": 42,
+            "savefig.dpi": 300.0,
+        }
     with matplotlib.rc_context(settings):
         yield
 
@@ -130,29 +150,70 @@ def save(fig: Figure) -> tuple[bytes, bytes]:
     return svg.getvalue(), png.getvalue()
 
 
-def render(plate: Plate) -> Picture:
+def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
+    """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.backends.backend_pdf import FigureCanvasPdf
+    from matplotlib.backends.backend_svg import FigureCanvasSVG
+
+    if kind == "paper":
+        width, height = fig.get_size_inches()
+        fig.set_size_inches(IEEE_WIDTH_IN, height * IEEE_WIDTH_IN / width)
+    fig.set_dpi(300.0 if kind == "paper" else RASTER_DPI)
+    found = {name: io.BytesIO() for name in formats}
+    agg = FigureCanvasAgg(fig)
+    if "png" in found:
+        agg.print_png(found["png"], pil_kwargs={"compress_level": 2})
+    elif found:
+        agg.draw()  # the layout is made here
+    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
+    if "svg" in found:
+        FigureCanvasSVG(fig).print_svg(found["svg"], metadata={"Date": None})
+    if "pdf" in found:
+        FigureCanvasPdf(fig).print_pdf(found["pdf"], metadata={"CreationDate": None})
+    return {name: file.getvalue() for name, file in found.items()}
+
+
+def smaller(png: bytes, colours: int = 128) -> bytes:
+    """A picture with so many colours at most: a third of the bytes, and the same to the eye."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    with Image.open(io.BytesIO(png)) as picture:
+        picture.convert("RGB").quantize(colours).save(out, "PNG", optimize=True)
+    return min(out.getvalue(), png, key=len)
+
+
+def render(plate: Plate, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
     """Draw a plate and forget the figure."""
-    with style():
-        svg, png = save(plate.draw())
+    with style(kind):
+        files = save_as(plate.draw(), formats, kind)
     return Picture(
         name=plate.name,
         section=plate.section,
         title=plate.title,
         caption=plate.caption,
         alt=plate.alt,
-        svg=svg,
-        png=png,
+        formats=files,
     )
 
 
-def write_plates(plates: Sequence[Plate], folder: Path) -> tuple[list[Picture], list[Path]]:
-    """Draw plates one after the other and write each as SVG and PNG; gives the pictures and the files."""
+def write_plates(
+    plates: Sequence[Plate],
+    folder: Path,
+    formats: Sequence[str] = ("svg", "png"),
+    kind: str = "screen",
+    progress: Progress = silent,
+) -> tuple[list[Picture], list[Path]]:
+    """Draw plates one after the other and write each in its formats; gives the pictures and the files."""
     drawn, written = [], []
-    for plate in plates:
-        picture = render(plate)
+    for number, plate in enumerate(plates):
+        progress("figures", number / len(plates))
+        picture = render(plate, formats, kind)
         drawn.append(picture)
-        written.append(write_file(folder / f"{picture.name}.svg", picture.svg))
-        written.append(write_file(folder / f"{picture.name}.png", picture.png))
+        written += [write_file(folder / f"{picture.name}.{name}", content) for name, content in picture.formats.items()]
+    if plates:
+        progress("figures", 1.0)
     return drawn, written
 
 

@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.result import AuditResult, EngineResult
+from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
 
@@ -89,12 +90,15 @@ class Baseline:
         Received power at the samples of the panel.
     offset_db, rmse_db : float
         Best offset of the measurement against this model, and what it leaves.
+    paired : PairedDifference, optional
+        The ray tracing against this model on the same samples.
     """
 
     name: str
     level_dbm: FloatArray
     offset_db: float
     rmse_db: float
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -155,6 +159,33 @@ class ErrorSpan:
     up_m: float
     mean_error_db: float
     cause: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Source:
+    """Where samples stand in the logs: names of the files, and per sample its file's number and its line, (n,)."""
+
+    files: tuple[str, ...]
+    file: IntArray
+    line: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PosePaths:
+    """Propagation paths of some poses of a tower, to be drawn.
+
+    Parameters
+    ----------
+    tower : str
+    time : (poses,) datetime64[ns]
+        Samples of the tower's first channel.
+    lines : tuple of tuples
+        Per pose its paths: points (depth + 2, 3) [m] from tower to UAV, and the number of reflections.
+    """
+
+    tower: str
+    time: AnyArray
+    lines: tuple[tuple[tuple[FloatArray, int], ...], ...]
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -234,6 +265,7 @@ class RssPanel:
     extra: Mapping[str, Any] = field(default_factory=dict)
     per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
     """Further columns (n,) of rss.csv, by name with unit."""
+    source: Source | None = None
 
     @property
     def name(self) -> str:
@@ -436,3 +468,4 @@ class ReportData:
     settings: Mapping[str, Any] = field(default_factory=dict)
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
+    paths: tuple[PosePaths, ...] = ()

@@ -40,10 +40,12 @@ def metrics(data: ReportData) -> dict[str, Any]:
                 "accepted": f.accepted,
                 "rejected": f.rejected,
                 "blank": f.blank,
+                "role": f.role,
                 "warnings": list(f.warnings),
             }
             for f in data.inputs
         ],
+        "settings": json_safe(data.settings),
         "rss": rss,
         "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),

@@ -15,6 +15,7 @@ from .rank_figures import agreement_curve, confusion, rank_histograms, rank_maps
 from .rss_figures import (
     altitude,
     channel_difference,
+    overview,
     residual_against_geometry,
     rss_diagnostics,
     rss_over_time,
@@ -33,6 +34,8 @@ if TYPE_CHECKING:
 def plates(data: ReportData) -> list[Plate]:
     """Every figure that the data allow, in reading order."""
     result: list[Plate] = []
+    if data.rss or data.rank:
+        result += _overview_plate(data)
     if data.track is not None and len(data.track.time):
         result += _track_plates(data, data.track)
     for panel in data.rss:
@@ -47,6 +50,7 @@ def plates(data: ReportData) -> list[Plate]:
         result.append(
             Plate(
                 name="speed_against_error",
+                page=True,
                 section="speed",
                 title="Speed against error",
                 caption="Down and left is better. The dashed line joins the settings that no other setting beats in "
@@ -69,6 +73,25 @@ def _with_own_names(found: list[Plate]) -> list[Plate]:
     return result
 
 
+def _overview_plate(data: ReportData) -> list[Plate]:
+    """The picture of the first screen where no script runs: the first channel, or the first rank."""
+    panels = [panel for panel in data.rss if len(panel.time) and panel.n]
+    if not panels:
+        return []
+    return [
+        Plate(
+            name="overview",
+            page=True,
+            section="overview",
+            title="Where and when the prediction fails",
+            caption=f"{panels[0].name}. Left: the flight coloured by the residual, measured minus ray tracing "
+            "after the offset. Right: level over time.",
+            alt=f"Map of the residual of {panels[0].name} beside its level over time.",
+            draw=lambda: overview(data, panels[0]),
+        )
+    ]
+
+
 def _track_plates(data: ReportData, track: Track) -> list[Plate]:
     there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
     invented = (
@@ -79,6 +102,7 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
     return [
         Plate(
             name="trajectory",
+            page=True,
             section="flight",
             title="Where the UAV flew",
             caption=f"Left: the whole site with its towers. Right: the flight, coloured by height.{invented}",
@@ -87,6 +111,7 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
         ),
         Plate(
             name="altitude",
+            page=True,
             section="flight",
             title="Height over time",
             caption="Height of the UAV above the ground at the site origin."
@@ -103,6 +128,7 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
     result = [
         Plate(
             name=f"rss_{stem}",
+            page=True,
             section=section,
             title=f"{panel.name}: RSS over time",
             caption="Top: the measurement after its offset, the ray tracing, and the baselines, each baseline moved to "
@@ -172,7 +198,13 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[Plate]:
 
     def plate(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> Plate:
         return Plate(
-            name=f"{name}_{stem}", section=section, title=f"{panel.tower}: {title}", caption=caption, alt=alt, draw=draw
+            name=f"{name}_{stem}",
+            section=section,
+            title=f"{panel.tower}: {title}",
+            caption=caption,
+            alt=alt,
+            draw=draw,
+            page=name in ("rank_histogram", "rank_time"),
         )
 
     result = [

@@ -1,30 +1,36 @@
-"""report.html: one file that needs nothing else, no network, no script.
+"""report.html: one file that needs nothing else and no network; without a script its figures still stand.
 
-Figures stand inside the page as SVG data. Every text that comes from a log or a configuration is escaped by the
+Figures stand inside the page as data. Every text that comes from a log or a configuration is escaped by the
 template engine.
 """
 
 from __future__ import annotations
 
 import base64
+import hashlib
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from importlib import resources
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 
 from ..logs.records import has_wall_clock
 from . import words
-from .canvas import Picture, start_of
+from .canvas import Picture, smaller, start_of
 from .data import RANKS, ReportData
+from .explorer import as_json, payload
+from .first_screen import headlines, verdict
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 REJECTED_SHOWN = 20
 """Rejected lines shown per file; the flight file holds all."""
 
-CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'none'"
-"""Lets a browser refuse whatever would be loaded from elsewhere, should a hostile log ever get past the escaping."""
+CONTENT_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src {script}"
+"""``script``: 'none', or the digest of the page's one script. Lets a browser refuse whatever would be loaded or run
+besides, should a hostile log ever get past the escaping."""
 
 
 def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
@@ -102,6 +108,21 @@ def short(value: Any) -> str:
     return f"{value:.6g}" if isinstance(value, float) else str(value)
 
 
+def policy(script: str = "") -> str:
+    """The content policy of a page with one script, or none."""
+    if not script:
+        return CONTENT_POLICY.format(script="'none'")
+    digest = base64.b64encode(hashlib.sha256(script.encode("utf-8")).digest()).decode("ascii")
+    return CONTENT_POLICY.format(script=f"'sha256-{digest}'")
+
+
+def picture_uri(picture: Picture) -> str:
+    """A picture as an address that holds it: PNG with few colours, else SVG."""
+    if "png" in picture.formats:
+        return "data:image/png;base64," + base64.b64encode(smaller(picture.formats["png"])).decode("ascii")
+    return data_uri(picture.formats["svg"])
+
+
 def data_uri(svg: bytes) -> str:
     """An SVG as an address that holds the picture itself.
 
@@ -124,9 +145,15 @@ def environment() -> Any:
     )
     environment.filters.update(
         num=number, interval=interval, percent=percent, duration=duration, data_uri=data_uri, k=k_key,
-        flat=lambda s: list(flat(s)), clock=clock,
+        flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri,
     )  # fmt: skip
     return environment
+
+
+def script(*names: str) -> str:
+    """Scripts of the page, one after the other."""
+    folder = resources.files("aerpaw_cmp.report") / "templates"
+    return "\n".join((folder / name).read_text(encoding="utf-8") for name in names)
 
 
 def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
@@ -149,9 +176,17 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         Names of the files beside the page.
     """
     template = environment().get_template("report.html.jinja")
+    linked = bool(data.rss or data.rank)
+    code = script("uplot.min.js", "explorer.js") if linked else ""
+    sections = by_section(pictures)
     text: str = template.render(
         data=data,
-        sections=by_section(pictures),
+        sections=sections,
+        overview=next(iter(sections.get("overview", [])), None),
+        explorer=Markup(as_json(payload(data))) if linked else "",
+        script=Markup(code),
+        first_words=verdict(data),
+        numbers=headlines(data),
         start=start_of(data),
         clock_unit="UTC" if has_wall_clock(start_of(data)) else "s",
         files=files,
@@ -166,6 +201,6 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,
         pretty=words.pretty,
-        content_policy=CONTENT_POLICY,
+        content_policy=policy(code),
     )
     return text

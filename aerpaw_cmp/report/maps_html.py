@@ -12,7 +12,7 @@ from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
 from .export import merge, write_file
-from .html import CONTENT_POLICY, by_section, environment
+from .html import by_section, environment, policy
 from .maps_data import MapError, MapsData
 from .names import k_key
 
@@ -84,7 +84,7 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
         errors=error_tables(data.errors),
         names={picture.name for picture in pictures},
         files=files,
-        content_policy=CONTENT_POLICY,
+        content_policy=policy(),
     )  # fmt: skip
     return text
 

@@ -40,6 +40,35 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
+def overview(data: ReportData, panel: RssPanel) -> Figure:
+    """The flight coloured by residual beside level and residual over time, of one channel."""
+    fig = figure((9.2, 4.0))
+    plan, right = fig.subplots(1, 2, width_ratios=(1.0, 1.5))
+    residual = panel.residual_db
+    if panel.east_m is not None and panel.north_m is not None:
+        draw_site(plan, data.site, towers=[panel.tower])
+        points = plan.scatter(
+            panel.east_m, panel.north_m, c=residual, cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
+            rasterized=True, zorder=5,
+        )  # fmt: skip
+        tower = data.site.towers.get(panel.tower)
+        ends = ([], []) if tower is None else ([tower.east_m], [tower.north_m])
+        frame_around(plan, np.concatenate([panel.east_m, ends[0]]), np.concatenate([panel.north_m, ends[1]]))
+        colour_bar(fig, points, plan, "Residual [dB]", "both")
+    start = start_of(data)
+    seconds = seconds_since(panel.time, start)
+    right.plot(
+        seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        label="measured, calibrated",
+    )  # fmt: skip
+    right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
+    right.set_xlabel(time_label(start))
+    right.set_ylabel("RSS [dBm]")
+    robust_limits(right, [panel.calibrated_db, panel.simulated_dbm])
+    fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
+    return fig
+
+
 def trajectory(data: ReportData, track: Track) -> Figure:
     """The flight on the plan of the whole site, and closer, coloured by height."""
     fig = figure((9.2, 5.4))

@@ -8,13 +8,10 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import shapely
-from shapely.geometry import Polygon
 
 from ..common.units import FloatArray
 from ..site.site import Building, Site, Trees
@@ -23,6 +20,7 @@ from .data import Track
 from .export import write_file
 from .html import environment
 from .names import safe_name
+from .shapes import at_height, listed, outline, walls
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -59,9 +57,9 @@ def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ())
         for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
             points.append(np.array([*corner, building.base_m + building.height_m]))
     for forest in site.forests:
-        points += list(_flat(np.asarray(forest.area.exterior.coords)[:, :2], 0.0))
+        points += list(at_height(np.asarray(forest.area.exterior.coords)[:, :2], 0.0))
     for fence in site.geofences:
-        points += list(_flat(np.asarray(fence.area.exterior.coords)[:, :2], 0.0))
+        points += list(at_height(np.asarray(fence.area.exterior.coords)[:, :2], 0.0))
     if len(trees := site.trees):
         points += list(np.column_stack([trees.east_m, trees.north_m, trees.ground_m + trees.height_m]))
     if track is not None and len(track.time):
@@ -178,7 +176,7 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
 def _solid_ground(ax: Any, site: Site, invented: str) -> None:
     from mpl_toolkits.mplot3d.art3d import Poly3DCollection
 
-    flat = [_flat(outline(forest.area), 0.0) for forest in site.forests]
+    flat = [at_height(outline(forest.area), 0.0) for forest in site.forests]
     if flat:
         areas = Poly3DCollection(
             flat, facecolor=canvas.FOREST, edgecolor="#7FA873", alpha=0.5, label=f"forest{invented}", zorder=1
@@ -188,33 +186,9 @@ def _solid_ground(ax: Any, site: Site, invented: str) -> None:
     for number, fence in enumerate(site.geofences):
         line = np.asarray(fence.area.exterior.coords)[:, :2]
         ax.plot(
-            *_flat(line, 0.0).T, color="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=2,
+            *at_height(line, 0.0).T, color="#333333", linestyle=(0, (4, 3)), linewidth=0.9, zorder=2,
             label="geofence" if number == 0 else None,
         )  # fmt: skip
-
-
-def outline(area: Polygon) -> FloatArray:
-    """Corners (n, 2) of an area as one line that also runs round its holes, so that filling it leaves them empty."""
-    area = shapely.orient_polygons(area)
-    outer = np.asarray(area.exterior.coords)[:, :2]
-    holes = [part for ring in area.interiors for part in (np.asarray(ring.coords)[:, :2], outer[:1])]
-    return np.concatenate([outer, *holes])
-
-
-def _flat(line_m: FloatArray, up_m: float) -> FloatArray:
-    return np.column_stack([line_m, np.full(len(line_m), up_m)])
-
-
-def walls(building: Building) -> list[FloatArray]:
-    """Wall rectangles and roof of a prism as polygons (n, 3)."""
-    base, top = building.base_m, building.base_m + building.height_m
-    result = []
-    for ring in (building.footprint.exterior, *building.footprint.interiors):
-        corners = np.asarray(ring.coords)[:, :2]
-        for (e0, n0), (e1, n1) in pairwise(corners):
-            result.append(np.array([[e0, n0, base], [e1, n1, base], [e1, n1, top], [e0, n0, top]]))
-    result.append(_flat(outline(building.footprint), top))
-    return result
 
 
 def _solid_buildings(ax: Any, buildings: Sequence[Building], invented: str) -> None:
@@ -250,10 +224,6 @@ def _solid_trees(ax: Any, trees: Trees, invented: str) -> None:
 
 def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()) -> dict[str, Any]:
     """The site as plain lists for the page, rounded to 0.1 m."""
-
-    def listed(points: Any) -> Any:
-        return np.round(np.asarray(points, dtype=np.float64), 1).tolist()
-
     trees, pick = site.trees, canvas.spread_out(len(site.trees), TREES_IN_PAGE)
     flight: list[Any] = []
     if track is not None and len(track.time):

@@ -85,14 +85,11 @@ def rss_verdict(panel: RssPanel) -> str:
     if not scored:
         return text + "."
     best = min(scored, key=lambda b: b.rmse_db)
-    gain = best.rmse_db - panel.rmse_db
-    if abs(gain) < 0.05:
-        return f"{text}; {pretty(best.name)} does as well ({best.rmse_db:.1f} dB)."
-    judged = "better" if gain > 0 else "WORSE"
-    doubt = ""
-    if panel.rmse_ci95_db is not None and panel.rmse_ci95_db[0] <= best.rmse_db <= panel.rmse_ci95_db[1]:
-        doubt = ", a difference within the interval"
-    return f"{text}, {abs(gain):.1f} dB {judged} than {pretty(best.name)} ({best.rmse_db:.1f} dB){doubt}."
+    if best.paired is None:
+        return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
+    words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
+    words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
+    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
 
 
 def rank_verdict(panel: RankPanel) -> str:
@@ -102,11 +99,25 @@ def rank_verdict(panel: RankPanel) -> str:
         return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
     best = min(scored, key=lambda at: at.total_variation)
     agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
-    kappa = f" (kappa {best.kappa:.2f}; 0 is chance)" if math.isfinite(best.kappa) else ""
+    kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_beside_kappa(panel)})" if math.isfinite(best.kappa) else ""
     return (
         f"{panel.tower} rank: of the K shown, K = {best.k:.10g} comes nearest to the reported distribution "
         f"(total variation {best.total_variation:.2f}){agree}{kappa}."
     )
+
+
+def _beside_kappa(panel: RankPanel) -> str:
+    """What agreement needs no model, and what the modem's agreement with itself allows."""
+    said = ""
+    commonest = panel.extra.get("commonest") or {}
+    if commonest.get("rank"):
+        said += f"; always saying {commonest['rank']} would agree in {100 * commonest['agreement']:.0f} %"
+    repeat = (panel.extra.get("repeat") or {}).get("same_heading") or (panel.extra.get("repeat") or {}).get(
+        "any_heading"
+    )
+    if repeat and repeat["n"] and repeat["kappa"] is not None and math.isfinite(repeat["kappa"]):
+        said += f"; the modem repeats itself at the same places to kappa {repeat['kappa']:.2f}"
+    return said
 
 
 def warnings(data: ReportData) -> list[str]:
@@ -149,11 +160,4 @@ def _rss_warnings(panel: RssPanel) -> list[str]:
     if panel.n_out_of_coverage and len(panel.time) and panel.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * panel.n_out_of_coverage / len(panel.time)
         found.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
-    if panel.lag_verdict in ("ambiguous", "failed"):
-        found.append(f"{panel.name}: the check of the radio clock against the telemetry clock is {panel.lag_verdict}.")
-    elif panel.lag_verdict == "ok" and abs(panel.lag_s) > 0.5:
-        applied = (panel.extra.get("clock") or {}).get("applied", "estimated")
-        found.append(
-            f"{panel.name}: the radio clock shows {signed(panel.lag_s)} s more than the telemetry clock ({applied})."
-        )
     return found

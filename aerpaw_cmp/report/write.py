@@ -2,15 +2,40 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
+from dataclasses import dataclass
 from pathlib import Path
 
+from ..common.stages import Stages
 from . import figures, html
+from .canvas import FORMATS, STYLES, write_plates
 from .data import ReportData
 from .export import metrics, rank_frame, rss_frame, write_file
 
+PAGE = "page"
+FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
+"""What is drawn: nothing, what the page shows, or every figure in one format or in all."""
 
-def write_report(data: ReportData, folder: str | Path) -> list[Path]:
+__all__ = ["FIGURES", "PAGE", "STYLES", "WrittenReport", "write_report"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WrittenReport:
+    """The files, ``report.html`` first, and the record with the seconds that its writing took."""
+
+    files: tuple[Path, ...]
+    data: ReportData
+
+
+def write_report(
+    data: ReportData,
+    folder: str | Path,
+    *,
+    drawn: str = PAGE,
+    style: str = "screen",
+    stages: Stages | None = None,
+) -> WrittenReport:
     """Write the files of a report.
 
     Parameters
@@ -18,27 +43,37 @@ def write_report(data: ReportData, folder: str | Path) -> list[Path]:
     data : ReportData
     folder : path
         Empty; that of :meth:`aerpaw_cmp.common.outputs.OutputFolder.filling`, say.
+    drawn : str
+        One of :data:`FIGURES`.
+    style : {"screen", "paper"}
+    stages : Stages, optional
+        Times the stage "report"; all its seconds are then those of the record.
 
     Returns
     -------
-    list of Path
-        ``report.html`` first, then ``metrics.json``, the CSVs (header only when they have no rows), the figures.
+    WrittenReport
+        Files: ``report.html`` first, the CSVs (header only when they have no rows), the figures, ``metrics.json``.
 
     Raises
     ------
     OSError
         If the folder cannot be written.
     """
-    from . import canvas
-
-    folder = Path(folder)
+    folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
+    written = []
+    with stages("report"):
+        for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
+            # written even without rows: a reader finds the same files in every report
+            written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
+        plates = [] if drawn == "none" else [p for p in figures.plates(data) if p.page or drawn != PAGE]
+        formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
+        pictures, paths = write_plates(plates, folder / "figures", formats, style, stages.progress)
+    written += paths
+    data = dataclasses.replace(data, stages_s=dict(stages.seconds))
+    files = ["metrics.json", *(str(path.relative_to(folder)) for path in written if path.parent == folder)]
+    with stages("report"):
+        shown = [one for one in pictures if {"png", "svg"} & set(one.formats)]
+        page = write_file(folder / "report.html", html.page(data, shown, files))
+    data = dataclasses.replace(data, stages_s=dict(stages.seconds))
     numbers = json.dumps(metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    written = [write_file(folder / "metrics.json", numbers)]
-    for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
-        # written even without rows: a reader finds the same files in every report
-        written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
-    drawn, pictures = canvas.write_plates(figures.plates(data), folder / "figures")
-    written += pictures
-    files = [str(path.relative_to(folder)) for path in written if path.parent == folder]
-    page = write_file(folder / "report.html", html.page(data, drawn, files))
-    return [page, *written]
+    return WrittenReport(files=(page, *written, write_file(folder / "metrics.json", numbers)), data=data)

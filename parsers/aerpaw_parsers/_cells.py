@@ -60,9 +60,9 @@ def streams(rows: _rows.Rows, readings: Iterable[Reading], *, source: str) -> li
     made: list[Stream] = []
     names = {(one.rat, one.pci if np.isfinite(one.pci) else -1.0) for one in found}
     for rat, pci in sorted(names):
-        mine = [
-            i for i, one in enumerate(found) if one.rat == rat and (one.pci == pci or (pci < 0 and one.pci != one.pci))
-        ]
+        none = pci < 0
+        same = [one.rat == rat and (one.pci == pci or (none and not np.isfinite(one.pci))) for one in found]
+        mine = np.flatnonzero(same).tolist()
         stream = _stream(rows, [found[i] for i in mine], served[mine], rat, pci, source)
         if stream is not None:
             made.append(stream)
@@ -97,6 +97,8 @@ def _serving(found: list[Reading]) -> FloatArray:
 def _stream(
     rows: _rows.Rows, mine: list[Reading], served: FloatArray, rat: str, pci: float, source: str
 ) -> Stream | None:
+    if not mine:
+        return None  # a cell whose number is none
     pick: IntArray = np.array([one.row for one in mine], dtype=np.int64)
     time = rows.time[pick]
     # of two readings of one instant the serving one is kept

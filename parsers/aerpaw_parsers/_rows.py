@@ -86,8 +86,11 @@ class Rows:
     def si(self, name: str) -> FloatArray:
         """A column of numbers with SI suffix: ``-4.3k`` is -4300."""
         cells = [cell.strip() for cell in self.columns[name].tolist()]
-        scale = np.array([_SI.get(cell[-1:], 1.0) for cell in cells])
-        plain = np.array([cell[:-1] if cell[-1:] in _SI else cell for cell in cells] or [b""], dtype=np.bytes_)
+        scaled = [cell[-1:] in _SI and cell[-2:-1].isdigit() for cell in cells]  # 'nan' is no nano
+        scale = np.array([_SI[cell[-1:]] if mark else 1.0 for cell, mark in zip(cells, scaled, strict=True)])
+        plain = np.array(
+            [cell[:-1] if mark else cell for cell, mark in zip(cells, scaled, strict=True)] or [b""], dtype=np.bytes_
+        )
         for word in (b"n/a", b"-"):
             plain = np.where(plain == word, b"", plain)
         return np.asarray(_lines.numbers(plain)[: len(cells)] * scale, dtype=np.float64)

@@ -83,8 +83,8 @@ def test_svg_stays_small_however_long_the_flight(report_data):
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
     plate = next(p for p in figures.plates(small_report) if p.name == "altitude")
     one, two = canvas.render(plate), canvas.render(plate)
-    assert one.svg == two.svg
-    fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.svg)
+    assert one.formats["svg"] == two.formats["svg"]
+    fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.formats["svg"])
     assert all(f.startswith((b"#", b"data:")) for f in fetched)
 
 

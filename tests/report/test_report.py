@@ -5,18 +5,44 @@ import json
 import subprocess
 import sys
 
+import pytest
+
+from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.report import names, write
+from aerpaw_cmp.report.figures import plates
 
 
 def test_whole_report(small_report, tmp_path):
     figures = tmp_path / "figures"
-    files = write.write_report(small_report, tmp_path)
+    files = write.write_report(small_report, tmp_path).files
     assert files[0] == tmp_path / "report.html"
     assert all(f.stat().st_size > 0 for f in files)
     assert json.loads((tmp_path / "metrics.json").read_text())["rss"]["LW4"]["USRP1"]["n"] == small_report.rss[0].n
     assert {p.name for p in tmp_path.iterdir()} == {"report.html", "metrics.json", "rss.csv", "rank.csv", "figures"}
     assert {p.name for p in figures.iterdir()} <= {f.name for f in files}
-    assert max(f.stat().st_size for f in files if f.suffix == ".svg") < 500_000
+    drawn = {p.name for p in plates(small_report) if p.page}
+    assert {f.stem for f in figures.iterdir()} == drawn
+    assert (tmp_path / "report.html").stat().st_size < 4e6
+
+
+@pytest.mark.parametrize(("drawn", "suffixes"), [("none", set()), ("svg", {".svg"}), ("all", {".svg", ".png", ".pdf"})])
+def test_figures_are_drawn_as_asked(small_report, tmp_path, drawn, suffixes):
+    data = dataclasses.replace(small_report, rss=(), pairs=(), speed=(), rank=())
+    files = write.write_report(data, tmp_path, drawn=drawn, style="paper").files
+    figures = [f for f in files if f.parent.name == "figures"]
+    assert {f.suffix for f in figures} == suffixes
+    assert len(figures) == len(suffixes) * len(plates(data))
+    assert max((f.stat().st_size for f in figures if f.suffix == ".svg"), default=0) < 900_000
+
+
+def test_the_seconds_of_the_writing_are_told(small_report, tmp_path):
+    stages = Stages()
+    with stages("replay"):
+        pass
+    written = write.write_report(small_report, tmp_path, drawn="none", stages=stages)
+    numbers = json.loads((tmp_path / "metrics.json").read_text())["stages"]
+    assert numbers["report_s"] == written.data.stages_s["report"] > 0
+    assert "replay_s" in numbers
 
 
 def test_without_rss_the_tables_have_their_columns(small_report, tmp_path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.report import canvas, site_view
+from aerpaw_cmp.report import canvas, shapes, site_view
 from aerpaw_cmp.report.site_view import PathLine
 from aerpaw_cmp.site.site import Building, Forest, Geofence, Site, Trees
 
@@ -54,7 +54,7 @@ def test_a_hostile_name_stays_a_name(report_data):
 def test_walls_enclose_the_prism():
     """Areas of walls with holes: perimeter times height, and one roof."""
     shape = Polygon([(0, 0), (10, 0), (10, 6), (0, 6)], [[(2, 2), (2, 4), (4, 4), (4, 2)]])
-    faces = site_view.walls(Building("b", shape, 5.0, base_m=2.0))
+    faces = shapes.walls(Building("b", shape, 5.0, base_m=2.0))
     area = sum(np.linalg.norm(np.cross(f[1] - f[0], f[3] - f[0])) for f in faces[:-1])
     assert area == pytest.approx((32 + 8) * 5.0)
     assert {z for f in faces for z in f[:, 2]} == {2.0, 7.0}
@@ -107,7 +107,7 @@ def test_ten_thousand_trees_keep_the_files_small(report_data):
 def test_holes_stay_empty_and_fences_are_drawn(report_data):
     """Filling the line of an area with holes covers exactly the area; the page and the pictures show geofences."""
     ring = Polygon([(0, 0), (30, 0), (30, 30), (0, 30)], [[(10, 10), (10, 20), (20, 20), (20, 10)]])
-    line = site_view.outline(ring)
+    line = shapes.outline(ring)
     east, north = line.T
     assert abs(np.sum(east * np.roll(north, -1) - np.roll(east, -1) * north)) / 2 == pytest.approx(ring.area)
     site = dataclasses.replace(

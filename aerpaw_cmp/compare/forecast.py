@@ -1,0 +1,287 @@
+"""Forecasts of rank: a probability for each rank, and what they are worth against the reports of a modem.
+
+A probability forecast is judged by proper scores (nobody gains by saying what he does not believe): the log score and
+the Brier score, each beside that of a constant forecast, the histogram of the training flights. Kappa and agreement
+judge the one rank that a decision makes of the probabilities, beside what always saying the commonest rank agrees.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.units import FloatArray, IntArray
+from .rank import MAX_RANK, cohen_kappa, total_variation
+from .statistics import NO_INTERVAL, REPLICATES, SEED, Interval, bootstrap_means, interval, memory, plain
+
+LEAST_PROBABILITY = 1e-6
+"""What a rank counts in the log score that a forecast held impossible."""
+
+
+def log_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Logarithmic score of each sample [nat]: ``-ln p(reported rank)``; smaller is better.
+
+    Parameters
+    ----------
+    probability : (n, ranks)
+        Of rank 1 .. ranks; rows sum to one.
+    rank : (n,)
+        Reported.
+
+    Notes
+    -----
+    Good (1952), doi:10.1111/j.2517-6161.1952.tb00104.x. Probabilities below :data:`LEAST_PROBABILITY` count as that.
+
+    Examples
+    --------
+    >>> log_losses(np.array([[0.5, 0.5]]), np.array([2])).round(4).tolist()
+    [0.6931]
+    """
+    return np.asarray(-np.log(np.maximum(probability[np.arange(len(rank)), rank - 1], LEAST_PROBABILITY)))
+
+
+def brier_losses(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Brier score of each sample: ``sum_r (p_r - [r = rank])^2``, 0 to 2; smaller is better.
+
+    Notes
+    -----
+    Brier (1950), doi:10.1175/1520-0493(1950)078<0001:VOFEIT>2.0.CO;2.
+
+    Examples
+    --------
+    >>> brier_losses(np.array([[0.5, 0.5]]), np.array([2])).tolist()
+    [0.5]
+    """
+    return np.asarray(((probability - one_hot(rank, probability.shape[1])) ** 2).sum(axis=1))
+
+
+def one_hot(rank: IntArray, ranks: int = MAX_RANK) -> FloatArray:
+    """1 in the column of each rank (n, ranks)."""
+    return np.asarray(np.asarray(rank)[:, None] == np.arange(1, ranks + 1), dtype=np.float64)
+
+
+def constant_forecast(rank: ArrayLike, ranks: int = MAX_RANK) -> FloatArray:
+    """Histogram of training ranks (ranks,), each rank counted once more, so that none is impossible."""
+    values = np.asarray(rank, dtype=np.float64)
+    count = np.bincount(values[values >= 1].astype(np.int64), minlength=ranks + 1)[1:] + 1.0
+    return np.asarray(count / count.sum())
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ForecastScore:
+    """What a forecast is worth on samples that had no part in its fit.
+
+    Parameters
+    ----------
+    n : int
+        Samples with a report and a forecast.
+    kappa, agreement : float
+        Of the decided rank.
+    majority_agreement : float
+        Agreement of always saying the commonest rank of these samples (known only afterwards).
+    log_score, constant_log_score : float
+        Mean of :func:`log_losses` [nat], of the forecast and of the constant one.
+    log_score_gain : float
+        Share by which the forecast is below the constant one.
+    log_score_difference_ci95 : (low, high)
+        Of forecast minus constant [nat], on the same samples.
+    brier_score, constant_brier_score : float
+    total_variation_expected : float
+        Between the mean probabilities and the measured histogram; ``constant_total_variation`` that of the constant.
+    expected_histogram, measured_histogram : (ranks,)
+    expected_histogram_ci95 : tuple of (low, high)
+        Of the expected histogram, by blocks.
+    kappa_ci95, log_score_ci95, total_variation_ci95 : (low, high)
+    """
+
+    n: int
+    kappa: float
+    kappa_ci95: Interval
+    agreement: float
+    majority_agreement: float
+    log_score: float
+    log_score_ci95: Interval
+    constant_log_score: float
+    log_score_gain: float
+    log_score_difference_ci95: Interval
+    brier_score: float
+    constant_brier_score: float
+    total_variation_expected: float
+    total_variation_ci95: Interval
+    constant_total_variation: float
+    expected_histogram: FloatArray
+    expected_histogram_ci95: tuple[Interval, ...]
+    measured_histogram: FloatArray
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json; NaN becomes None."""
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
+
+
+def score_forecast(
+    measured: ArrayLike,
+    probability: FloatArray,
+    decided: ArrayLike,
+    constant: FloatArray,
+    *,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> ForecastScore:
+    """Score a forecast on samples in time order.
+
+    Parameters
+    ----------
+    measured : array_like, (n,)
+        Reported rank, NaN where none.
+    probability : (n, ranks)
+        NaN where there is no forecast.
+    decided : array_like, (n,)
+        The one rank said; 0 where there is no forecast.
+    constant : (ranks,)
+        The constant forecast, from the flights of the fit (:func:`constant_forecast`).
+    replicates, seed : int
+        Block bootstrap.
+
+    Returns
+    -------
+    ForecastScore
+        All NaN where no sample has both.
+
+    Raises
+    ------
+    ValueError
+        If the three are not of one length.
+    """
+    ri, said = np.asarray(measured, dtype=np.float64).ravel(), np.asarray(decided, dtype=np.float64).ravel()
+    if not len(ri) == len(said) == len(probability):
+        raise ValueError(f"{len(ri)} measured ranks, {len(probability)} forecasts, {len(said)} decisions: not in pairs")
+    good = (ri >= 1) & (said >= 1) & np.isfinite(probability).all(axis=1)
+    rank, choice, p = ri[good].astype(np.int64), said[good].astype(np.int64), probability[good]
+    if not len(rank):
+        return _no_score(probability.shape[1])
+    ranks = p.shape[1]
+    flat = np.broadcast_to(constant, p.shape)
+    one, two = one_hot(rank, ranks), one_hot(choice, ranks)
+    log, log_constant = log_losses(p, rank), log_losses(flat, rank)
+    columns = np.column_stack([rank == choice, log, log - log_constant, one, two, p]).astype(np.float64)
+    known = max((memory(c) for c in columns[:, :3].T), key=lambda m: m.block_length)
+    drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
+    mean = columns.mean(axis=0)
+    share, expected = mean[3 : 3 + ranks], mean[3 + 2 * ranks :]
+    kappa = cohen_kappa(rank, choice)
+    spread = total_variation(share, expected)
+    return ForecastScore(
+        n=len(rank),
+        kappa=kappa,
+        kappa_ci95=interval(kappa, _kappa_of(drawn, ranks), known, bounds=(-1.0, 1.0)),
+        agreement=float(mean[0]),
+        majority_agreement=float(share.max()),
+        log_score=float(mean[1]),
+        log_score_ci95=interval(float(mean[1]), drawn[:, 1], known, bounds=(0.0, np.inf)),
+        constant_log_score=float(log_constant.mean()),
+        log_score_gain=float(1.0 - mean[1] / log_constant.mean()),
+        log_score_difference_ci95=interval(float(mean[2]), drawn[:, 2], known),
+        brier_score=float(brier_losses(p, rank).mean()),
+        constant_brier_score=float(brier_losses(flat, rank).mean()),
+        total_variation_expected=spread,
+        total_variation_ci95=interval(spread, _variation_of(drawn, ranks), known, bounds=(0.0, 1.0)),
+        constant_total_variation=total_variation(share, constant),
+        expected_histogram=expected,
+        expected_histogram_ci95=tuple(
+            interval(float(expected[r]), drawn[:, 3 + 2 * ranks + r], known, bounds=(0.0, 1.0)) for r in range(ranks)
+        ),
+        measured_histogram=share,
+    )
+
+
+def _kappa_of(drawn: FloatArray, ranks: int) -> FloatArray:
+    chance = (drawn[:, 3 : 3 + ranks] * drawn[:, 3 + ranks : 3 + 2 * ranks]).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(np.where(chance < 1.0 - 1e-12, (drawn[:, 0] - chance) / (1.0 - chance), np.nan))
+
+
+def _variation_of(drawn: FloatArray, ranks: int) -> FloatArray:
+    return np.asarray(0.5 * np.abs(drawn[:, 3 : 3 + ranks] - drawn[:, 3 + 2 * ranks :]).sum(axis=1))
+
+
+def _no_score(ranks: int) -> ForecastScore:
+    nan, nothing = float("nan"), np.full(ranks, np.nan)
+    numbers = dict.fromkeys(
+        ("kappa", "agreement", "majority_agreement", "log_score", "constant_log_score", "log_score_gain", "brier_score",
+         "constant_brier_score", "total_variation_expected", "constant_total_variation"), nan
+    )  # fmt: skip
+    intervals = dict.fromkeys(
+        ("kappa_ci95", "log_score_ci95", "log_score_difference_ci95", "total_variation_ci95"), NO_INTERVAL
+    )
+    return ForecastScore(
+        n=0,
+        expected_histogram=nothing,
+        expected_histogram_ci95=(NO_INTERVAL,) * ranks,
+        measured_histogram=nothing,
+        **numbers,  # type: ignore[arg-type]
+        **intervals,  # type: ignore[arg-type]
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RepeatCeiling:
+    """How well one flight's reports predict another's at the same places: what a perfect map could reach.
+
+    Parameters
+    ----------
+    n : int
+        Samples of the second flight with a sample of the first nearby.
+    kappa, agreement : float
+        NaN without a pair.
+    within_m : float
+        How near a sample must be [m].
+    """
+
+    n: int
+    kappa: float
+    agreement: float
+    within_m: float
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
+
+
+def repeat_ceiling(
+    first_m: FloatArray, first_rank: ArrayLike, second_m: FloatArray, second_rank: ArrayLike, *, within_m: float = 5.0
+) -> RepeatCeiling:
+    """Kappa and agreement of the nearest report of another flight.
+
+    Parameters
+    ----------
+    first_m, second_m : (n, 3), (m, 3)
+        Positions [m].
+    first_rank, second_rank : array_like, (n,), (m,)
+        Reports, NaN where none.
+    within_m : float
+        Farther reports do not count.
+
+    Examples
+    --------
+    >>> at = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])
+    >>> repeat_ceiling(at, [1, 2], at + 1.0, [1, 2]).kappa
+    1.0
+    """
+    from scipy.spatial import cKDTree
+
+    one, two = np.asarray(first_rank, dtype=np.float64), np.asarray(second_rank, dtype=np.float64)
+    known, asked = one >= 1, two >= 1
+    if not known.any() or not asked.any():
+        return RepeatCeiling(n=0, kappa=float("nan"), agreement=float("nan"), within_m=within_m)
+    far, index = cKDTree(first_m[known]).query(second_m[asked], distance_upper_bound=within_m)
+    near = np.isfinite(far)
+    predicted, reported = one[known][index[near]], two[asked][near]
+    return RepeatCeiling(
+        n=int(near.sum()),
+        kappa=cohen_kappa(reported, predicted),
+        agreement=float(np.mean(reported == predicted)) if near.any() else float("nan"),
+        within_m=within_m,
+    )

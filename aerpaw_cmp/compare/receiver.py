@@ -1,0 +1,578 @@
+"""How a receiver decides its rank, learned on flights: from singular values and level to a probability of each rank.
+
+A receiver picks the rank that promises most throughput at its noise, from a codebook and an estimate of the channel
+that no log holds. What can be learned is how often it says 1, 2, 3 or 4 where the modelled channel has certain ratios
+of singular values and a certain level: a multinomial logistic regression with a ridge penalty. Simpler rules stand
+beside it: one threshold per stream, and an ordered regression (one linear score, one cut between neighbouring ranks).
+
+Which antenna geometry the channel is modelled with is chosen by the log score on sectors of directions left out within
+the training flights (:func:`choose_features`), never on the flight that is scored.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.errors import InputError
+from ..common.units import BoolArray, FloatArray, IntArray
+from .forecast import constant_forecast, log_losses, one_hot
+from .rank import MAX_RANK, cohen_kappa, k_grid
+from .statistics import REPLICATES, SEED, bootstrap_means, interval, memory, plain
+
+FLOOR_DB = -40.0
+"""Ratios of singular values below this are as good as zero to any receiver."""
+
+PENALTIES = (1.0, 3.0, 10.0, 30.0, 100.0)
+"""Ridge penalties to choose from, on coefficients of standardised features (log likelihood of the whole flight)."""
+
+FEWEST = 50
+"""Training samples below which nothing is fitted."""
+
+_HELD = 1 << 22
+"""Numbers in one batch of regressions: bounds memory to some 100 MiB."""
+
+
+def stream_features(sigma: ArrayLike) -> FloatArray:
+    """What a receiver may decide by: ratios of singular values and level.
+
+    Parameters
+    ----------
+    sigma : array_like, (..., m)
+        Singular values, descending, absolute (not scaled per matrix).
+
+    Returns
+    -------
+    ndarray, (..., m)
+        ``20 log10 (sigma_i / sigma_1)`` [dB] for i = 2 .. m, not below :data:`FLOOR_DB`, then ``20 log10 sigma_1``
+        [dB]. NaN without a channel.
+
+    Examples
+    --------
+    >>> stream_features([1.0, 0.1, 0.0]).tolist()
+    [-20.0, -40.0, 0.0]
+    """
+    values = np.asarray(sigma, dtype=np.float64)
+    largest = values[..., :1]
+    alive = (largest > 0) & np.isfinite(largest)
+    safe = np.where(alive, largest, 1.0)
+    ratio = np.maximum(values[..., 1:] / safe, 10.0 ** (FLOOR_DB / 20.0))
+    features = 20.0 * np.log10(np.concatenate([np.where(alive, ratio, 1.0), safe], axis=-1))
+    return np.asarray(np.where(alive, features, np.nan))
+
+
+def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
+    """Sector of directions from the tower of each sample (n,), with about equally many samples in each.
+
+    Sectors left out are directions that the fit never saw; neighbouring samples in time mostly share one.
+    """
+    away = position_m[:, :2] - np.asarray(tower_m)[:2]
+    # cut where the tower has seen nothing, so that the seam splits no sector
+    azimuth = np.arctan2(away[:, 1], away[:, 0])
+    order = np.sort(azimuth)
+    gap = np.diff(np.append(order, order[0] + 2.0 * np.pi))
+    turned = (azimuth - order[(np.argmax(gap) + 1) % len(order)]) % (2.0 * np.pi)
+    return np.asarray(
+        np.searchsorted(np.quantile(turned, np.arange(1, sectors) / sectors), turned, side="right"), dtype=np.int64
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Receiver:
+    """A fitted multinomial regression of rank.
+
+    Parameters
+    ----------
+    coefficient : (ranks, 1 + features)
+        Per rank: constant, then one per standardised feature.
+    mean, scale : (features,)
+        Of the training features.
+    decision_weight : (ranks,)
+        The decided rank is that of the largest probability times weight. All ones: the most probable rank. Weights
+        for the largest kappa are fitted on out-of-sector forecasts of the training flights.
+    penalty : float
+        Ridge penalty.
+    constant : (ranks,)
+        Histogram of the training ranks: the constant forecast.
+    n : int
+        Training samples.
+    """
+
+    coefficient: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+    decision_weight: FloatArray
+    penalty: float
+    constant: FloatArray
+    n: int
+
+    def probabilities(self, features: FloatArray) -> FloatArray:
+        """Probability (n, ranks) of each rank at features (n, features); NaN where a feature is NaN."""
+        if features.shape[-1] != len(self.mean):
+            raise ValueError(f"{features.shape[-1]} features for a receiver of {len(self.mean)}")
+        return _softmax(_design((features - self.mean) / self.scale) @ self.coefficient.T)
+
+    def decide(self, probability: FloatArray) -> IntArray:
+        """One rank (n,) per row of probabilities; 0 where there is none."""
+        return decide(probability, self.decision_weight)
+
+    def as_dict(self) -> dict[str, Any]:
+        """For files; :meth:`from_dict` reads it."""
+        return dict(plain({name: getattr(self, name) for name in self.__slots__}))
+
+    @classmethod
+    def from_dict(cls, numbers: Mapping[str, Any]) -> Receiver:
+        """From :meth:`as_dict`.
+
+        Raises
+        ------
+        ValueError
+            If a part is missing or has another shape than the others.
+        """
+        names = ("coefficient", "mean", "scale", "decision_weight", "constant")
+        if missing := [name for name in (*names, "penalty", "n") if name not in numbers]:
+            raise ValueError(f"a receiver without {', '.join(missing)}")
+        arrays = {name: np.asarray(numbers[name], dtype=np.float64) for name in names}
+        ranks, width = arrays["coefficient"].shape
+        if arrays["mean"].shape != (width - 1,) or arrays["constant"].shape != (ranks,):
+            raise ValueError(f"coefficients of {ranks} ranks and {width - 1} features do not fit the other parts")
+        return cls(**arrays, penalty=float(numbers["penalty"]), n=int(numbers["n"]))
+
+
+def decide(probability: FloatArray, weight: FloatArray) -> IntArray:
+    """Rank (n,) of the largest ``probability * weight``; 0 where the probabilities are NaN."""
+    alive = np.asarray(np.isfinite(probability).all(axis=1))
+    best = np.argmax(np.where(alive[:, None], probability, 0.0) * weight, axis=1) + 1
+    return np.where(alive, best, 0).astype(np.int64)
+
+
+def fit_receiver(
+    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = PENALTIES
+) -> Receiver:
+    """Fit a receiver; penalty and decision are chosen on groups of the training samples left out.
+
+    Parameters
+    ----------
+    features : (n, features)
+        See :func:`stream_features`.
+    rank : array_like, (n,)
+        Reported rank; samples without (NaN, 0) or without features take no part.
+    groups : (n,) int
+        Each is left out once, e.g. :func:`sector_groups`.
+    penalties : sequence of float
+        To choose from.
+
+    Raises
+    ------
+    InputError
+        Fewer than :data:`FEWEST` samples, or one rank only: nothing to learn from.
+    """
+    x, y, group = _training(features, rank, groups)
+    left_out = [out_of_group(x, y, group, penalty) for penalty in penalties]
+    best = int(np.argmin([log_losses(p, y).mean() for p in left_out]))
+    return _fitted(x, y, float(penalties[best]), _kappa_weights(left_out[best], y))
+
+
+def _fitted(x: FloatArray, rank: IntArray, penalty: float, decision_weight: FloatArray | None = None) -> Receiver:
+    mean, scale = _standard(x)
+    return Receiver(
+        coefficient=_fit_multinomial((x - mean) / scale, rank, np.ones(len(rank)), penalty),
+        mean=mean,
+        scale=scale,
+        decision_weight=np.ones(MAX_RANK) if decision_weight is None else decision_weight,
+        penalty=penalty,
+        constant=constant_forecast(rank),
+        n=len(rank),
+    )
+
+
+def _training(features: FloatArray, rank: ArrayLike, groups: IntArray) -> tuple[FloatArray, IntArray, IntArray]:
+    ri = np.asarray(rank, dtype=np.float64)
+    if not len(ri) == len(features) == len(groups):
+        raise ValueError(f"{len(ri)} ranks, {len(features)} rows of features, {len(groups)} groups: not of one length")
+    good = np.asarray((ri >= 1) & np.isfinite(features).all(axis=1))
+    y = ri[good].astype(np.int64)
+    if len(y) < FEWEST or np.ptp(y) == 0:
+        what = f"{len(y)} samples with rank and channel" if len(y) < FEWEST else f"rank {y[0]} throughout"
+        raise InputError(what, expected=f"at least {FEWEST} samples of at least two ranks to fit a receiver")
+    if len(np.unique(groups[good])) < 2:
+        raise InputError("all training samples are in one sector", expected="samples in at least two sectors")
+    return features[good], y, groups[good]
+
+
+def _standard(x: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Mean and scale per feature; a constant feature keeps scale 1 and says nothing."""
+    scale = x.std(axis=-2)
+    return x.mean(axis=-2), np.asarray(np.where(scale > 1e-9, scale, 1.0))
+
+
+def _design(x: FloatArray) -> FloatArray:
+    return np.concatenate([np.ones((*x.shape[:-1], 1)), x], axis=-1)
+
+
+def _softmax(score: FloatArray) -> FloatArray:
+    e = np.exp(score - score.max(axis=-1, keepdims=True))
+    return np.asarray(e / e.sum(axis=-1, keepdims=True))
+
+
+def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
+    """Forecast (..., n, ranks) of each group by a regression on all the others.
+
+    Parameters
+    ----------
+    x : (..., n, features)
+        Leading axes are further sets of features of the same samples, fitted at once.
+    """
+    mean, scale = _standard(x)
+    z = (x - mean[..., None, :]) / scale[..., None, :]
+    result = np.empty((*z.shape[:-1], MAX_RANK))
+    for group in np.unique(groups):
+        out = groups == group
+        weights = _fit_multinomial(z, rank, (~out).astype(np.float64), penalty)
+        result[..., out, :] = _softmax(_design(z[..., out, :]) @ np.swapaxes(weights, -1, -2))
+    return result
+
+
+def _fit_multinomial(
+    x: FloatArray, rank: IntArray, weight: FloatArray, penalty: float, *, steps: int = 30
+) -> FloatArray:
+    """Coefficients (..., ranks, 1 + features) of the largest penalised log likelihood, by damped Newton steps.
+
+    Parameters
+    ----------
+    x : (..., n, features)
+        Standardised.
+    weight : (n,)
+        Of each sample, 0 or 1.
+    penalty : float
+        ``penalty / 2`` times the squares of all slopes is added to minus the log likelihood, and a thousandth of it
+        for the constants, which fixes the common shift that probabilities do not see.
+
+    Notes
+    -----
+    Hastie, Tibshirani, Friedman, The Elements of Statistical Learning, 2nd ed., section 4.4.
+    """
+    design = _design(x) * 1.0
+    lead, width = design.shape[:-2], design.shape[-1]
+    target = one_hot(rank) * weight[:, None]
+    ridge = np.full(width, penalty)
+    ridge[0] = 1e-3 * penalty
+    start = np.log((target.sum(axis=0) + 0.5) / (weight.sum() + 0.5 * MAX_RANK))
+    coefficient = np.zeros((*lead, MAX_RANK, width))
+    coefficient[..., 0] = start - start.mean()
+    transposed = np.swapaxes(design, -1, -2)
+
+    def objective(c: FloatArray) -> FloatArray:
+        score = design @ np.swapaxes(c, -1, -2)
+        top = score.max(axis=-1)
+        normal = top + np.log(np.exp(score - top[..., None]).sum(axis=-1))
+        return np.asarray(
+            (weight * normal).sum(axis=-1)
+            - (target * score).sum(axis=(-1, -2))
+            + 0.5 * (ridge * c**2).sum(axis=(-1, -2))
+        )
+
+    value = objective(coefficient)
+    for _ in range(steps):
+        p = _softmax(design @ np.swapaxes(coefficient, -1, -2))
+        gradient = np.swapaxes(p * weight[:, None] - target, -1, -2) @ design + ridge * coefficient
+        hessian = _hessian(design, transposed, p, weight, ridge)
+        flat = gradient.reshape(*lead, MAX_RANK * width, 1)
+        step = np.linalg.solve(hessian, flat)[..., 0].reshape(coefficient.shape)
+        damping = np.ones((*lead, 1, 1))
+        for _halving in range(12):
+            trial = objective(coefficient - damping * step)
+            worse = trial > value + 1e-9
+            if not np.any(worse):
+                break
+            damping = np.where(worse[..., None, None], 0.5 * damping, damping)
+        coefficient = coefficient - damping * step
+        value = objective(coefficient)
+        if np.abs(damping * step).max() < 1e-7:
+            break
+    return coefficient
+
+
+def _hessian(
+    design: FloatArray, transposed: FloatArray, p: FloatArray, weight: FloatArray, ridge: FloatArray
+) -> FloatArray:
+    width = design.shape[-1]
+    result = np.zeros((*design.shape[:-2], MAX_RANK * width, MAX_RANK * width))
+    for a in range(MAX_RANK):
+        for b in range(a, MAX_RANK):
+            curvature = weight * p[..., a] * (float(a == b) - p[..., b])
+            block = transposed @ (design * curvature[..., None])
+            if a == b:
+                block = block + np.diag(ridge)
+            result[..., a * width : (a + 1) * width, b * width : (b + 1) * width] = block
+            result[..., b * width : (b + 1) * width, a * width : (a + 1) * width] = block
+    return result
+
+
+def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
+    """Weights (ranks,) for the largest kappa: one for ranks below the commonest, one for those above.
+
+    Always the most probable rank says the commonest one too often: kappa pays for the rare ones. Two weights on a grid,
+    the nearest to none at equal kappa.
+    """
+    commonest = int(np.bincount(rank).argmax())
+    exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
+    best, found = -np.inf, np.ones(MAX_RANK)
+    ranks = np.arange(1, MAX_RANK + 1)
+    for below in exponents:
+        for above in exponents:
+            weight = np.exp(np.where(ranks < commonest, below, np.where(ranks > commonest, above, 0.0)))
+            kappa = cohen_kappa(rank, decide(probability, weight))
+            if np.isfinite(kappa) and kappa > best + 1e-9:
+                best, found = kappa, weight
+    return found
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReceiverMixture:
+    """Receivers of several geometries that the training flights cannot tell apart: the mean of their forecasts.
+
+    Parameters
+    ----------
+    members : tuple of Receiver
+        One per geometry, best first.
+    decision_weight : (ranks,)
+        As of a :class:`Receiver`, for the mean.
+    """
+
+    members: tuple[Receiver, ...]
+    decision_weight: FloatArray
+
+    def probabilities(self, features: FloatArray) -> FloatArray:
+        """Mean probability (n, ranks) at features (members, n, features)."""
+        if len(features) != len(self.members):
+            raise ValueError(f"features of {len(features)} geometries for {len(self.members)} receivers")
+        return np.asarray(
+            np.mean([one.probabilities(x) for one, x in zip(self.members, features, strict=True)], axis=0)
+        )
+
+    def decide(self, probability: FloatArray) -> IntArray:
+        """One rank (n,) per row of probabilities; 0 where there is none."""
+        return decide(probability, self.decision_weight)
+
+
+def fit_mixture(
+    features: FloatArray, rank: ArrayLike, groups: IntArray, *, penalties: Sequence[float] = PENALTIES
+) -> ReceiverMixture:
+    """Fit one receiver per geometry, with the penalty and the decision that suit the mean of their forecasts.
+
+    Parameters
+    ----------
+    features : (geometries, n, features)
+        Those of :attr:`FeatureChoice.tied`, say.
+    rank, groups, penalties
+        As :func:`fit_receiver`.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit_receiver`.
+    """
+    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
+    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
+    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
+    means = [np.mean([out_of_group(one, y, group, penalty) for one in x], axis=0) for penalty in penalties]
+    best = int(np.argmin([log_losses(p, y).mean() for p in means]))
+    return ReceiverMixture(
+        members=tuple(_fitted(one, y, float(penalties[best])) for one in x),
+        decision_weight=_kappa_weights(means[best], y),
+    )
+
+
+# --- which geometry -------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FeatureChoice:
+    """Which of several modelled channels explains the training ranks best, and which do as well.
+
+    Parameters
+    ----------
+    best : int
+        Index of the candidate with the least log score on groups left out.
+    order : (tried,) int
+        Candidates that were cross-validated, best first.
+    log_score : (tried,)
+        On groups left out [nat], in that order.
+    tied : tuple of int
+        Candidates that the data cannot tell from the best: the 95 % interval of the difference of their log scores on
+        the same samples holds 0. The best comes first.
+    candidates : int
+        How many there were.
+    """
+
+    best: int
+    order: IntArray
+    log_score: FloatArray
+    tied: tuple[int, ...]
+    candidates: int
+
+
+def choose_features(
+    features: FloatArray,
+    rank: ArrayLike,
+    groups: IntArray,
+    *,
+    penalty: float = 10.0,
+    finalists: int = 60,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> FeatureChoice:
+    """Choose between candidate geometries by groups left out within the training flights.
+
+    Parameters
+    ----------
+    features : (candidates, n, features)
+        Of every candidate at the same samples.
+    rank : array_like, (n,)
+    groups : (n,) int
+        Each is left out once.
+    penalty : float
+        The same for all.
+    finalists : int
+        Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
+        equally many coefficients, and a fit costs a tenth of a cross-validation.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit_receiver`.
+    """
+    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
+    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
+    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
+    step = max(1, _HELD // (x.shape[1] * (x.shape[2] + 1) * MAX_RANK))
+    rough = np.concatenate([_own_losses(x[i : i + step], y, penalty) for i in range(0, len(x), step)])
+    final = np.argsort(rough, kind="stable")[:finalists]
+    losses = np.concatenate(
+        [_left_out_losses(x[final[i : i + step]], y, group, penalty) for i in range(0, len(final), step)]
+    )
+    score = losses.mean(axis=1)
+    rows = np.argsort(score, kind="stable")
+    tied = tuple(int(final[r]) for r in rows if _not_worse(losses[r] - losses[rows[0]], replicates, seed))
+    return FeatureChoice(
+        best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
+    )
+
+
+def _own_losses(x: FloatArray, rank: IntArray, penalty: float) -> FloatArray:
+    mean, scale = _standard(x)
+    z = (x - mean[..., None, :]) / scale[..., None, :]
+    p = _softmax(_design(z) @ np.swapaxes(_fit_multinomial(z, rank, np.ones(len(rank)), penalty, steps=6), -1, -2))
+    return np.array([log_losses(one, rank).mean() for one in p])
+
+
+def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float) -> FloatArray:
+    return np.stack([log_losses(one, rank) for one in out_of_group(x, rank, groups, penalty)])
+
+
+def _not_worse(difference: FloatArray, replicates: int, seed: int) -> bool:
+    if np.abs(difference).max() < 1e-9:  # the same channel by another name
+        return True
+    known = memory(difference)
+    mean = float(difference.mean())
+    drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
+    low, _ = interval(mean, drawn, known)
+    return not low > 0.0
+
+
+# --- simpler rules --------------------------------------------------------------------------------------------------
+
+
+def rank_by_thresholds(ratio_db: ArrayLike, threshold_db: Sequence[float]) -> IntArray:
+    """Rank by one threshold per stream: stream i counts if streams 2 .. i exceed each their own threshold.
+
+    Parameters
+    ----------
+    ratio_db : array_like, (n, streams - 1)
+        ``20 log10 (sigma_i / sigma_1)`` [dB] of streams 2, 3, ...
+    threshold_db : sequence of float, (streams - 1,)
+
+    Examples
+    --------
+    >>> rank_by_thresholds([[-5.0, -12.0, -30.0], [-15.0, -16.0, -30.0]], (-10.0, -20.0, -20.0)).tolist()
+    [3, 1]
+    """
+    above: BoolArray = np.asarray(ratio_db, dtype=np.float64) > np.asarray(threshold_db, dtype=np.float64)
+    return np.asarray(1 + np.cumprod(above, axis=-1).sum(axis=-1), dtype=np.int64)
+
+
+def fit_thresholds(ratio_db: FloatArray, rank: ArrayLike, *, sweeps: int = 3) -> tuple[float, ...]:
+    """Thresholds [dB] with the largest kappa on the training samples, one after the other until none moves."""
+    ri = np.asarray(rank, dtype=np.float64)
+    good = (ri >= 1) & np.isfinite(ratio_db).all(axis=1)
+    y, ratio = ri[good], ratio_db[good]
+    grid = -20.0 * np.log10(k_grid(1.25, 100.0))
+    found = [-20.0] * ratio.shape[1]
+    for _ in range(sweeps):
+        before = list(found)
+        for stream in range(len(found)):
+            trials = [[*found[:stream], float(g), *found[stream + 1 :]] for g in grid]
+            kappas = [cohen_kappa(y, rank_by_thresholds(ratio, trial)) for trial in trials]
+            if np.isfinite(kappas).any():
+                found[stream] = float(grid[int(np.nanargmax(kappas))])
+        if found == before:
+            break
+    return tuple(found)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class OrderedReceiver:
+    """A fitted ordered regression: ``P(rank > r) = 1 / (1 + exp(cut_r - slope . z))`` with z the standardised features.
+
+    McCullagh (1980), doi:10.1111/j.2517-6161.1980.tb01109.x.
+    """
+
+    slope: FloatArray
+    cut: FloatArray
+    mean: FloatArray
+    scale: FloatArray
+
+    def probabilities(self, features: FloatArray) -> FloatArray:
+        """Probability (n, ranks)."""
+        return _ordered(self.slope, self.cut, (features - self.mean) / self.scale)
+
+
+def fit_ordered(features: FloatArray, rank: ArrayLike, *, penalty: float = 10.0) -> OrderedReceiver:
+    """Ordered regression of the largest penalised likelihood.
+
+    Raises
+    ------
+    InputError
+        As :func:`fit_receiver`.
+    """
+    from scipy.optimize import minimize
+
+    x, y, _ = _training(features, rank, np.arange(len(features)))
+    mean, scale = _standard(x)
+    z = (x - mean) / scale
+    beyond = np.array([(np.sum(y > r) + 0.5) / (len(y) + 1.0) for r in range(1, MAX_RANK)])
+    cut = np.log((1.0 - beyond) / beyond)
+    start = np.concatenate([np.zeros(x.shape[1]), [cut[0]], np.log(np.maximum(np.diff(cut), 1e-3))])
+
+    def parts(theta: FloatArray) -> tuple[FloatArray, FloatArray]:
+        width = x.shape[1]
+        # gaps as exponentials: cuts stay in order
+        return theta[:width], np.cumsum(np.concatenate([theta[width : width + 1], np.exp(theta[width + 1 :])]))
+
+    def objective(theta: FloatArray) -> float:
+        slope, cuts = parts(theta)
+        return float(log_losses(_ordered(slope, cuts, z), y).sum() + 0.5 * penalty * (slope @ slope))
+
+    slope, cuts = parts(minimize(objective, start, method="L-BFGS-B").x)
+    return OrderedReceiver(slope=slope, cut=cuts, mean=mean, scale=scale)
+
+
+def _ordered(slope: FloatArray, cut: FloatArray, z: FloatArray) -> FloatArray:
+    above = 1.0 / (1.0 + np.exp(np.clip(cut - (z @ slope)[:, None], -500.0, 500.0)))
+    edge = np.concatenate([np.ones((len(z), 1)), above, np.zeros((len(z), 1))], axis=1)
+    return np.asarray(np.maximum(edge[:, :-1] - edge[:, 1:], 0.0))

@@ -1,0 +1,189 @@
+"""Channels of many antenna geometries at once, on line of sight and ground reflection.
+
+Which way a modem's antennas point and how its ports are slanted is hardly ever written down. Trying thousands of
+geometries takes no thousand replays: the field of an element slanted by ``s`` is ``cos s`` times that of a vertical
+plus ``sin s`` times that of a horizontal one at the same place, so one evaluation with both at every port
+(:func:`aerpaw_cmp.propagation.channel.channel_matrices`, float64, every pair of elements) serves all slants, and the
+ground reflection is one ray that is added at any strength.
+
+The rank that a modem reports is for its whole band. Over 100 MHz the ground ray turns against the direct one by about a
+cycle where the two differ by 3 m, so beside the coherent sum at the carrier there is the power sum
+``L L^H + g^2 G G^H`` over the receiving ports, whose eigenvalues are the squares of the singular values in the mean.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..common.units import ComplexArray, FloatArray
+from .arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
+from .channel import channel_matrices
+from .paths import Faces, PathSet
+
+Ground = Literal["coherent", "power_sum"]
+"""How the ground ray is added to the direct one."""
+
+GROUND_MATERIAL = "itu_medium_dry_ground"
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Geometry:
+    """One way the antennas may hang.
+
+    Parameters
+    ----------
+    uav_yaw_deg, uav_pitch_deg, uav_roll_deg : float
+        Mount of the UAV's array in its carrier: body, or site axes where no attitude is known.
+    tower_slant_deg, uav_slant_deg : tuple of float
+        Per port; 0 vertical.
+    ground : float
+        Amplitude factor on the ground reflection: 1 that of a smooth half-space, 0 none.
+    sum : {"coherent", "power_sum"}
+    """
+
+    uav_yaw_deg: float
+    uav_pitch_deg: float
+    uav_roll_deg: float
+    tower_slant_deg: tuple[float, ...]
+    uav_slant_deg: tuple[float, ...]
+    ground: float
+    sum: Ground = "power_sum"
+
+    def in_words(self) -> str:
+        """For tables."""
+        slants = "/".join(f"{s:g}" for s in self.uav_slant_deg)
+        tower = "/".join(f"{s:g}" for s in self.tower_slant_deg)
+        turn = f"yaw {self.uav_yaw_deg:g}, pitch {self.uav_pitch_deg:g}, roll {self.uav_roll_deg:g} deg"
+        return f"{turn}; slants UAV {slants}, tower {tower}; ground x {self.ground:g} ({self.sum.replace('_', ' ')})"
+
+
+def every_geometry(
+    mounts_deg: Sequence[tuple[float, float, float]],
+    tower_slants_deg: Sequence[tuple[float, ...]],
+    uav_slants_deg: Sequence[tuple[float, ...]],
+    grounds: Sequence[float],
+    sums: Sequence[Ground] = ("power_sum",),
+) -> tuple[Geometry, ...]:
+    """All combinations; mounts are (yaw, pitch, roll). Geometries of one mount follow each other."""
+    return tuple(
+        Geometry(
+            uav_yaw_deg=yaw,
+            uav_pitch_deg=pitch,
+            uav_roll_deg=roll,
+            tower_slant_deg=tower,
+            uav_slant_deg=uav,
+            ground=ground,
+            sum=how,
+        )
+        for yaw, pitch, roll in mounts_deg
+        for tower in tower_slants_deg
+        for uav in uav_slants_deg
+        for how in sums
+        for ground in grounds
+    )
+
+
+def singular_values_of(
+    geometries: Iterable[Geometry],
+    tower: Array,
+    tower_m: FloatArray,
+    uav: Array,
+    poses: Poses,
+    carrier_hz: float,
+    *,
+    material: str = GROUND_MATERIAL,
+) -> Iterator[FloatArray]:
+    """Singular values (n, ports) of each geometry, absolute, descending.
+
+    Parameters
+    ----------
+    geometries : iterable of Geometry
+        In runs of one mount: each run costs one evaluation of the field.
+    tower : Array
+        Positions, pattern and mount; its slants are those of the geometry.
+    tower_m : (3,)
+        Array centre, east, north, up over flat ground at 0 [m].
+    uav : Array
+        Positions and pattern; slants and mount are those of the geometry.
+    poses : Poses
+    carrier_hz : float
+    material : str
+        Of the ground.
+
+    Notes
+    -----
+    Over receiving ports at the UAV. With the power sum they are the roots of the eigenvalues of ``L L^H + g^2 G G^H``:
+    the mean of ``H H^H`` over a band in which the ground ray takes all phases against the direct one.
+    """
+    last: tuple[float, float, float] | None = None
+    direct = bounced = np.zeros(0, dtype=np.complex128)
+    for g in geometries:
+        mount = (g.uav_yaw_deg, g.uav_pitch_deg, g.uav_roll_deg)
+        if mount != last:
+            turned = dataclasses.replace(uav, mount=np.asarray(rotation_from_yaw_pitch_roll(*map(np.radians, mount))))
+            direct, bounced = basis_fields(tower, tower_m, turned, poses, carrier_hz, material=material)
+            last = mount
+        at_uav, at_tower = slant_basis(g.uav_slant_deg), slant_basis(g.tower_slant_deg).T
+        los, ground = at_uav @ direct @ at_tower, g.ground * (at_uav @ bounced @ at_tower)
+        yield _coherent(los + ground) if g.sum == "coherent" else _power_sum(los, ground)
+
+
+def _coherent(h: ComplexArray) -> FloatArray:
+    return np.asarray(np.linalg.svd(h, compute_uv=False))
+
+
+def _power_sum(los: ComplexArray, ground: ComplexArray) -> FloatArray:
+    covariance = los @ _hermitian(los) + ground @ _hermitian(ground)
+    # the eigenvalues of a Hermitian matrix come ascending; rounding leaves the zero ones slightly negative
+    return np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(covariance)[..., ::-1], 0.0)))
+
+
+def _hermitian(matrix: ComplexArray) -> ComplexArray:
+    return np.asarray(np.conj(np.swapaxes(matrix, -1, -2)))
+
+
+def basis_fields(
+    tower: Array, tower_m: FloatArray, uav: Array, poses: Poses, carrier_hz: float, *, material: str = GROUND_MATERIAL
+) -> tuple[ComplexArray, ComplexArray]:
+    """Channel matrices (n, 2 uav ports, 2 tower ports) of line of sight and of the ground reflection alone.
+
+    Each port is there twice, vertical then horizontal: :func:`slant_basis` combines them.
+    """
+    link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
+    faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (material,), ("ground",))
+    n = len(poses)
+    index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
+    found = []
+    for depth in (0, 1):
+        path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
+        found.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link).h[:, 0])
+    return found[0], found[1]
+
+
+def _both_slants(array: Array) -> Array:
+    return dataclasses.replace(
+        array,
+        positions_m=np.repeat(array.positions_m, 2, axis=0),
+        slant_rad=np.tile([0.0, np.pi / 2.0], len(array)),
+        patterns=array.patterns if len(array.patterns) == 1 else tuple(p for p in array.patterns for _ in range(2)),
+    )
+
+
+def slant_basis(slant_deg: Sequence[float]) -> FloatArray:
+    """Matrix (ports, 2 ports) from vertical and horizontal elements to slanted ones.
+
+    Examples
+    --------
+    >>> slant_basis([0.0, 90.0]).round(6).tolist()
+    [[1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
+    """
+    slant = np.radians(np.asarray(slant_deg, dtype=np.float64))
+    result = np.zeros((len(slant), 2 * len(slant)))
+    port = np.arange(len(slant))
+    result[port, 2 * port], result[port, 2 * port + 1] = np.cos(slant), np.sin(slant)
+    return result

@@ -1,0 +1,543 @@
+"use strict";
+// The linked views: one pose, one span and one choice of series, shown by a map and by charts over time.
+// Numbers of a span follow the formulas of aerpaw_cmp.compare: offset on the grid, RMSE about it, Pearson correlation.
+(() => {
+  const data = JSON.parse(document.getElementById("explorer-data").textContent);
+  const root = document.getElementById("explorer");
+  const at = id => document.getElementById(id);
+
+  const arrays = data.arrays.map(a => {
+    const raw = atob(a.data), bytes = new Uint8Array(raw.length);
+    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
+    return a.type === "f8" ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
+  });
+  const get = i => i === undefined || i === null ? null : arrays[i];
+  const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+
+  const state = { series: 0, model: 0, k: 0, span: null, pose: null, colour: "residual", against: 0, turn: 0, tilt: Math.PI / 2, zoom: 1, east: 0, north: 0 };
+  const rss = () => data.rss[state.series] || null;
+  const rank = () => {
+    const tower = rss() ? rss().tower : null;
+    return data.rank.find(r => r.tower === tower) || (rss() ? null : data.rank[state.series] || null);
+  };
+
+  // --- numbers ------------------------------------------------------------------------------------------------------
+
+  function gridOffset(meanDifference) {
+    const [low, high] = data.span_db, exact = meanDifference / data.step_db, whole = Math.trunc(exact);
+    const rest = Math.abs(exact - whole);
+    const steps = rest > 0.5 + 1e-9 ? whole + Math.sign(exact) : whole; // a tie goes to the offset nearer zero
+    return Math.min(high, Math.max(low, steps * data.step_db));
+  }
+
+  function residuals() {
+    const s = rss();
+    if (!s) return null;
+    const model = s.models[state.model], level = get(model.level), measured = get(s.measured), out = new Float64Array(level.length);
+    for (let i = 0; i < out.length; i++) out[i] = measured[i] + (model.offset ?? NaN) - level[i];
+    return out;
+  }
+
+  function statistics() {
+    const s = rss();
+    if (!s) return null;
+    const time = get(s.time), measured = get(s.measured), model = s.models[state.model], level = get(model.level);
+    let n = 0, sm = 0, sl = 0;
+    const used = [];
+    for (let i = 0; i < time.length; i++) {
+      if (!Number.isFinite(measured[i]) || !Number.isFinite(level[i])) continue;
+      if (state.span && (time[i] < state.span[0] || time[i] > state.span[1])) continue;
+      used.push(i); n++; sm += measured[i]; sl += level[i];
+    }
+    if (!n) return { n: 0 };
+    const mm = sm / n, ml = sl / n, own = gridOffset(ml - mm);
+    let vm = 0, vl = 0, both = 0, ownSquare = 0, flightSquare = 0;
+    for (const i of used) {
+      const a = measured[i] - mm, b = level[i] - ml;
+      vm += a * a; vl += b * b; both += a * b;
+      ownSquare += (measured[i] + own - level[i]) ** 2;
+      flightSquare += (measured[i] + (model.offset ?? NaN) - level[i]) ** 2;
+    }
+    return { n, offset: own, rmse: Math.sqrt(ownSquare / n), rmseFlight: Math.sqrt(flightSquare / n), bias: mm + (model.offset ?? NaN) - ml, correlation: both / Math.sqrt(vm * vl), used };
+  }
+
+  function rankStatistics() {
+    const r = rank();
+    if (!r) return null;
+    const time = get(r.time), measured = get(r.measured), model = r.models[state.k], simulated = model ? get(model.rank) : null;
+    const shares = { measured: [0, 0, 0, 0, 0], simulated: [0, 0, 0, 0, 0] };
+    let n = 0, same = 0, pairs = 0;
+    for (let i = 0; i < time.length; i++) {
+      if (state.span && (time[i] < state.span[0] || time[i] > state.span[1])) continue;
+      const m = measured[i], s = simulated ? simulated[i] : NaN;
+      if (m >= 1) { shares.measured[Math.min(m, 4)]++; n++; }
+      if (s >= 0) shares.simulated[Math.min(s, 4)]++;
+      if (m >= 1 && s >= 1) { pairs++; if (m === s) same++; }
+    }
+    return { n, pairs, agreement: pairs ? same / pairs : NaN, shares };
+  }
+
+  // --- words --------------------------------------------------------------------------------------------------------
+
+  const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? v.toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
+  function clock(t) {
+    if (!data.start) return number(t, 2, "s");
+    return new Date(Date.parse(data.start + "Z") + t * 1000).toISOString().slice(11, 21) + " UTC";
+  }
+  function cells(target, rows) {
+    target.replaceChildren(...rows.map(([name, value]) => {
+      const row = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
+      dt.textContent = name; dd.textContent = value; row.append(dt, dd);
+      return row;
+    }));
+  }
+  function nearest(time, t) {
+    let low = 0, high = time.length - 1;
+    while (high - low > 1) { const mid = (low + high) >> 1; if (time[mid] <= t) low = mid; else high = mid; }
+    return high >= 0 && Math.abs(time[high] - t) < Math.abs(time[low] - t) ? high : low;
+  }
+
+  function describe() {
+    const s = rss(), r = rank(), rows = [], t = state.pose;
+    if (t === null) { cells(at("pose"), [["Pose", "point at a chart or at the map"]]); return; }
+    rows.push(["Time", clock(t)]);
+    if (s) {
+      const i = nearest(get(s.time), t), model = s.models[state.model], measured = get(s.measured)[i], level = get(model.level)[i];
+      const east = get(s.east), north = get(s.north), up = get(s.up);
+      if (east) rows.push(["East, north, up", `${number(east[i], 0)}, ${number(north[i], 0)}, ${number(up[i], 1)} m`]);
+      rows.push(["Measured", number(measured, 1, s.unit)], ["Calibrated", number(measured + model.offset, 1, "dBm")]);
+      rows.push([model.name[0].toUpperCase() + model.name.slice(1), number(level, 1, "dBm")], ["Residual", number(measured + model.offset - level, 1, "dB")]);
+      for (const g of s.geometry.slice(0, 2)) rows.push([g.name.replace(/ \[.*\]/, ""), number(get(g.values)[i], 1, (g.name.match(/\[(\w+)/) || [])[1])]);
+      if (s.line !== undefined) rows.push(["Log", `${s.files[get(s.file)[i]] ?? "?"}, line ${get(s.line)[i]}`]);
+    }
+    if (r && r.of) {
+      const i = nearest(get(r.time), t), m = get(r.measured)[i];
+      rows.push(["Rank measured", Number.isFinite(m) ? String(m) : "no CSI"]);
+      if (r.models[state.k]) rows.push([`Rank, ${r.models[state.k].name}`, String(get(r.models[state.k].rank)[i] || "no path")]);
+      for (const p of r.probability) rows.push([p.name.replaceAll("_", " "), number(100 * get(p.values)[i], 0, "%")]);
+    }
+    cells(at("pose"), rows);
+  }
+
+  function summarise() {
+    const s = statistics(), r = rankStatistics(), rows = [];
+    const span = state.span ? `${clock(state.span[0])} to ${clock(state.span[1])}` : "whole flight";
+    rows.push(["Span", span]);
+    if (s) {
+      rows.push(["Samples", number(s.n, 0)]);
+      if (s.n) rows.push(["RMSE, offset of the span", number(s.rmse, 2, "dB")], ["Offset of the span", number(s.offset, 1, "dB")],
+        ["RMSE, offset of the flight", number(s.rmseFlight, 2, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
+    }
+    if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
+    cells(at("span"), rows);
+    const shown = rss(), held = shown ? get(shown.time).length : 0;
+    at("thinned").textContent = shown && held < shown.of ? `${held} of ${shown.of} samples are in this page (extremes kept); the tables beside it hold all.` : "";
+  }
+
+  // --- charts over time -----------------------------------------------------------------------------------------------
+
+  let charts = [], range = null, linking = false;
+
+  function axis(label, size = 52) {
+    return { label, labelSize: 18, size, stroke: css("--ink"), font: "12px system-ui, sans-serif", labelFont: "12px system-ui, sans-serif",
+      grid: { stroke: css("--line"), width: 1 }, ticks: { stroke: css("--line"), width: 1 } };
+  }
+  function timeAxis() {
+    const a = axis("", 30);
+    a.values = (u, splits) => splits.map(v => data.start ? new Date(Date.parse(data.start + "Z") + v * 1000).toISOString().slice(11, 19) : String(Math.round(v * 10) / 10));
+    a.space = 80;
+    return a;
+  }
+
+  function bands(u) {
+    const { ctx, bbox } = u;
+    ctx.save();
+    if (state.span) {
+      const a = u.valToPos(state.span[0], "x", true), b = u.valToPos(state.span[1], "x", true);
+      ctx.fillStyle = css("--chosen");
+      ctx.fillRect(Math.max(a, bbox.left), bbox.top, Math.min(b, bbox.left + bbox.width) - Math.max(a, bbox.left), bbox.height);
+    }
+    if (state.pose !== null) {
+      const x = u.valToPos(state.pose, "x", true);
+      if (x >= bbox.left && x <= bbox.left + bbox.width) {
+        ctx.strokeStyle = css("--accent"); ctx.lineWidth = devicePixelRatio;
+        ctx.beginPath(); ctx.moveTo(x, bbox.top); ctx.lineTo(x, bbox.top + bbox.height); ctx.stroke();
+      }
+    }
+    ctx.restore();
+  }
+
+  function chart(target, label, columns, series, height, extra = {}) {
+    const host = document.createElement("div");
+    host.className = "chart";
+    target.append(host);
+    const options = {
+      width: Math.max(host.clientWidth, 200), height, legend: { show: false }, padding: [6, 12, 0, 0],
+      scales: { x: { time: false, range: () => range }, ...(extra.scales || {}) },
+      axes: [timeAxis(), { ...axis(label), ...(extra.axis || {}) }],
+      cursor: { drag: { x: true, y: false, setScale: false }, y: false, points: { show: false } },
+      series: [{}, ...series],
+      hooks: {
+        draw: [bands],
+        setCursor: [u => { if (!linking && u.cursor.left >= 0 && u.cursor.idx !== null) choose(u.posToVal(u.cursor.left, "x")); }],
+        setSelect: [u => {
+          if (u.select.width < 4) return;
+          span([u.posToVal(u.select.left, "x"), u.posToVal(u.select.left + u.select.width, "x")]);
+          u.setSelect({ left: 0, top: 0, width: 0, height: 0 }, false);
+        }],
+      },
+    };
+    const made = new uPlot(options, columns, host);
+    made.over.addEventListener("dblclick", () => { span(null); zoomTo(null); });
+    charts.push({ chart: made, host, height });
+  }
+
+  const dots = (name, colour, size) => ({ label: name, stroke: colour, fill: colour, paths: () => null, points: { show: true, size, fill: colour, stroke: colour } });
+  const line = (name, colour, dash, width = 1.5) => ({ label: name, stroke: colour, width, dash, points: { show: false }, spanGaps: false });
+  const column = a => Array.from(a, v => Number.isFinite(v) ? v : null);
+
+  function fullRange() {
+    const times = [];
+    for (const s of [...data.rss, ...data.rank]) { const t = get(s.time); if (t.length) times.push(t[0], t[t.length - 1]); }
+    if (!times.length && data.track) { const t = get(data.track.time); times.push(t[0], t[t.length - 1]); }
+    return times.length ? [Math.min(...times), Math.max(...times, Math.min(...times) + 1)] : [0, 1];
+  }
+
+  function drawCharts() {
+    for (const c of charts) c.chart.destroy();
+    charts = [];
+    const target = at("charts");
+    target.replaceChildren();
+    range = range || fullRange();
+    const s = rss(), r = rank(), tall = innerWidth < 600 ? 150 : 175;
+    if (s) {
+      const time = get(s.time), model = s.models[state.model], measured = get(s.measured);
+      const calibrated = Array.from(measured, v => Number.isFinite(v) ? v + (model.offset ?? 0) : null);
+      const columns = [Array.from(time), calibrated, column(get(model.level))], series = [dots("measured, calibrated", css("--measured"), 4), line(model.name, css("--ink"))];
+      if (state.model === 0 && s.models[1]) { columns.push(column(get(s.models[1].level))); series.push(line(s.models[1].name, css("--baseline"), [6, 4], 1)); }
+      chart(target, "Level [dBm]", columns, series, tall + 30);
+      const rest = residuals();
+      chart(target, "Residual [dB]", [Array.from(time), column(rest), rest.length ? Array(rest.length).fill(0) : []], [dots("residual", css("--measured"), 3), line("zero", css("--soft"), undefined, 1)], tall - 20);
+    }
+    if (r) {
+      const steps = uPlot.paths.stepped({ align: 1 }), model = r.models[state.k];
+      const columns = [Array.from(get(r.time)), column(get(r.measured))], series = [dots("measured", css("--measured"), 5)];
+      if (model) { columns.push(column(get(model.rank))); series.push({ ...line(model.name, css("--ink")), paths: steps }); }
+      chart(target, "Rank", columns, series, tall - 40, { scales: { y: { range: [-0.4, 4.4] } }, axis: { splits: () => [0, 1, 2, 3, 4], values: () => ["none", "1", "2", "3", "4"] } });
+    }
+    const place = data.track || s || r;
+    if (place && get(place.up)) chart(target, "Height [m]", [Array.from(get(place.time)), column(get(place.up))], [line("height", css("--ink"))], tall - 50);
+    at("legend").textContent = s ? `dots: measured plus offset; line: ${s.models[state.model].name}${state.model === 0 && s.models[1] ? "; dashed: " + s.models[1].name : ""}` : "";
+  }
+
+  // --- the map, plan or in three dimensions ---------------------------------------------------------------------------
+
+  const canvas = at("map"), pen = canvas.getContext("2d");
+  let project = null, drawn = [];
+
+  function flown() {
+    const s = rss() || rank() || data.track;
+    return s && get(s.east) ? { time: get(s.time), east: get(s.east), north: get(s.north), up: get(s.up) } : null;
+  }
+
+  function box() {
+    const lists = [[], [], []], f = data.track ? { east: get(data.track.east), north: get(data.track.north), up: get(data.track.up) } : flown();
+    if (f) for (let i = 0; i < f.east.length; i += Math.ceil(f.east.length / 500)) if (Number.isFinite(f.east[i])) { lists[0].push(f.east[i]); lists[1].push(f.north[i]); lists[2].push(f.up[i]); }
+    const tower = rss() ? rss().tower : rank() ? rank().tower : null;
+    for (const t of data.site.towers) if (t.name === tower || !lists[0].length) { lists[0].push(t.at[0]); lists[1].push(t.at[1]); lists[2].push(t.top); }
+    return lists.map(l => l.length ? [Math.min(...l), Math.max(...l)] : [0, 1]);
+  }
+
+  function prepare() {
+    const w = canvas.clientWidth, h = canvas.clientHeight, b = box(), c = b.map(([x, y]) => (x + y) / 2);
+    const ct = Math.cos(state.turn), st = Math.sin(state.turn), ce = Math.cos(state.tilt), se = Math.sin(state.tilt), stretch = state.tilt > 1.5 ? 1 : 2;
+    const raw = p => {
+      const e = p[0] - c[0] - state.east, n = p[1] - c[1] - state.north, u = (p[2] || 0) * stretch;
+      const right = e * ct + n * st, deep = -e * st + n * ct;
+      return [right, u * ce + deep * se, deep * ce - u * se];
+    };
+    const corners = [];
+    for (const e of b[0]) for (const n of b[1]) for (const u of [0, b[2][1]]) corners.push(raw([e + state.east, n + state.north, u]));
+    const xs = corners.map(p => p[0]), ys = corners.map(p => p[1]);
+    const wide = Math.max(Math.max(...xs) - Math.min(...xs), 10), high = Math.max(Math.max(...ys) - Math.min(...ys), 10);
+    const scale = state.zoom * Math.min((w - 60) / wide, (h - 60) / high), mx = (Math.max(...xs) + Math.min(...xs)) / 2, my = (Math.max(...ys) + Math.min(...ys)) / 2;
+    project = p => { const q = raw(p); return [w / 2 + (q[0] - mx) * scale, h / 2 - (q[1] - my) * scale, q[2]]; };
+    project.scale = scale;
+  }
+
+  function shade(v, low, high, diverging) {
+    const x = Math.min(1, Math.max(0, (v - low) / (high - low)));
+    if (diverging) {
+      const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [235, 235, 225];
+      return `rgb(${to.map((t, i) => Math.round(mid[i] + (t - mid[i]) * Math.sqrt(k))).join(",")})`;
+    }
+    const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], i = Math.min(3, Math.floor(x * 4)), f = x * 4 - i;
+    return `rgb(${stops[i].map((a, j) => Math.round(a + (stops[i + 1][j] - a) * f)).join(",")})`;
+  }
+
+  const RANKS = ["#9a9a9a", "#440154", "#31688e", "#35b779", "#fde725"];
+
+  function colours() {
+    const s = rss(), r = rank();
+    if ((state.colour === "rank" || !s) && r) {
+      const model = r.models[state.k], v = get(r.measured);
+      return { source: r, of: i => Number.isFinite(v[i]) ? RANKS[v[i]] : RANKS[0], words: "measured rank: " + [1, 2, 3, 4].join(", "), key: [1, 2, 3, 4].map(k => [RANKS[k], String(k)]), model };
+    }
+    if (!s) return null;
+    if (state.colour === "level") {
+      const v = get(s.measured), known = Array.from(v).filter(Number.isFinite).sort((a, b) => a - b), low = known[Math.floor(known.length * 0.02)] ?? 0, high = known[Math.floor(known.length * 0.98)] ?? 1;
+      return { source: s, of: i => Number.isFinite(v[i]) ? shade(v[i], low, high) : "#9a9a9a", key: [0, .25, .5, .75, 1].map(x => [shade(x, 0, 1), number(low + x * (high - low), 0)]), words: `measured level [${s.unit}]` };
+    }
+    const v = residuals();
+    return { source: s, of: i => Number.isFinite(v[i]) ? shade(v[i], -12, 12, true) : "#9a9a9a", key: [-12, -6, 0, 6, 12].map(x => [shade(x, -12, 12, true), number(x, 0)]), words: "residual [dB], measured minus " + s.models[state.model].name };
+  }
+
+  function polygon(points, fill, stroke) {
+    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])); pen.closePath();
+    if (fill) { pen.fillStyle = fill; pen.fill(); }
+    if (stroke) { pen.strokeStyle = stroke; pen.lineWidth = 0.6; pen.stroke(); }
+  }
+  function polyline(points, colour, width, dash) {
+    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
+    pen.strokeStyle = colour; pen.lineWidth = width; pen.setLineDash(dash || []); pen.stroke(); pen.setLineDash([]);
+  }
+  function label(text, p, colour) {
+    pen.font = "bold 12px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = css("--paper");
+    pen.strokeText(text, p[0] + 6, p[1] - 5); pen.fillStyle = colour; pen.fillText(text, p[0] + 6, p[1] - 5);
+  }
+
+  function drawMap() {
+    const ratio = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
+    canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.lineJoin = "round";
+    pen.fillStyle = css("--paper"); pen.fillRect(0, 0, w, h);
+    prepare();
+    for (const f of data.site.forests) polygon(f.map(p => project([p[0], p[1], 0])), css("--forest"), null);
+    const parts = [];
+    for (const faces of data.site.buildings) for (const face of faces) {
+      const seen = face.map(project);
+      parts.push([Math.max(...seen.map(p => p[2])), () => polygon(seen, css("--building"), css("--soft"))]);
+    }
+    if (state.tilt < 1.5) for (const [e, n, g, height, wide, base] of data.site.trees) {
+      const foot = project([e, n, g]), crown = project([e, n, g + base]), top = project([e, n, g + height]), half = wide / 2 * project.scale;
+      parts.push([foot[2], () => polygon([top, [crown[0] - half, crown[1]], [crown[0] + half, crown[1]]], css("--tree"), null)]);
+    }
+    parts.sort((a, b) => b[0] - a[0]).forEach(p => p[1]());
+    if (data.track) {
+      const e = get(data.track.east), n = get(data.track.north), u = get(data.track.up);
+      polyline(Array.from(e, (v, i) => project([v, n[i], u[i]])), css("--line"), 1);
+    }
+    const c = colours();
+    drawn = [];
+    if (c) {
+      const s = c.source, time = get(s.time), e = get(s.east), n = get(s.north), u = get(s.up);
+      if (e) for (let i = 0; i < time.length; i++) {
+        if (!Number.isFinite(e[i])) continue;
+        const p = project([e[i], n[i], u[i]]), inside = !state.span || (time[i] >= state.span[0] && time[i] <= state.span[1]);
+        drawn.push([p[0], p[1], time[i]]);
+        pen.globalAlpha = inside ? 1 : 0.15;
+        pen.fillStyle = c.of(i); pen.fillRect(p[0] - 2.5, p[1] - 2.5, 5, 5);
+      }
+      pen.globalAlpha = 1;
+    }
+    const tower = rss() ? rss().tower : rank() ? rank().tower : "";
+    for (const t of data.site.towers) {
+      const foot = project(t.at), top = project([t.at[0], t.at[1], t.top]);
+      polyline([foot, top], css("--accent"), 3);
+      polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
+      label(t.name, top, t.name === tower ? css("--accent") : css("--soft"));
+    }
+    drawPaths(tower);
+    drawKey(c, w, h);
+  }
+
+  function drawPaths(tower) {
+    if (state.pose === null) return;
+    const f = flown();
+    if (f) {
+      const i = nearest(f.time, state.pose), p = project([f.east[i], f.north[i], f.up[i]]);
+      const found = data.paths.find(x => x.tower === tower);
+      if (found && found.time.length) {
+        const j = nearest(found.time, state.pose);
+        for (const [points, kind] of found.lines[j]) polyline(points.map(project), css(kind ? "--baseline" : "--ink"), 1.4, kind ? [5, 3] : []);
+      }
+      pen.beginPath(); pen.arc(p[0], p[1], 6, 0, 7); pen.fillStyle = "#F0C000"; pen.fill(); pen.strokeStyle = "#000"; pen.lineWidth = 1.2; pen.stroke();
+    }
+  }
+
+  function drawKey(c, w, h) {
+    const metres = [1, 2, 5, 10, 20, 50, 100, 200, 500, 1000].find(m => m * project.scale > 50) || 2000;
+    if (state.tilt > 1.5) { polyline([[14, h - 14], [14 + metres * project.scale, h - 14]], css("--ink"), 2); pen.font = "11px system-ui, sans-serif"; pen.fillStyle = css("--ink"); pen.fillText(`${metres} m`, 14, h - 19); }
+    if (!c) return;
+    pen.font = "11px system-ui, sans-serif";
+    c.key.forEach(([fill, text], i) => { pen.fillStyle = fill; pen.fillRect(w - 36 * (c.key.length - i) - 6, h - 24, 34, 10); pen.fillStyle = css("--ink"); pen.fillText(text, w - 36 * (c.key.length - i) - 2, h - 4); });
+    pen.textAlign = "right"; pen.fillText(c.words, w - 8, h - 30); pen.textAlign = "left";
+  }
+
+  // --- residual against a quantity, and histograms ----------------------------------------------------------------------
+
+  function frame(id) {
+    const c = at(id), p = c.getContext("2d"), ratio = devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight;
+    c.width = Math.round(w * ratio); c.height = Math.round(h * ratio);
+    p.setTransform(ratio, 0, 0, ratio, 0, 0); p.fillStyle = css("--paper"); p.fillRect(0, 0, w, h); p.font = "11px system-ui, sans-serif";
+    return [p, w, h];
+  }
+
+  function ticks(low, high, most = 5) {
+    const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw), out = [];
+    for (let v = Math.ceil(low / step) * step; v <= high + 1e-9; v += step) out.push(Math.abs(v) < 1e-9 ? 0 : v);
+    return out;
+  }
+
+  function drawScatter() {
+    const s = rss();
+    at("scatter-figure").hidden = !s || !s.geometry.length;
+    if (!s || !s.geometry.length) return;
+    const [p, w, h] = frame("scatter"), g = s.geometry[state.against] || s.geometry[0], x = get(g.values), y = residuals(), time = get(s.time);
+    const chosen = [];
+    for (let i = 0; i < x.length; i++) if (Number.isFinite(x[i]) && Number.isFinite(y[i]) && (!state.span || (time[i] >= state.span[0] && time[i] <= state.span[1]))) chosen.push([x[i], y[i]]);
+    if (!chosen.length) return;
+    let low = Infinity, high = -Infinity, reach = 5;
+    for (const [a, b] of chosen) { low = Math.min(low, a); high = Math.max(high, a); reach = Math.max(reach, Math.abs(b)); }
+    reach = Math.min(reach, 30); if (high - low < 1e-6) high = low + 1;
+    const X = v => 44 + (v - low) / (high - low) * (w - 56), Y = v => 8 + (reach - Math.max(-reach, Math.min(reach, v))) / (2 * reach) * (h - 42);
+    p.strokeStyle = css("--line"); p.fillStyle = css("--ink"); p.lineWidth = 1;
+    for (const t of ticks(low, high)) { p.beginPath(); p.moveTo(X(t), 8); p.lineTo(X(t), h - 34); p.stroke(); p.textAlign = "center"; p.fillText(String(Math.round(t * 100) / 100), X(t), h - 20); }
+    for (const t of ticks(-reach, reach)) { p.beginPath(); p.moveTo(44, Y(t)); p.lineTo(w - 12, Y(t)); p.stroke(); p.textAlign = "right"; p.fillText(number(t, 0), 40, Y(t) + 4); }
+    p.textAlign = "center"; p.fillText(g.name, (44 + w - 12) / 2, h - 5);
+    p.fillStyle = css("--measured"); p.globalAlpha = 0.5;
+    for (const [a, b] of chosen) p.fillRect(X(a) - 1.2, Y(b) - 1.2, 2.4, 2.4);
+    p.globalAlpha = 1;
+    chosen.sort((a, b) => a[0] - b[0]);
+    const bins = Math.min(20, Math.floor(chosen.length / 8));
+    if (bins > 1) {
+      p.strokeStyle = css("--ink"); p.lineWidth = 2; p.beginPath();
+      for (let k = 0; k < bins; k++) {
+        const part = chosen.slice(Math.floor(k * chosen.length / bins), Math.floor((k + 1) * chosen.length / bins));
+        const mx = part.reduce((t, v) => t + v[0], 0) / part.length, my = part.reduce((t, v) => t + v[1], 0) / part.length;
+        if (k) p.lineTo(X(mx), Y(my)); else p.moveTo(X(mx), Y(my));
+      }
+      p.stroke();
+    }
+  }
+
+  function drawHistogram() {
+    const s = rss(), r = rank(), [p, w, h] = frame("histogram");
+    if (s) {
+      const found = statistics(), rest = residuals(), counts = new Array(30).fill(0);
+      if (found.used) for (const i of found.used) counts[Math.min(29, Math.max(0, Math.floor((rest[i] + 15) / 1)))]++;
+      const most = Math.max(1, ...counts), wide = (w - 30) / 30;
+      counts.forEach((c, i) => { p.fillStyle = css("--measured"); p.fillRect(15 + i * wide, h - 34 - c / most * (h - 46), wide - 1, c / most * (h - 46)); });
+      p.fillStyle = css("--ink"); p.textAlign = "center";
+      for (const v of [-15, -10, -5, 0, 5, 10, 15]) p.fillText(number(v, 0), 15 + (v + 15) * wide, h - 20);
+      p.fillText("Residual [dB], ends hold what lies beyond", w / 2, h - 5);
+    } else if (r) {
+      const found = rankStatistics(), names = ["none", "1", "2", "3", "4"], wide = (w - 40) / 5;
+      const share = list => { const t = list.reduce((a, b) => a + b, 0) || 1; return list.map(v => v / t); };
+      const m = share(found.shares.measured), q = share(found.shares.simulated);
+      names.forEach((name, i) => {
+        p.fillStyle = css("--measured"); p.fillRect(20 + i * wide + 4, h - 34 - m[i] * (h - 46), wide / 2 - 6, m[i] * (h - 46));
+        p.fillStyle = css("--ink"); p.fillRect(20 + i * wide + wide / 2, h - 34 - q[i] * (h - 46), wide / 2 - 6, q[i] * (h - 46));
+        p.textAlign = "center"; p.fillText(name, 20 + (i + .5) * wide, h - 20);
+      });
+      p.fillStyle = css("--ink"); p.fillText("Rank: measured (light), simulated (dark)", w / 2, h - 5);
+    }
+  }
+
+  // --- linking ---------------------------------------------------------------------------------------------------------
+
+  let waiting = new Set();
+  function later(...jobs) {
+    if (!waiting.size) requestAnimationFrame(() => { const now = [...waiting]; waiting = new Set(); for (const job of now) job(); });
+    jobs.forEach(job => waiting.add(job));
+  }
+  const lines = () => { linking = true; for (const c of charts) c.chart.redraw(false); linking = false; };
+
+  function choose(t) { if (t === state.pose) return; state.pose = t; later(lines, drawMap, describe); }
+  function span(s) { state.span = s && s[1] > s[0] ? s : null; later(lines, drawMap, drawScatter, drawHistogram, summarise); }
+  function zoomTo(s) { range = s || fullRange(); linking = true; for (const c of charts) c.chart.setScale("x", { min: range[0], max: range[1] }); linking = false; }
+  function everything() { drawCharts(); drawMap(); drawScatter(); drawHistogram(); summarise(); describe(); }
+
+  function fill(select, names, chosen) {
+    select.replaceChildren(...names.map((name, i) => { const o = document.createElement("option"); o.value = i; o.textContent = name; return o; }));
+    select.value = chosen;
+    select.closest("label").hidden = names.length < 2;
+  }
+
+  function controls() {
+    const s = rss(), r = rank();
+    fill(at("choose-series"), (data.rss.length ? data.rss : data.rank).map(x => x.name || x.tower), state.series);
+    fill(at("choose-model"), s ? s.models.map(m => m.name) : [], state.model);
+    fill(at("choose-k"), r ? r.models.map(m => m.name) : [], state.k);
+    const kinds = [...(s ? ["residual", "level"] : []), ...(r ? ["rank"] : [])];
+    const names = { residual: "residual", level: "measured level", rank: "measured rank" };
+    at("choose-colour").replaceChildren(...kinds.map(k => { const o = document.createElement("option"); o.value = k; o.textContent = names[k]; return o; }));
+    if (!kinds.includes(state.colour)) state.colour = kinds[0];
+    at("choose-colour").value = state.colour;
+    at("choose-colour").closest("label").hidden = kinds.length < 2;
+    fill(at("choose-against"), s ? s.geometry.map(g => g.name) : [], state.against);
+  }
+
+  const pick = (id, change) => at(id).addEventListener("change", e => { change(e.target.value); controls(); everything(); });
+  pick("choose-series", v => { state.series = +v; state.model = Math.min(state.model, (rss() ? rss().models.length : 1) - 1); state.k = rank() ? rank().best : 0; });
+  pick("choose-model", v => { state.model = +v; });
+  pick("choose-k", v => { state.k = +v; });
+  pick("choose-colour", v => { state.colour = v; });
+  pick("choose-against", v => { state.against = +v; });
+  at("zoom-span").addEventListener("click", () => zoomTo(state.span));
+  at("clear-span").addEventListener("click", () => { span(null); zoomTo(null); });
+  at("view-plan").addEventListener("click", () => { Object.assign(state, { turn: 0, tilt: Math.PI / 2, zoom: 1, east: 0, north: 0 }); later(drawMap); });
+  at("view-solid").addEventListener("click", () => { Object.assign(state, { turn: -0.45, tilt: 0.5, zoom: 1, east: 0, north: 0 }); later(drawMap); });
+
+  root.addEventListener("keydown", e => {
+    if (e.target.tagName === "SELECT") return;
+    const s = rss() || rank();
+    if (!s) return;
+    const time = get(s.time), step = { ArrowLeft: -1, ArrowRight: 1, PageUp: -50, PageDown: 50 }[e.key];
+    if (step) {
+      e.preventDefault();
+      const i = state.pose === null ? 0 : nearest(time, state.pose) + step * (e.shiftKey ? 10 : 1);
+      choose(time[Math.min(time.length - 1, Math.max(0, i))]);
+    } else if (e.key === "[" && state.pose !== null) span([state.pose, state.span ? state.span[1] : range[1]]);
+    else if (e.key === "]" && state.pose !== null) span([state.span ? state.span[0] : range[0], state.pose]);
+    else if (e.key === "Escape") { span(null); zoomTo(null); }
+    else if (e.key === "+" || e.key === "=") { state.zoom = Math.min(30, state.zoom * 1.25); later(drawMap); }
+    else if (e.key === "-") { state.zoom = Math.max(0.3, state.zoom / 1.25); later(drawMap); }
+  });
+
+  let held = null;
+  canvas.addEventListener("pointerdown", e => { canvas.setPointerCapture(e.pointerId); held = [e.clientX, e.clientY]; });
+  canvas.addEventListener("pointerup", () => { held = null; });
+  canvas.addEventListener("pointermove", e => {
+    if (held) {
+      const dx = e.clientX - held[0], dy = e.clientY - held[1];
+      held = [e.clientX, e.clientY];
+      if (state.tilt < 1.5 && !e.shiftKey) { state.turn -= dx * 0.006; state.tilt = Math.min(1.45, Math.max(0.05, state.tilt + dy * 0.006)); }
+      else { state.east -= dx / project.scale; state.north += dy / project.scale; }
+      later(drawMap);
+      return;
+    }
+    const r = canvas.getBoundingClientRect(), x = e.clientX - r.left, y = e.clientY - r.top;
+    let best = 400, t = null;
+    for (const [px, py, time] of drawn) { const d = (px - x) ** 2 + (py - y) ** 2; if (d < best) { best = d; t = time; } }
+    if (t !== null) choose(t);
+  });
+  canvas.addEventListener("wheel", e => { if (!e.ctrlKey && !e.metaKey && document.activeElement !== canvas) return; e.preventDefault(); state.zoom = Math.min(30, Math.max(0.3, state.zoom * Math.exp(-e.deltaY * 0.0015))); later(drawMap); }, { passive: false });
+
+  let width = 0;
+  new ResizeObserver(() => {
+    if (root.clientWidth === width) return;
+    width = root.clientWidth;
+    linking = true;
+    for (const c of charts) c.chart.setSize({ width: Math.max(c.host.clientWidth, 200), height: c.height });
+    linking = false;
+    later(drawMap, drawScatter, drawHistogram);
+  }).observe(root);
+  matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => everything());
+
+  state.k = Math.max(0, rank() ? rank().best : 0);
+  document.documentElement.classList.add("live");
+  controls();
+  everything();
+  window.explorer = { state, statistics, rankStatistics, choose, span, get data() { return data; } };
+})();

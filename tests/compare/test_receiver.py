@@ -1,0 +1,155 @@
+"""A receiver learned from ranks."""
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.compare.forecast import log_losses
+from aerpaw_cmp.compare.rank import channel_rank, cohen_kappa
+from aerpaw_cmp.compare.receiver import (
+    Receiver,
+    choose_features,
+    fit_mixture,
+    fit_ordered,
+    fit_receiver,
+    fit_thresholds,
+    out_of_group,
+    rank_by_thresholds,
+    sector_groups,
+    stream_features,
+)
+
+
+def planted(n=1200, seed=2):
+    """Features and ranks drawn from a known regression; groups of equal size."""
+    rng = np.random.default_rng(seed)
+    x = rng.normal(size=(n, 4)) * [6.0, 5.0, 4.0, 8.0] - [10.0, 20.0, 30.0, 80.0]
+    z = (x - x.mean(axis=0)) / x.std(axis=0)
+    score = np.stack([-1.5 - z[:, 0], 1.0 + 0 * z[:, 0], z[:, 0] + 0.8 * z[:, 1], -1.0 + 1.5 * z[:, 2]], axis=1)
+    p = np.exp(score) / np.exp(score).sum(axis=1, keepdims=True)
+    rank = 1 + (rng.random(n)[:, None] > np.cumsum(p, axis=1)).sum(axis=1)
+    return x, rank, p, np.arange(n) * 8 // n
+
+
+def test_features_are_ratios_and_level_and_scale_only_moves_the_level():
+    h = np.random.default_rng(0).normal(size=(5, 4, 4, 2)) @ [1, 1j]
+    one, two = (stream_features(np.linalg.svd(m, compute_uv=False)) for m in (h, 10.0 * h))
+    np.testing.assert_allclose(two - one, np.tile([0.0, 0.0, 0.0, 20.0], (5, 1)), atol=1e-9)
+    assert np.isnan(stream_features([0.0, 0.0, 0.0, 0.0])).all()
+
+
+def test_probabilities_come_near_the_planted_ones():
+    x, rank, truth, groups = planted(6000)
+    found = fit_receiver(x, rank, groups, penalties=(0.1,)).probabilities(x)
+    assert np.abs(found - truth).mean() < 0.02
+    assert found.sum(axis=1) == pytest.approx(1.0)
+
+
+def test_regression_equals_the_one_of_scikit_learn():
+    linear_model = pytest.importorskip("sklearn.linear_model")
+    x, rank, _, groups = planted(600)
+    found = fit_receiver(x, rank, groups, penalties=(5.0,))
+    z = (x - found.mean) / found.scale
+    other = linear_model.LogisticRegression(C=1.0 / 5.0, tol=1e-10, max_iter=5000).fit(z, rank)
+    np.testing.assert_allclose(found.coefficient[:, 1:], other.coef_, atol=2e-4)
+    np.testing.assert_allclose(found.probabilities(x), other.predict_proba(z), atol=2e-4)
+
+
+def test_a_batch_of_features_equals_one_after_the_other():
+    x, rank, _, groups = planted(300)
+    both = np.stack([x, x[:, ::-1] * 2.0])
+    together = out_of_group(both, rank, groups, 3.0)
+    for i in (0, 1):
+        np.testing.assert_allclose(together[i], out_of_group(both[i], rank, groups, 3.0), atol=1e-6)
+
+
+def test_what_is_left_out_has_no_part_in_its_forecast():
+    x, rank, _, groups = planted(400)
+    changed = np.where(groups == 3, 5 - rank, rank)
+    one, two = (out_of_group(x, r, groups, 3.0) for r in (rank, changed))
+    np.testing.assert_array_equal(one[groups == 3], two[groups == 3])
+    assert np.abs(one[groups != 3] - two[groups != 3]).max() > 0.01
+
+
+def test_noise_is_told_as_the_constant_forecast():
+    x, rank, _, groups = planted()
+    shuffled = np.random.default_rng(5).permutation(rank)
+    receiver = fit_receiver(x, shuffled, groups)
+    p = receiver.probabilities(x)
+    constant = -np.log(receiver.constant[shuffled - 1]).mean()
+    assert log_losses(p, shuffled).mean() > 0.97 * constant
+
+
+def test_decision_for_kappa_says_the_rare_ranks_too():
+    x, rank, _, groups = planted()
+    receiver = fit_receiver(x[::2], rank[::2], groups[::2])
+    p = receiver.probabilities(x[1::2])
+    assert cohen_kappa(rank[1::2], receiver.decide(p)) > cohen_kappa(rank[1::2], p.argmax(axis=1) + 1) - 0.01
+    assert receiver.decide(np.full((1, 4), np.nan)).tolist() == [0]
+
+
+def test_a_receiver_survives_its_file():
+    x, rank, _, groups = planted(300)
+    receiver = fit_receiver(x, rank, groups)
+    again = Receiver.from_dict(receiver.as_dict())
+    np.testing.assert_array_equal(again.probabilities(x), receiver.probabilities(x))
+    with pytest.raises(ValueError, match="without penalty"):
+        Receiver.from_dict({k: v for k, v in receiver.as_dict().items() if k != "penalty"})
+
+
+@pytest.mark.parametrize("rank", [np.full(300, 2), np.r_[np.full(280, np.nan), np.tile([1, 2], 10)]])
+def test_nothing_to_learn_from_is_one_message(rank):
+    with pytest.raises(InputError, match="to fit a receiver"):
+        fit_receiver(np.zeros((300, 4)), rank, np.arange(300) % 8)
+
+
+def test_the_planted_geometry_is_found_and_its_double_is_told_as_tied():
+    x, rank, _, groups = planted()
+    rng = np.random.default_rng(9)
+    worse = [rng.permutation(x) for _ in range(3)]
+    choice = choose_features(np.stack([*worse, x, 2.0 * x]), rank, groups, finalists=5, replicates=200)
+    assert choice.best in (3, 4)
+    assert sorted(choice.tied) == [3, 4]
+
+
+def test_mixture_is_the_mean_of_its_members():
+    x, rank, _, groups = planted(300)
+    mixture = fit_mixture(np.stack([x, x]), rank, groups, penalties=(3.0,))
+    one = fit_receiver(x, rank, groups, penalties=(3.0,))
+    np.testing.assert_allclose(mixture.probabilities(np.stack([x, x])), one.probabilities(x), atol=1e-9)
+    with pytest.raises(ValueError, match="geometries"):
+        mixture.probabilities(x[None])
+
+
+def test_equal_thresholds_are_the_rule_with_one_k():
+    h = np.random.default_rng(4).normal(size=(200, 4, 4, 2)) @ [1, 1j]
+    ratio = stream_features(np.linalg.svd(h, compute_uv=False))[:, :3]
+    np.testing.assert_array_equal(rank_by_thresholds(ratio, (-20.0,) * 3), channel_rank(h, 10.0))
+
+
+def test_planted_thresholds_are_found():
+    h = np.random.default_rng(4).normal(size=(600, 4, 4, 2)) @ [1, 1j]
+    ratio = stream_features(np.linalg.svd(h, compute_uv=False))[:, :3]
+    truth = rank_by_thresholds(ratio, (-4.0, -9.0, -20.0))
+    assert fit_thresholds(ratio, truth) == pytest.approx((-4.0, -9.0, -20.0), abs=20.0 / 24)  # a step of K
+
+
+def test_ordered_regression_finds_planted_cuts():
+    rng = np.random.default_rng(6)
+    x = rng.normal(size=(5000, 1))
+    rank = 1 + (x + rng.logistic(size=(5000, 1)) > np.array([-2.0, 0.5, 2.0])).sum(axis=1)
+    found = fit_ordered(x, rank, penalty=1e-3)
+    assert found.slope[0] / found.scale[0] == pytest.approx(1.0, abs=0.1)
+    np.testing.assert_allclose(
+        found.cut - found.slope[0] * -found.mean[0] / -found.scale[0], [-2.0, 0.5, 2.0], atol=0.2
+    )
+    assert found.probabilities(x).sum(axis=1) == pytest.approx(1.0)
+
+
+def test_sectors_are_contiguous_directions_of_equal_share():
+    rng = np.random.default_rng(1)
+    azimuth = rng.uniform(2.5, 4.5, 800)  # across the cut of arctan2
+    at = np.column_stack([100 * np.cos(azimuth), 100 * np.sin(azimuth), np.full(800, 30.0)])
+    group = sector_groups(at, np.zeros(3))
+    assert np.bincount(group).tolist() == [100] * 8
+    assert (np.diff(group[np.argsort(azimuth)]) != 0).sum() == 7

@@ -1,0 +1,142 @@
+"""A short, seeded part of the fuzz driver: every target, in this process; and the driver sees planted faults."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import json
+import sys
+import warnings
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import limits
+from aerpaw_cmp.logs.readers import catalogue
+from aerpaw_cmp.logs.records import ReadResult
+
+PATH = Path(__file__).parents[2] / "benchmarks" / "fuzz_inputs.py"
+
+
+@pytest.fixture(scope="module")
+def fuzz() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("fuzz_inputs", PATH)
+    assert spec is not None
+    assert spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    sys.modules["fuzz_inputs"] = module
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.fixture(scope="module")
+def known(fuzz: ModuleType) -> dict:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.delenv("AERPAW_CMP_FIELD_DATA", raising=False)  # the same inputs everywhere
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # rasterio writes the seed
+            return {target.name: target for target in fuzz.targets()}
+
+
+def test_every_reader_of_the_catalogue_is_a_target_with_seeds(known: dict) -> None:
+    lacking = {f"reader:{reader.name}" for reader in catalogue()} - set(known)
+    assert not lacking, f"no seed for {lacking}: add a sample to tests/parsers/samples.py"
+    assert {"flight.yaml", "site.yaml", "campaign.yaml", "map:kmz", "matfile", "flight_file", "path_cache"} <= set(
+        known
+    )
+    assert {"map:geojson", "map:osm", "map:kml", "dem:asc", "antenna:text"} <= set(known)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_a_short_part_of_the_run_has_no_violation(fuzz: ModuleType, known: dict) -> None:
+    found, read = [], 0
+    for name, target in known.items():
+        for index in range(20):
+            verdict, what, _ = fuzz.one_input(target, 7, index, bounded=False)
+            read += verdict == "read"
+            if verdict == "violation":
+                found.append(f"{name} {index}: {what}")
+    assert not found
+    assert read > 50, "most mutations must leave something to read, or nothing is tested behind the first check"
+
+
+def test_an_input_depends_on_seed_target_and_number_alone(fuzz: ModuleType, known: dict) -> None:
+    target = known["flight.yaml"]
+    some = [fuzz.mutated(target, 3, i) for i in range(40)]
+    assert some == [fuzz.mutated(target, 3, i) for i in range(40)]
+    assert len(set(some)) > 35
+    assert some != [fuzz.mutated(target, 4, i) for i in range(40)]
+
+
+def eat(_data: bytes, index: int) -> bool:
+    """Faults by the number of the input."""
+    if index == 1:
+        raise KeyError("a bug")
+    if index == 2:
+        while True:
+            pass
+    if index == 3:
+        return bool(len(bytearray(600 * 2**20)))
+    if index == 4:
+        import os
+
+        os._exit(9)
+    if index == 5:
+        raise InputError(" ")
+    if index == 6:
+        raise InputError("refused")
+    return True
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_planted_faults_are_seen_and_resumed_after(
+    fuzz: ModuleType, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fuzz, "LIMIT_S", 0.2)
+    target = fuzz.Target("planted", (b"x",), eat)
+    account, told = tmp_path / "account.jsonl", []
+    (row,) = fuzz.run([target], 8, 1, account, told.append)
+    assert (row["inputs"], row["read"], row["refused"], row["violations"]) == (8, 2, 1, 5)
+    for index, words in {
+        1: "KeyError",
+        2: "more than 0.2 s",
+        3: "300 MiB",
+        4: "process ended with 9",
+        5: "no message",
+    }.items():
+        assert any(text.startswith(f"planted {index}:") and words in text for text in told), (index, told)
+    assert fuzz.run([target], 8, 1, account, told.append) == [], "the account says that they were done"
+    entry = json.loads(account.read_text().splitlines()[0])
+    assert (entry["from"], entry["to"], entry["target"]) == (0, 8, "planted")
+
+
+def test_a_reader_that_breaks_its_promises_is_seen(fuzz: ModuleType) -> None:
+    vehicle = next(reader for reader in catalogue() if reader.name == "vehicle_out")
+    from tests.parsers.samples import VEHICLE_10
+
+    def spoilt(change: object) -> object:
+        def read(data: bytes, options: object) -> ReadResult:
+            result = vehicle.read(data, options)
+            (stream,) = result.streams
+            frame = stream.frame.copy()
+            change(frame)
+            return dataclasses.replace(result, streams=(dataclasses.replace(stream, frame=frame),))
+
+        return dataclasses.replace(vehicle, read=read)
+
+    assert fuzz._read_log(vehicle, False, VEHICLE_10, 0)
+    for change, words in (
+        (lambda frame: frame.__setitem__("line", 99), "a record of no line"),
+        (lambda frame: frame.__setitem__("flag", 0), "a flag that is no text"),
+        (lambda frame: frame.__setitem__("time", np.datetime64("NaT", "ns")), "a record without a time"),
+    ):
+        with pytest.raises(fuzz.ViolationError, match=words):
+            fuzz._read_log(spoilt(change), False, VEHICLE_10, 0)
+    beyond = vehicle.read(VEHICLE_10, fuzz.OPTIONS[0])
+    beyond.streams[0].frame["latitude_deg"] = 1e30
+    with pytest.raises(fuzz.ViolationError, match="latitude_deg beyond its range"):
+        fuzz.check_law(beyond, VEHICLE_10, False)
+    assert fuzz.check_law(limits.check(beyond), VEHICLE_10, False) is None

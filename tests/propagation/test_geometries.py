@@ -1,0 +1,83 @@
+"""Many geometries at once against one replay each."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.propagation.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.geometries import basis_fields, every_geometry, singular_values_of
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.site import Site, Tower
+
+CARRIER_HZ = 3.4e9
+HEIGHT_M = 12.0
+
+
+def poses(n=12):
+    rng = np.random.default_rng(0)
+    at = np.column_stack([rng.uniform(-300, 300, n), rng.uniform(-300, 300, n), rng.uniform(15, 60, n)])
+    return Poses(at, np.broadcast_to(np.eye(3), (n, 3, 3)))
+
+
+def some(how, ground):
+    return every_geometry(
+        [(315.0, 0.0, 90.0), (40.0, 10.0, 0.0)],
+        [(45.0, -45.0, 45.0, -45.0)],
+        [(45.0, -45.0, -45.0, 45.0), (0.0, 90.0, 20.0, -70.0)],
+        [ground],
+        [how],
+    )
+
+
+def test_equal_to_the_replay_with_those_arrays():
+    at = poses()
+    frame = SiteFrame(35.7275, -78.696)
+    site = Site("flat", frame, {"T": Tower("T", 35.7275, -78.696, 0.0, 0.0, HEIGHT_M)})
+    wavelength = 299792458.0 / CARRIER_HZ
+    tower, uav = tower_comparison_array(), uav_comparison_array(wavelength)
+    found = singular_values_of(some("coherent", 1.0), tower, site.towers["T"].position_m, uav, at, CARRIER_HZ)
+    for geometry, sigma in zip(some("coherent", 1.0), found, strict=True):
+        slanted = uav_comparison_array(wavelength, geometry.uav_yaw_deg, geometry.uav_roll_deg, geometry.uav_slant_deg)
+        if geometry.uav_pitch_deg:
+            from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
+
+            turn = np.radians([geometry.uav_yaw_deg, geometry.uav_pitch_deg, geometry.uav_roll_deg])
+            slanted = dataclasses.replace(slanted, mount=rotation_from_yaw_pitch_roll(*turn))
+        link = Link(CARRIER_HZ, {"T": tower_comparison_array(slant_deg=geometry.tower_slant_deg)}, slanted,
+                    uav_transmits=False)  # fmt: skip
+        h = replay(site, link, at, max_depth=1).h[:, 0]
+        np.testing.assert_allclose(sigma, np.linalg.svd(h, compute_uv=False), rtol=1e-8, atol=1e-15)
+
+
+def test_power_sum_is_the_mean_over_the_phases_of_the_ground_ray():
+    at = poses(5)
+    tower, uav = tower_comparison_array(), uav_comparison_array(0.0882)
+    centre = np.array([0.0, 0.0, HEIGHT_M])
+    (geometry, *_) = some("power_sum", 0.7)
+    (sigma, *_) = singular_values_of([geometry], tower, centre, uav, at, CARRIER_HZ)
+    from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
+    from aerpaw_cmp.propagation.geometries import slant_basis
+
+    turn = rotation_from_yaw_pitch_roll(*np.radians([geometry.uav_yaw_deg, 0.0, geometry.uav_roll_deg]))
+    los, ground = basis_fields(tower, centre, dataclasses.replace(uav, mount=turn), at, CARRIER_HZ)
+    left, right = slant_basis(geometry.uav_slant_deg), slant_basis(geometry.tower_slant_deg).T
+    mean = 0.0
+    for phase in np.exp(2j * np.pi * np.arange(8) / 8):
+        h = left @ (los + 0.7 * phase * ground) @ right
+        mean = mean + h @ np.conj(np.swapaxes(h, 1, 2)) / 8
+    np.testing.assert_allclose(sigma**2, np.linalg.eigvalsh(mean)[:, ::-1], rtol=1e-6, atol=1e-22)
+
+
+@pytest.mark.parametrize("how", ["coherent", "power_sum"])
+def test_no_ground_leaves_the_direct_ray(how):
+    at = poses(4)
+    tower, uav = tower_comparison_array(), uav_comparison_array(0.0882)
+    centre = np.array([0.0, 0.0, HEIGHT_M])
+    one, two = (list(singular_values_of(some(how, g), tower, centre, uav, at, CARRIER_HZ)) for g in (0.0, 1.0))
+    assert any(np.abs(a - b).max() > 1e-9 for a, b in zip(one, two, strict=True))
+    alone = list(singular_values_of(some("coherent", 0.0), tower, centre, uav, at, CARRIER_HZ))
+    for a, b in zip(one, alone, strict=True):
+        # roots of eigenvalues keep half of the digits
+        np.testing.assert_allclose(a, b, atol=1e-7 * b.max())

@@ -1,0 +1,85 @@
+"""The data of the linked views: what the script gets is what the record holds."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.report import explorer
+from aerpaw_cmp.report.data import Source
+
+
+def array(content, number):
+    stored = content["arrays"][number]
+    return np.frombuffer(base64.b64decode(stored["data"]), dtype="<" + stored["type"])
+
+
+def test_arrays_come_back_as_they_were(report_data):
+    content = json.loads(explorer.as_json(explorer.payload(report_data)))
+    for one, panel in zip(content["rss"], report_data.rss, strict=True):
+        assert array(content, one["measured"]) == pytest.approx(panel.measured_db, nan_ok=True, rel=1e-6)
+        assert array(content, one["models"][0]["level"]) == pytest.approx(panel.simulated_dbm, nan_ok=True, rel=1e-6)
+        assert [m["name"] for m in one["models"][1:]] == ["free space", "two-ray ground"]
+        assert one["of"] == len(panel.time)
+        assert np.diff(array(content, one["time"])).min() >= 0
+    for one, rank in zip(content["rank"], report_data.rank, strict=True):
+        assert array(content, one["measured"]) == pytest.approx(rank.measured, nan_ok=True)
+        best = rank.simulated[one["best"]]
+        assert best.total_variation == min(at.total_variation for at in rank.simulated)
+
+
+def test_equal_arrays_are_stored_once(report_data):
+    panel = report_data.rss[0]
+    twice = dataclasses.replace(report_data, rss=(panel, dataclasses.replace(panel, channel="copy")))
+    alone = dataclasses.replace(report_data, rss=(panel,))
+    assert len(explorer.payload(twice)["arrays"]) == len(explorer.payload(alone)["arrays"])
+
+
+def test_a_sample_names_its_log_and_line(report_data):
+    panel = report_data.rss[0]
+    n = len(panel.time)
+    source = Source(files=("a.txt", "b.txt"), file=np.arange(n) % 2, line=np.arange(n) + 7)
+    content = explorer.payload(dataclasses.replace(report_data, rss=(dataclasses.replace(panel, source=source),)))
+    one = content["rss"][0]
+    assert one["files"] == ["a.txt", "b.txt"]
+    assert array(content, one["line"])[3] == 10
+    assert array(content, one["file"])[3] == 1
+
+
+def test_long_series_are_thinned_with_their_extremes(report_data):
+    panel = report_data.rss[0]
+    n = 120_000
+    rng = np.random.default_rng(1)
+    level = rng.normal(-80, 5, n)
+    level[77_777] = -10.0
+    names = ("east_m", "north_m", "up_m", "simulated_dbm")
+    long = dataclasses.replace(
+        panel, time=panel.time[0] + np.arange(n) * np.timedelta64(100, "ms"), measured_db=level, geometry={}, baselines=(),
+        **{name: np.resize(getattr(panel, name), n) for name in names},
+    )  # fmt: skip
+    content = explorer.payload(dataclasses.replace(report_data, rss=(long,), rank=()))
+    one = content["rss"][0]
+    kept = array(content, one["measured"])
+    assert one["of"] == n
+    assert 10_000 < len(kept) <= explorer.POINTS + 2
+    assert kept.max() == np.float32(-10.0)
+    assert kept.min() == np.float32(level.min())
+    assert len(explorer.as_json(content)) < 8e6
+
+
+@settings(max_examples=50, deadline=None)
+@given(st.lists(st.floats(-1e3, 1e3) | st.just(float("nan")), min_size=1, max_size=300), st.integers(4, 80))
+def test_extremes_stay(values, limit):
+    array = np.array(values)
+    pick = explorer.keep_extremes([array], limit)
+    assert (np.diff(pick) > 0).all()
+    assert len(pick) <= max(limit, 2) + 2
+    if np.isfinite(array).any():
+        assert np.nanmax(array[pick]) == np.nanmax(array)
+        assert np.nanmin(array[pick]) == np.nanmin(array)

@@ -18,7 +18,7 @@ inputs and the foreign file have their bytes; the target is whole (its own SHA-2
 two clean runs write alike are compared), and there if it was there before; an error is exit code 3 with one message
 that names the output, and leaves no other file. What a kill left is cleared by the next run.
 
-``--plant`` writes in place, as the tool once did, to see the checks fail.
+In the end the first job is tried with a planted fault, writing in place as the tool once did: the checks must fail.
 """
 
 from __future__ import annotations
@@ -149,10 +149,10 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
         plates: Callable[..., Any] = room.plates
         room.plates = lambda data, _plates=plates: list(_plates(data))[:2]  # type: ignore[attr-defined]
     for room, name in ((run, "_replayed_and_compared"), (campaign, "run"), (coverage_map, "make_maps")):
-        setattr(room, name, _remembered(getattr(room, name), lambda *_: ""))
-    canvas.render = _remembered(canvas.render, lambda plate: str(plate.name))
-    export._legend = _remembered(export._legend, lambda layer, *_: str(layer.name))
-    typer_main.get_command = _remembered(typer_main.get_command, lambda *_: "")  # the options of all commands
+        setattr(room, name, _remembered(getattr(room, name), lambda *_, **__: ""))
+    canvas.render = _remembered(canvas.render, lambda plate, *_, **__: str(plate.name))
+    export._legend = _remembered(export._legend, lambda layer, *_, **__: str(layer.name))
+    typer_main.get_command = _remembered(typer_main.get_command, lambda *_, **__: "")  # the options of all commands
     for job in jobs.values():
         for variant in VARIANTS if job.kind == "folder" else ():
             _variant[0] = variant
@@ -474,7 +474,6 @@ def main() -> int:
     parser.add_argument("--kills", type=int, default=200, help="per command")
     parser.add_argument("--jobs", nargs="*", help="some of the commands")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--plant", action="store_true", help="write in place, to see the checks fail")
     parser.add_argument("--preloaded", type=Path, help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.preloaded is None:
@@ -491,8 +490,6 @@ def main() -> int:
         jobs = make_inputs(inputs)
         jobs = {name: job for name, job in jobs.items() if not arguments.jobs or name in arguments.jobs}
         compute_once(jobs, work / "first")
-    if arguments.plant:
-        plant()
     chance, total, everything = random.Random(arguments.seed), collections.Counter[str](), {}
     violations: list[str] = []
     for name, job in jobs.items():
@@ -501,15 +498,18 @@ def main() -> int:
             "calls": found.calls, "seconds_of_a_run": round(found.seconds, 3), **found.done,
             "violations": len(found.violations),
         }  # fmt: skip
-        if job.name in ("ingest", "report") and not arguments.plant:
+        if job.name in ("ingest", "report"):
             everything[name]["full_tmpfs"] = try_full_tmpfs(job, work, shim)
         print(name, json.dumps(everything[name]), file=sys.stderr, flush=True)
         total += found.done
         violations += found.violations
+    plant()
+    planted = try_job(next(iter(jobs.values())), inputs, work, shim, 20, chance)
     conditions = {"kills_per_command": arguments.kills, "seed": arguments.seed, "python": sys.version.split()[0]}
     result = {**conditions, "jobs": everything, "total": total, "violations": violations[:20], "n": len(violations)}
+    result["planted_fault"] = {"tried": sum(planted.done.values()), "violations": len(planted.violations)}
     print(json.dumps(result, indent=1))
-    return 1 if violations else 0
+    return 1 if violations or not planted.violations else 0
 
 
 if __name__ == "__main__":

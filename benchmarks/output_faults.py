@@ -210,8 +210,7 @@ class Runs:
         code = 70
         _variant[0] = variant
         try:
-            os.dup2(said, 1)
-            os.dup2(said, 2)
+            sys.stdout = sys.stderr = os.fdopen(os.dup(said), "w", encoding="utf-8")
             if limit is not None:
                 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
             at, kind, error, sticky, command = fault
@@ -220,6 +219,8 @@ class Runs:
             sys.stdout.flush()
             sys.stderr.flush()
             os.write(said, f"\ncalls {self.shim.fault_count()}\n".encode())
+        except BaseException as error:
+            os.write(said, f"{type(error).__name__}: {error}\n".encode())
         finally:
             os._exit(code)
 

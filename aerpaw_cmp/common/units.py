@@ -57,6 +57,23 @@ def power_from_db(level_db: ArrayLike) -> FloatArray:
     return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 10.0))
 
 
+def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
+    """20 log10 of a ratio of magnitudes (voltages, fields, singular values); zero gives -inf without a warning.
+
+    Examples
+    --------
+    >>> db_from_amplitude([10.0, 0.0]).tolist()
+    [20.0, -inf]
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(20.0 * np.log10(np.asarray(amplitude, dtype=np.float64)))
+
+
+def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
+    """Ratio of magnitudes of a level in dB."""
+    return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 20.0))
+
+
 def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:
     """Angle wrapped to [-180, 180) degrees."""
     return np.asarray((np.asarray(angle_deg, dtype=np.float64) + 180.0) % 360.0 - 180.0)

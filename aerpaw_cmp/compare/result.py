@@ -13,6 +13,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from .field_difference import FieldAudit
+from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .statistics import Interval, PairedDifference
@@ -276,6 +278,8 @@ class AuditResult:
     seconds: float = float("nan")
     reference_seconds: float = float("nan")
     note: str = ""
+    fields: FieldAudit | None = None
+    """Fields, paths and attitude against Sionna's own coefficients and a second implementation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -293,9 +297,13 @@ class EngineResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """Everything that was found about one flight; empty where it has no such series."""
+    """Everything that was found about one flight; empty where it has no such series.
+
+    ``ladder`` holds one row per model, tower and channel; none where it was not climbed.
+    """
 
     rss: tuple[RssResult, ...] = ()
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    ladder: tuple[LadderRow, ...] = ()

@@ -705,6 +705,19 @@ def repeatability(
     """Repeatability floor of two passes (two flights, or two parts of one); arguments as in :func:`same_places`.
 
     ``level_db`` (n,) and ``other_level_db`` (m,) are the levels [dB]; NaN is left out.
+
+    Parameters
+    ----------
+    position_m, other_position_m : (n, 3), (m, 3)
+        Places of the two passes.
+    level_db, other_level_db : (n,), (m,)
+        Levels [dB]; NaN is left out.
+    radius_m : float
+        Two samples nearer than this were taken at the same place.
+    heading_deg, other_heading_deg : (n,), (m,), optional
+        Headings; given both, those of a pair have to agree.
+    heading_within_deg : float
+        Within this.
     """
     heard, other_heard = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
     here, there = same_places(

@@ -292,7 +292,23 @@ def cluster_executor(address: str) -> Executor:
 
 
 def run_tasks(tasks: Sequence[Task], workers: int, cluster: str | None, progress: Progress) -> list[Outcome]:
-    """All tasks in order: here, in a pool of processes, or on a cluster."""
+    """All tasks in order: here, in a pool of processes, or on a cluster.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    workers : int
+        Processes; with one the tasks run here.
+    cluster : str, optional
+        Address of a Dask scheduler, in place of processes.
+    progress : Progress
+        Gets a line per finished task.
+
+    Returns
+    -------
+    list of Outcome
+        In the order of the tasks; what goes wrong in one is its failure.
+    """
     if cluster is None and workers <= 1:
         out = []
         for task in tasks:

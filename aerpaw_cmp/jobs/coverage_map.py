@@ -622,7 +622,23 @@ def _mean(values: AnyArray) -> float:
 
 
 def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], progress: Progress) -> list[Path]:
-    """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed."""
+    """layers.csv, layers.geojson, maps.json and maps.kmz; maps.nc and maps.tif where the libraries are installed.
+
+    Parameters
+    ----------
+    outcome : MapOutcome
+    folder : Path
+        Made when missing.
+    summary : mapping
+        Free entries of maps.json.
+    progress : Progress
+        Told of files that are left out, and why.
+
+    Returns
+    -------
+    list of Path
+        The files written.
+    """
     site, grid = outcome.site, outcome.shown.grid
     joint, every = _all_layers(outcome, towers_too=False), _all_layers(outcome, towers_too=True)
     names = {layer.name for layer in joint}

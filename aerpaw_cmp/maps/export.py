@@ -20,6 +20,7 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
+from ..common.jsonable import json_safe
 from ..common.units import AnyArray, FloatArray
 from .grid import Border, Grid, Layer
 
@@ -34,7 +35,18 @@ ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer]) -> Path:
-    """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers."""
+    """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    """
     import pandas as pd
 
     _check(grid, layers)
@@ -58,7 +70,20 @@ def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[L
 def write_json(
     path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer], summary: Mapping[str, Any] | None = None
 ) -> Path:
-    """Axes, layers (in index order, ``null`` out of coverage) and a free summary as one JSON object."""
+    """Axes, layers (in index order, ``null`` out of coverage) and a free summary as one JSON object.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    summary : mapping, optional
+        Anything that JSON can hold, once NaN is null.
+    """
     _check(grid, layers)
     content = {
         "origin": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
@@ -66,13 +91,13 @@ def write_json(
         "north_m": grid.north_m.tolist(),
         "spacing_m": grid.spacing_m,
         "order": "from the south-west corner, east first, then north",
-        "summary": _plain(dict(summary or {})),
+        "summary": json_safe(dict(summary or {})),
         "layers": {
             layer.name: {
                 "title": layer.title,
                 "unit": layer.unit,
                 "classes": list(layer.classes) or None,
-                "values": _plain(layer.values),
+                "values": json_safe(layer.values),
             }
             for layer in layers
         },
@@ -90,10 +115,25 @@ def write_geojson(
     towers_m: Mapping[str, Sequence[float]] | None = None,
     borders: Sequence[Border] = (),
 ) -> Path:
-    """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946)."""
+    """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946).
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    towers_m : mapping of str to (3,), optional
+        Positions of the towers, east, north, up.
+    borders : sequence of Border
+        Lines between the areas that two towers serve.
+    """
     _check(grid, layers)
     rings = _cell_corners(grid, frame)
-    columns = {layer.name: _plain(layer.values) for layer in layers}
+    columns = {layer.name: json_safe(layer.values) for layer in layers}
     features: list[dict[str, Any]] = [
         _feature(
             "Polygon",
@@ -152,7 +192,24 @@ def write_kmz(
     *,
     title: str = "Coverage and rank",
 ) -> Path:
-    """Ground overlays with one legend each (only the first is switched on), towers and serving borders."""
+    """Ground overlays with one legend each (only the first is switched on), towers and serving borders.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    towers_m : mapping of str to (3,), optional
+        Positions of the towers, east, north, up.
+    borders : sequence of Border
+        Lines between the areas that two towers serve.
+    title : str
+        Name of the document.
+    """
     _check(grid, layers)
     box = _bounding_box(grid, frame)
     parts = [_kml_overlay(layer, box, visible=number == 0) for number, layer in enumerate(layers)]
@@ -301,6 +358,18 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
 def write_netcdf(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer], title: str = "") -> Path:
     """NetCDF following CF-1.10: (north, east) grids in the site's azimuthal equidistant projection, with lat/lon.
 
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    title : str
+        Attribute of the file.
+
     Raises
     ------
     UsageError
@@ -367,6 +436,16 @@ def _cf_values(grid: Grid, layer: Layer) -> tuple[AnyArray, dict[str, Any]]:
 def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer]) -> Path:
     """GeoTIFF with one float32 band per layer (its name and unit in the tags), north up, NaN out of coverage.
 
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+
     Raises
     ------
     UsageError
@@ -416,22 +495,3 @@ def _check(grid: Grid, layers: Sequence[Layer]) -> None:
         raise ValueError(
             f"layers of the wrong shape: {wrong}, with the same name: {twice}; the grid has {len(grid)} cells"
         )
-
-
-def _plain(value: Any) -> Any:
-    """JSON's own types; what is not finite is null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            boxed = value.astype(object)
-            boxed[~np.isfinite(value)] = None
-            return boxed.tolist()
-        return value.tolist()
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value

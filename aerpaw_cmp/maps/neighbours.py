@@ -74,7 +74,9 @@ def nearest(
     tree = cKDTree(samples_m)
     for start in range(0, len(targets_m), CHUNK):
         part = np.arange(start, min(start + CHUNK, len(targets_m)))
-        _fill_nearest(tree, targets_m, part, radius_m, skip, index, distance)
+        _fill_nearest(
+            tree=tree, targets_m=targets_m, todo=part, radius_m=radius_m, skip=skip, index=index, distance=distance
+        )
     return Neighbours(index, distance)
 
 
@@ -137,6 +139,20 @@ def random_within(
     """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read.
 
     Parameters as in :func:`nearest`; ``seed`` fixes the draw, ``chunk`` bounds the memory and does not change it.
+
+    Parameters
+    ----------
+    samples_m, targets_m : (n, 2 or 3), (t, 2 or 3)
+        Positions.
+    m : int
+        Samples per target, at most.
+    radius_m : float
+    seed : int
+        Fixes the draw.
+    skip : (t,) int, optional
+        Sample that is not to be taken for a target (leave-one-out).
+    chunk : int
+        Targets at a time: bounds the memory and does not change the draw.
     """
     from scipy.spatial import cKDTree
 

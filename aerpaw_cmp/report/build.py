@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..common.jsonable import fields_of, json_safe
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray, IntArray, db_from_amplitude
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
@@ -80,6 +80,7 @@ def report_data(
         pairs=tuple(pair_panel(one) for one in result.pairs),
         extra_metrics=metrics_beyond_panels(result),
         engine=result.engine,
+        ladder=result.ladder,
         speed=tuple(speed),
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
@@ -234,7 +235,8 @@ def pair_panel(result: PairResult) -> record.ChannelPair:
 
 def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     """Numbers for metrics.json alone: tables of residuals, pairs of channels."""
-    found: dict[str, Any] = {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
+    found: dict[str, Any] = {"ladder": [json_safe(fields_of(row)) for row in result.ladder]} if result.ladder else {}
+    found |= {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
         merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
@@ -261,8 +263,8 @@ def _clock_entry(clock: ClockResult) -> dict[str, Any]:
 def rank_panel(result: RankResult) -> record.RankPanel:
     """The rank of one tower."""
     score, position = result.score, result.position_m
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio_db = 20.0 * np.log10(result.sigma[:, 1:] / result.sigma[:, :1])
+    with np.errstate(invalid="ignore"):  # no channel: 0 / 0
+        ratio_db = db_from_amplitude(result.sigma[:, 1:] / result.sigma[:, :1])
     return record.RankPanel(
         tower=result.tower,
         time=result.time,

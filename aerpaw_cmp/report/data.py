@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.ladder import LadderRow
 from ..compare.result import AuditResult, EngineResult
 from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
@@ -434,7 +435,7 @@ class ReportData:
         UTC, ISO 8601.
     versions : mapping of str to str
     inputs : tuple of InputFile
-    track, waypoints, rss, rank, pairs, engine, speed
+    track, waypoints, rss, rank, pairs, engine, ladder, speed
         See their classes.
     synthetic : bool
         The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
@@ -462,6 +463,7 @@ class ReportData:
     rank: tuple[RankPanel, ...] = ()
     pairs: tuple[ChannelPair, ...] = ()
     engine: EngineResult | None = None
+    ladder: tuple[LadderRow, ...] = ()
     speed: tuple[SpeedRow, ...] = ()
     synthetic: bool = False
     warnings: tuple[str, ...] = ()

@@ -140,6 +140,7 @@ def _engine_metrics(engine: Engine) -> dict[str, Any]:
             "extra_paths": audit.extra_paths,
             "rss_max_error_db": audit.rss_max_error_db,
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
+            "field": None if audit.fields is None else audit.fields.as_dict(),
             "seconds": audit.seconds,
             "reference_seconds": audit.reference_seconds,
         },

@@ -519,6 +519,9 @@ def bench(
     _table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
+    if result["report"]:
+        seconds = {name.removeprefix("seconds_"): value for name, value in result["report"].items()}
+        print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
 
 
 @site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")

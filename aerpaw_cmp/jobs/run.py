@@ -278,28 +278,44 @@ def run_bench(
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+        ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
     """
-    from ..propagation.bench import path_search, random_scene, speed_against_error
-    from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
+    from ..propagation.bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    found: dict[str, Any] = {}
-    if ratios:
-        progress("path search against PathSolver at 1e6 samples")
-        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
-        progress("Kriging against PyKrige")
-        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
-        progress("ingest against pandas")
-        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    found = _against_peers(progress) if ratios else {}
     return {
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None and "ratio" in value},
+        "report": found.get("report"),
         "details": found,
     }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """How many times faster than each peer; at equal error and with the same work on both sides first."""
+    from . import peer_ratios as peers
+
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = peers.path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = peers.kriging_shared_weights()
+    found: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige_c_27_fields": shared,
+        "kriging_vs_pykrige": peers.kriging_vs_pykrige(),
+    }
+    progress("ingest against pandas")
+    for lines, value in peers.ingest_at_sizes().items():
+        found["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
+    progress("a report, cold and warm")
+    found["report"] = peers.report_cold_and_warm()
+    return found
 
 
 def run_site_import(

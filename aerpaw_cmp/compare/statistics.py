@@ -402,7 +402,7 @@ def error_intervals(
 
 
 def _of_spread(residual: Autocorrelation, influence: Autocorrelation) -> Autocorrelation:
-    """Autocorrelation for a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
+    """Of a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
     return Autocorrelation(
         residual.n,
         max(residual.block_length, influence.block_length),

@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .field_difference import FieldAudit
+from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .statistics import Interval, PairedDifference
@@ -296,9 +297,13 @@ class EngineResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """Everything that was found about one flight; empty where it has no such series."""
+    """Everything that was found about one flight; empty where it has no such series.
+
+    ``ladder`` holds one row per model, tower and channel; none where it was not climbed.
+    """
 
     rss: tuple[RssResult, ...] = ()
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    ladder: tuple[LadderRow, ...] = ()

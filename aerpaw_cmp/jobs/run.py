@@ -114,12 +114,15 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
+    recommend: Path | None = None,
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
+
+    With ``recommend``, the flight file with the settings of the model that the ladder recommends is written there.
 
     Parameters
     ----------
@@ -128,6 +131,8 @@ def run_report(
         Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
         In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+    recommend : Path, optional
+        Where to write it.
     force : bool
         Replace what this tool did not write.
     figures : {"page", "none", "svg", "png", "pdf", "all"}
@@ -150,13 +155,32 @@ def run_report(
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
-    with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
+    with ExitStack() as outputs:
+        output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
+        target = None
+        if recommend is not None:
+            _beside(recommend, flight, logs_root)
+            target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
-        record = _replayed_and_compared(settings, flight, logs_root, stages)
+        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        if target is not None:
+            from .ladder import recommended_text
+
+            target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
+    """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
+    if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
+        raise UsageError(
+            f"--recommend in another folder than {flight}",
+            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
+            path=recommend,
+        )
 
 
 def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
@@ -179,7 +203,7 @@ def _texts(value: Any) -> Iterator[str]:
 
 
 def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
-    """The record of a report: read, replay, compare, audit."""
+    """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
     from ..flight.data import gather, read_logs
 
     with stages("read"):
@@ -188,7 +212,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    found = run_flight(data, stages)
+    found = run_flight(data, stages, ladder=True)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links:
@@ -201,7 +225,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .pose_paths import pose_paths
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(
+    record = report_data(
         data,
         found.result,
         speed=speed,
@@ -209,6 +233,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
         other_inputs=other_inputs(settings, flight, logs_root),
         paths=pose_paths(data, found.replays),
     )
+    return record, found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -264,28 +289,44 @@ def run_bench(
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+        ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
     """
-    from ..propagation.bench import path_search, random_scene, speed_against_error
-    from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
+    from ..propagation.bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    found: dict[str, Any] = {}
-    if ratios:
-        progress("path search against PathSolver at 1e6 samples")
-        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
-        progress("Kriging against PyKrige")
-        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
-        progress("ingest against pandas")
-        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    found = _against_peers(progress) if ratios else {}
     return {
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None and "ratio" in value},
+        "report": found.get("report"),
         "details": found,
     }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """How many times faster than each peer; at equal error and with the same work on both sides first."""
+    from . import peer_ratios as peers
+
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = peers.path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = peers.kriging_shared_weights()
+    found: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige_c_27_fields": shared,
+        "kriging_vs_pykrige": peers.kriging_vs_pykrige(),
+    }
+    progress("ingest against pandas")
+    for lines, value in peers.ingest_at_sizes().items():
+        found["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
+    progress("a report, cold and warm")
+    found["report"] = peers.report_cold_and_warm()
+    return found
 
 
 def run_site_import(

@@ -259,12 +259,14 @@ def test_a_lag_estimated_on_the_scored_samples_is_told(folder: Path) -> None:
     for name in OFFSETS_DB:
         settings = flight_settings(name, 1, YAW_DEG)
         settings["rss"]["lag"] = "apply"
+        settings["flight"]["plan"]["clock_shift_s"] = {"LW1": 1.5}
         (folder / f"apply_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
+        assert main(["simulate", str(folder / f"apply_{name}.yaml"), "-o", str(folder / "applied")]) == 0
     flights = ["apply_first.yaml", "apply_second.yaml"]
     campaign = load_campaign(
         write_campaign(folder, "apply", flights=flights, held_out={"fit": {YAW: [YAW_DEG]}, "fit_on": ["first"]})
     )
-    data = run(campaign, folder)
+    data = run(campaign, folder, logs_root=folder / "applied")
     (fold,) = data.held_out
     by = {(r.flight, r.channel): r.fitted for r in data.rss}
     assert {(r.flight, r.channel): r.own for r in fold.rows} == by

@@ -114,7 +114,7 @@ def rss_panel(result: RssResult) -> record.RssPanel:
         rmse_ci95_db=score.rmse_ci95_db,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.memory.n_effective,
+        n_effective=score.intervals.autocorrelation.n_effective,
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,

@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 
+from .units import AnyArray
+
 
 def number_key(number: float) -> str:
     """A number as a key of JSON, or as part of a column's name.
@@ -36,7 +38,7 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, Mapping):
         return {number_key(key) if isinstance(key, float) else str(key): json_safe(item) for key, item in value.items()}
     if isinstance(value, np.ndarray):
-        return json_safe(value.tolist() if value.dtype.kind != "M" else value.astype(str).tolist())
+        return _listed(value)
     if isinstance(value, (list, tuple, set, frozenset)):
         return [json_safe(item) for item in (sorted(value) if isinstance(value, (set, frozenset)) else value)]
     if isinstance(value, (bool, np.bool_)):
@@ -49,6 +51,14 @@ def json_safe(value: Any) -> Any:
     if isinstance(value, np.datetime64) and np.isnat(value):
         return None
     return value if value is None else str(value)
+
+
+def _listed(array: AnyArray) -> Any:
+    if array.dtype.kind == "f":  # large maps: one pass, not one call per number
+        boxed = array.astype(object)
+        boxed[~np.isfinite(array)] = None
+        return boxed.tolist()
+    return json_safe(array.tolist() if array.dtype.kind != "M" else array.astype(str).tolist())
 
 
 def fields_of(record: Any) -> dict[str, Any]:

@@ -26,6 +26,21 @@ MINIMUM_HEIGHT_M = 0.5
 """Poses below this height above ground are raised to it (arXiv 2502.10324, section V)."""
 
 
+THERMAL_NOISE_DBM_HZ = 10.0 * float(np.log10(1.380_649e-23 * 290.0)) + 30.0
+"""Thermal noise at 290 K [dBm in 1 Hz]: -173.98 (Boltzmann's constant: SI, exact)."""
+
+
+def noise_floor_dbm(bandwidth_hz: float, noise_figure_db: float = 0.0) -> float:
+    """Noise power of a receiver [dBm]: k T B F at 290 K (ITU-R P.372, eq. 1 to 4).
+
+    Examples
+    --------
+    >>> round(noise_floor_dbm(1e6, 5.0), 2)
+    -108.98
+    """
+    return THERMAL_NOISE_DBM_HZ + 10.0 * float(np.log10(bandwidth_hz)) + noise_figure_db
+
+
 def wavelength_m(frequency_hz: float) -> float:
     """Free-space wavelength [m] of a frequency [Hz]."""
     return SPEED_OF_LIGHT_MPS / frequency_hz
@@ -40,6 +55,23 @@ def db_from_power(power: ArrayLike) -> FloatArray:
 def power_from_db(level_db: ArrayLike) -> FloatArray:
     """Power ratio of a level in dB."""
     return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 10.0))
+
+
+def db_from_amplitude(amplitude: ArrayLike) -> FloatArray:
+    """20 log10 of a ratio of magnitudes (voltages, fields, singular values); zero gives -inf without a warning.
+
+    Examples
+    --------
+    >>> db_from_amplitude([10.0, 0.0]).tolist()
+    [20.0, -inf]
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.asarray(20.0 * np.log10(np.asarray(amplitude, dtype=np.float64)))
+
+
+def amplitude_from_db(level_db: ArrayLike) -> FloatArray:
+    """Ratio of magnitudes of a level in dB."""
+    return np.asarray(10.0 ** (np.asarray(level_db, dtype=np.float64) / 20.0))
 
 
 def wrap_degrees(angle_deg: ArrayLike) -> FloatArray:

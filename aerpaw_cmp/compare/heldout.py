@@ -143,9 +143,15 @@ def fit_held_out(
         n for n, x, v in zip(names, found, values, strict=True) if len(v) > 1 and n not in circular and _at_bound(x, v)
     ]
     return HeldOutFit(
-        fitted, tuple(train), tuple(test), {f: after[f] for f in train}, {f: after[f] for f in test},
-        {flight: rmse(objective(first, flight)) for flight in flights}, tuple(edge), calls,
-    )  # fmt: skip
+        parameters=fitted,
+        fitted_on=tuple(train),
+        applied_to=tuple(test),
+        train_rmse_db={f: after[f] for f in train},
+        test_rmse_db={f: after[f] for f in test},
+        start_rmse_db={flight: rmse(objective(first, flight)) for flight in flights},
+        at_bounds=tuple(edge),
+        evaluations=calls,
+    )
 
 
 def goes_round(values: Sequence[float] | FloatArray) -> bool:

@@ -445,7 +445,15 @@ def read_reference_powers(path: str | Path) -> list[ReferencePower]:
         except (ValueError, IndexError) as error:
             raise InputError(f"unreadable row: {error}", expected="numbers", path=path, line=line) from None
         found.append(
-            ReferencePower(row[0].lower(), row[1].lower(), row[2].lower(), amplifier, gain, frequencies, levels)
+            ReferencePower(
+                node=row[0].lower(),
+                category=row[1].lower(),
+                channel=row[2].lower(),
+                amplifier=amplifier,
+                gain_db=gain,
+                frequencies_hz=frequencies,
+                power_dbm=levels,
+            )
         )
     return found
 

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from .field_difference import FieldAudit
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .statistics import Interval, PairedDifference
@@ -276,6 +277,8 @@ class AuditResult:
     seconds: float = float("nan")
     reference_seconds: float = float("nan")
     note: str = ""
+    fields: FieldAudit | None = None
+    """Fields, paths and attitude against Sionna's own coefficients and a second implementation."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -198,23 +198,25 @@ def compare_rss(
     offsets, curve = offset_curve(m, s, step_db=step_db, span_db=span_db)
     simple = {name: _levels(levels) for name, levels in (baselines or {}).items()}
     return RssComparison(
-        fit.offset_db,
-        fit.rmse_db,
-        fit.n,
-        int((known & ~use).sum()),
-        int((known & ~np.isfinite(measured)).sum()),
-        int((known & ~np.isfinite(simulated)).sum()),
-        int((~known).sum()),
-        fit.at_edge,
-        correlation(m, s),
-        error_intervals(m, s, replicates=replicates, seed=seed),
-        identifiable_range(offsets, curve),
-        trimmed_offset(m, s, step_db=step_db, span_db=span_db),
-        {name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()},
-        {name: _rmse_interval(m, level[order], replicates, seed) for name, level in simple.items()},
-        lag_s,
-        (() if offset_db is not None else ("offset_db",)) + tuple(fitted_on_scored),
-        np.where(use, measured + fit.offset_db - simulated, np.nan),
+        offset_db=fit.offset_db,
+        rmse_db=fit.rmse_db,
+        n=fit.n,
+        n_out_of_coverage=int((known & ~use).sum()),
+        n_measured_out=int((known & ~np.isfinite(measured)).sum()),
+        n_simulated_out=int((known & ~np.isfinite(simulated)).sum()),
+        n_no_pose=int((~known).sum()),
+        at_edge=fit.at_edge,
+        correlation=correlation(m, s),
+        intervals=error_intervals(m, s, replicates=replicates, seed=seed),
+        identifiable_db=identifiable_range(offsets, curve),
+        trimmed=trimmed_offset(m, s, step_db=step_db, span_db=span_db),
+        baselines={
+            name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()
+        },
+        baseline_intervals={name: _rmse_interval(m, level[order], replicates, seed) for name, level in simple.items()},
+        lag_s=lag_s,
+        fitted_on_scored=(() if offset_db is not None else ("offset_db",)) + tuple(fitted_on_scored),
+        residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
     )
 
 
@@ -522,7 +524,15 @@ def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike |
     reach = np.where(np.isfinite(reach), reach, np.nan)
     total = float(np.sum((r - r.mean()) ** 2)) if len(r) else 0.0
     explained = 1.0 - float(np.sum(centred**2)) / total if total > 0 else float("nan")
-    return ResidualBins(limits, n, mean, np.sqrt(mean**2 + variance), mean - reach, mean + reach, explained)
+    return ResidualBins(
+        edges=limits,
+        n=n,
+        mean_db=mean,
+        rmse_db=np.sqrt(mean**2 + variance),
+        low_db=mean - reach,
+        high_db=mean + reach,
+        explained=explained,
+    )
 
 
 def _edges(values: FloatArray, edges: ArrayLike | int) -> FloatArray:
@@ -626,11 +636,16 @@ def error_spans(
         centre = () if place is None else tuple(float(v) for v in place[a:b].mean(axis=0))
         found.append(
             ErrorSpan(
-                float(t[a]), float(t[b - 1]), int(b - a), float(part.mean()),
-                float(part[np.argmax(np.abs(part))]), centre, _likely_cause(where, slice(a, b), float(part.mean())),
-                {name: _typical(values[a:b]) for name, values in where.items()},
+                start_s=float(t[a]),
+                end_s=float(t[b - 1]),
+                n=int(b - a),
+                mean_db=float(part.mean()),
+                worst_db=float(part[np.argmax(np.abs(part))]),
+                position_m=centre,
+                cause=_likely_cause(where, slice(a, b), float(part.mean())),
+                geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )
-        )  # fmt: skip
+        )
     found.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
     return found[:largest]
 
@@ -720,7 +735,9 @@ def channel_difference(
     ok = np.isfinite(one) & np.isfinite(two)
     if not ok.any():
         nan = float("nan")
-        return ChannelDifference(0, nan, nan, nan, nan, NO_INTERVAL, [])
+        return ChannelDifference(
+            n=0, mean_db=nan, std_db=nan, correlation=nan, share_parted=nan, interval_std_db=NO_INTERVAL, spans=[]
+        )
     difference = one - two
     mean = float(difference[ok].mean())
     residual = difference - mean
@@ -728,11 +745,11 @@ def channel_difference(
         time_s, residual, position_m=position_m, context=context, window_s=window_s, threshold_db=part_db
     )
     return ChannelDifference(
-        int(ok.sum()),
-        mean,
-        float(residual[ok].std()),
-        correlation(one, two),
-        float(np.mean(np.abs(residual[ok]) > part_db)),
-        error_intervals(two[ok], one[ok]).rmse_db,
-        spans,
+        n=int(ok.sum()),
+        mean_db=mean,
+        std_db=float(residual[ok].std()),
+        correlation=correlation(one, two),
+        share_parted=float(np.mean(np.abs(residual[ok]) > part_db)),
+        interval_std_db=error_intervals(two[ok], one[ok]).rmse_db,
+        spans=spans,
     )

@@ -308,16 +308,20 @@ def _checked(
             return doubt(f"with the antennas' patterns free it is {free.radio_minus_telemetry_s:+.1f} s")
     held_out = _held_out(list(heard.values()), found, lags)
     found = replace(found, held_out=held_out)
-    if held_out.better:
-        return found
     low, high = found.ci95_s
-    if low <= 0.0 <= high or abs(lag) <= _NO_MATTER_S:
+    none = low <= 0.0 <= high or abs(lag) <= _NOT_RESOLVED_S
+    if held_out.better and not none:
+        return found
+    if none or abs(lag) <= _NO_MATTER_S:
         return replace(found, verdict="agree", reason="no difference that matters: nothing to correct")
     return doubt(
         f"correcting it lowers the error of {held_out.improved} of {held_out.blocks} blocks kept out, by "
         f"{-held_out.paired.difference_db:.2f} dB in all"
     )
 
+
+_NOT_RESOLVED_S = 0.05
+"""A difference that no telemetry of one row a second resolves [s]."""
 
 _NO_MATTER_S = 0.2
 """A smaller difference moves a UAV at 10 m/s by less than the error of its position [s]."""

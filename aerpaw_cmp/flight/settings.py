@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from ..common.errors import UsageError
-from ..common.units import FloatArray, wavelength_m
+from ..common.units import FloatArray, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import load_yaml
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
@@ -154,9 +154,28 @@ class LinkSettings(Settings):
     carrier_hz: Positive
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
+    noise_floor_dbm: float | None = None
+    """Below it a link is out of coverage; by default from ``bandwidth_hz`` and ``noise_figure_db``."""
+    bandwidth_hz: Positive | None = None
+    noise_figure_db: float | None = None
     tower: ArraySettings = ArraySettings()
     towers: dict[str, ArraySettings] = {}
     uav: ArraySettings = ArraySettings()
+
+    @model_validator(mode="after")
+    def _one_floor(self) -> LinkSettings:
+        if self.noise_floor_dbm is not None and (self.bandwidth_hz is not None or self.noise_figure_db is not None):
+            raise ValueError("noise_floor_dbm or bandwidth_hz with noise_figure_db, not both")
+        if self.noise_figure_db is not None and self.bandwidth_hz is None:
+            raise ValueError("noise_figure_db needs bandwidth_hz")
+        return self
+
+    @property
+    def floor_dbm(self) -> float:
+        """Noise floor of the receiver [dBm]: given, of its bandwidth, or that of 1 Hz."""
+        if self.noise_floor_dbm is not None:
+            return self.noise_floor_dbm
+        return noise_floor_dbm(self.bandwidth_hz or 1.0, self.noise_figure_db or 0.0)
 
     def build(self, tower_names: list[str], folder: Path) -> Link:
         """The link to the named towers."""
@@ -168,6 +187,7 @@ class LinkSettings(Settings):
             uav_array=self.uav.build(wavelength, folder),
             transmit_power_dbm=self.transmit_power_dbm,
             uav_transmits=self.uav_transmits,
+            noise_floor_dbm=self.floor_dbm,
         )
 
 

@@ -6,22 +6,18 @@ A new number of a tower and channel is a field of ``RssFurther`` there and a fun
 
 from __future__ import annotations
 
-import math
 from collections.abc import Mapping, Sequence
 from itertools import combinations
 from typing import Any
 
 import numpy as np
 
-from ..common.stages import Progress, silent
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
 from ..compare.result import (
-    AuditResult,
     Censored,
-    EngineResult,
     ExpectedOffset,
     Fit,
     FlightResult,
@@ -35,11 +31,10 @@ from ..compare.result import (
 )
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.settings import RssSettings, RtSettings
-from ..propagation.audit import audit
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .levels import Levels, at_samples, levels_of
-from .replay import FlightReplay, Replayed, direct_foliage_m, path_loss, reflecting_crowns
+from .replay import FlightReplay, Replayed, direct_foliage_m
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -450,79 +445,3 @@ def _repeated_rank(
             other_heading_deg=None if turned is None else turned[late],
         )
     return found
-
-
-# --- audit ---------------------------------------------------------------------------------------------------------
-
-
-def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
-    """The engine record, with the audit by the other engine where ``rt.audit_links`` asks for one."""
-    rt = data.settings.rt
-    return EngineResult(
-        engine=rt.engine,
-        links=sum(len(r.poses) for r in replays),
-        seconds=sum(r.replay.seconds for r in replays),
-        paths=sum(len(r.replay.paths) for r in replays),
-        settings={
-            "max_depth": rt.max_depth,
-            "samples": rt.samples,
-            "attitude": rt.attitude,
-            "foliage": rt.foliage,
-            **_crown_settings(rt, replays),
-        },
-        left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
-        audit=_audit(data.site, rt, data.settings.rank.k, replays, progress) if rt.audit_links else None,
-    )
-
-
-def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
-    """Whether opaque crowns reflect, and how many paths bounce off one."""
-    if rt.foliage != "opaque":
-        return {}
-    bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
-    return {"crown_reflections": rt.crown_reflections, "paths_off_crowns": bounced}
-
-
-def _audit(
-    site: Site, rt: RtSettings, ks: Sequence[float], replays: Sequence[Replayed], progress: Progress
-) -> AuditResult | None:
-    """One audit over all series: links are shared out in proportion to their poses."""
-    total = sum(len(r.poses) for r in replays)
-    parts = []
-    for replayed in replays:
-        count = len(replayed.poses)
-        links = min(count, math.ceil(rt.audit_links * count / max(total, 1)))
-        if links == 0:
-            continue
-        progress(f"audit {replayed.replay.towers[0]}: {links} links")
-        parts.append(
-            audit(
-                site,
-                replayed.link,
-                replayed.poses,
-                replayed.replay,
-                links=links,
-                max_depth=rt.max_depth,
-                samples=rt.samples,
-                batch=rt.batch,
-                loss=path_loss(site.trees, rt, replayed.link.carrier_hz),
-                crowns=reflecting_crowns(site.trees, rt),
-                cache_dir=None if rt.cache else "",
-                ks=ks,
-            )
-        )
-    if not parts:
-        return None
-    errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
-    links = sum(p.links for p in parts)
-    return AuditResult(
-        reference=parts[0].reference,
-        links=links,
-        missing_paths=sum(p.missing_paths for p in parts),
-        extra_paths=sum(p.extra_paths for p in parts),
-        rss_max_error_db=max(errors, default=float("nan")),
-        rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
-        seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
-        reference_seconds=sum(p.reference_seconds for p in parts),
-        note="The time of the engine is its share for the audited links; that of the reference includes its start-up.",
-    )

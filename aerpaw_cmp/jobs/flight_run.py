@@ -13,7 +13,8 @@ from dataclasses import dataclass
 from ..common.stages import Stages
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
-from .compare_flight import audit_replays, compare_flight
+from .audit_flight import audit_replays
+from .compare_flight import compare_flight
 from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
 
 

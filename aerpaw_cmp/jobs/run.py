@@ -173,10 +173,18 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
 
             speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
     from ..report.build import report_data
+    from .manifest import other_inputs
     from .pose_paths import pose_paths
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(data, found.result, speed=speed, notes=notes, paths=pose_paths(data, found.replays))
+    return report_data(
+        data,
+        found.result,
+        speed=speed,
+        notes=notes,
+        other_inputs=other_inputs(settings, flight, logs_root),
+        paths=pose_paths(data, found.replays),
+    )
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -206,6 +214,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
+    failed += [f"audit of the field: {text}" for text in (audit.get("field") or {}).get("failures", ())]
     return tuple(failed)
 
 

@@ -57,7 +57,7 @@ def evaluate(
 def level_dbm(link: Link, fields: Fields, field: RssField) -> FloatArray:
     """RSS (poses,) of the one tower of a series, coherent or power sum as ``rss.field`` says [dBm]."""
     power = fields.power if field == "power" else mean_pair_power(fields.h)
-    return rss_dbm(power, link.transmit_power_dbm)[:, 0]
+    return rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm)[:, 0]
 
 
 def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssField) -> dict[str, FloatArray]:

@@ -72,7 +72,7 @@ FEW_SHARE = 0.01
 FEW_ROWS = 3
 """At most this share, or this many, are "a few"."""
 
-UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports")
+UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number")
 """Flags of rows that no comparison scores. (The other flags void the doubtful value itself.)"""
 
 

@@ -209,7 +209,9 @@ class _Projection:
         """One exponential as a degenerate pair: c1 = 0."""
         rate = -float(np.exp(log_rate))
         rmse = float(np.sqrt(self._single_cost(log_rate) / len(self.d)))
-        return BiExponential(0.0, rate, self._single_amplitude(log_rate), rate, rmse, True, message)
+        return BiExponential(
+            c1=0.0, c2=rate, c3=self._single_amplitude(log_rate), c4=rate, rmse=rmse, degenerate=True, message=message
+        )
 
     def judge(self, log_rates: FloatArray) -> BiExponential:
         """The fit with a verdict on whether two exponentials are in the data."""
@@ -234,7 +236,9 @@ class _Projection:
         if -c4 * self.d.max() < 1e-3 or log_rates[1] < self.log_rates[0] + 1e-3:
             reasons.append("the slow rate is too small to tell from 0: the tail is flat over the data")
         rmse = float(np.sqrt(cost / n))
-        return BiExponential(c1, c2, c3, c4, rmse, bool(reasons), "; ".join(reasons))
+        return BiExponential(
+            c1=c1, c2=c2, c3=c3, c4=c4, rmse=rmse, degenerate=bool(reasons), message="; ".join(reasons)
+        )
 
 
 def _candidate_amplitudes(basis: FloatArray, target: FloatArray, low: float, high: float, total: float) -> FloatArray:

@@ -7,7 +7,7 @@ without an estimate is counted as ``unpredicted`` and not averaged in.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -90,11 +90,6 @@ def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayL
     data = np.asarray(values, dtype=np.float64)
     estimate, variance = model.fit(points_m, data.reshape(len(data), -1)).leave_one_out()
     return estimate.reshape(data.shape), variance.reshape(data.shape)
-
-
-def leave_one_out_table(models: Mapping[str, Predictor], points_m: ArrayLike, values: ArrayLike) -> dict[str, Score]:
-    """Leave-one-out of several interpolators on the same samples."""
-    return {name: leave_one_out(model, points_m, values) for name, model in models.items()}
 
 
 def held_out_estimate(

@@ -20,6 +20,7 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
+from ..common.jsonable import json_safe
 from ..common.units import AnyArray, FloatArray
 from .grid import Border, Grid, Layer
 
@@ -66,13 +67,13 @@ def write_json(
         "north_m": grid.north_m.tolist(),
         "spacing_m": grid.spacing_m,
         "order": "from the south-west corner, east first, then north",
-        "summary": _plain(dict(summary or {})),
+        "summary": json_safe(dict(summary or {})),
         "layers": {
             layer.name: {
                 "title": layer.title,
                 "unit": layer.unit,
                 "classes": list(layer.classes) or None,
-                "values": _plain(layer.values),
+                "values": json_safe(layer.values),
             }
             for layer in layers
         },
@@ -93,7 +94,7 @@ def write_geojson(
     """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946)."""
     _check(grid, layers)
     rings = _cell_corners(grid, frame)
-    columns = {layer.name: _plain(layer.values) for layer in layers}
+    columns = {layer.name: json_safe(layer.values) for layer in layers}
     features: list[dict[str, Any]] = [
         _feature(
             "Polygon",
@@ -416,22 +417,3 @@ def _check(grid: Grid, layers: Sequence[Layer]) -> None:
         raise ValueError(
             f"layers of the wrong shape: {wrong}, with the same name: {twice}; the grid has {len(grid)} cells"
         )
-
-
-def _plain(value: Any) -> Any:
-    """JSON's own types; what is not finite is null."""
-    if isinstance(value, Mapping):
-        return {str(key): _plain(item) for key, item in value.items()}
-    if isinstance(value, list | tuple):
-        return [_plain(item) for item in value]
-    if isinstance(value, np.ndarray):
-        if value.dtype.kind == "f" and not np.isfinite(value).all():
-            boxed = value.astype(object)
-            boxed[~np.isfinite(value)] = None
-            return boxed.tolist()
-        return value.tolist()
-    if isinstance(value, float | np.floating):
-        return float(value) if np.isfinite(value) else None
-    if isinstance(value, np.integer | np.bool_):
-        return value.item()
-    return value

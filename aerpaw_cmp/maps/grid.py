@@ -216,12 +216,6 @@ def without_coverage_as_nan(rank: ArrayLike) -> FloatArray:
     return np.where(array > 0, array, np.nan)
 
 
-def coverage_share(covered: ArrayLike) -> float:
-    """Share of positions with coverage (bool array), the paper's probability of coverage; NaN for no position."""
-    array = np.asarray(covered, dtype=bool)
-    return float(array.mean()) if array.size else float("nan")
-
-
 def class_shares(rank: ArrayLike, highest: int = 4) -> FloatArray:
     """Shares of the classes Z (0), 1, ..., ``highest`` among ranks; shape (highest + 1,), sum 1."""
     counts = np.bincount(np.asarray(rank, dtype=np.int64).ravel(), minlength=highest + 1)

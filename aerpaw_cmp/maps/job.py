@@ -13,7 +13,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -195,9 +195,20 @@ def map_job(
     half = grid.spacing_m / 2
     borders = voronoi_borders(places, (area[0] - half, area[1] + half, area[2] - half, area[3] + half))
     return MapResult(
-        grid, names, places, at["rss"], at["rank"], tuple(map(float, ks)), rss[0], rss[1], rank, ratio[0], ratio[1],
-        serving_tower(grid.points_m, places), borders,
-    )  # fmt: skip
+        grid=grid,
+        tower_names=names,
+        towers_m=places,
+        rss_altitudes_m=at["rss"],
+        rank_altitudes_m=at["rank"],
+        ks=tuple(map(float, ks)),
+        rss_siso_dbm=rss[0],
+        rss_mimo_dbm=rss[1],
+        rank=rank,
+        spread_db=ratio[0],
+        condition_db=ratio[1],
+        serving=serving_tower(grid.points_m, places),
+        borders=borders,
+    )
 
 
 def rank_of_singular_values(singular_values: ArrayLike, ks: Sequence[float]) -> IntArray:
@@ -220,17 +231,6 @@ def _check(found: Evaluation, n: int, towers: int) -> None:
     shapes = found.rss_siso_dbm.shape, found.rss_mimo_dbm.shape, found.singular_values.shape[:2]
     if set(shapes) != {(n, towers)}:
         raise ValueError(f"the engine returned shapes {shapes} for {n} positions and {towers} towers")
-
-
-def empirical_cdf(values: ArrayLike) -> tuple[FloatArray, FloatArray]:
-    """Distribution function of a map as (value, share of positions at or below).
-
-    Positions out of coverage count as below every value: the curve starts at their share.
-    """
-    array = np.asarray(values, dtype=np.float64).ravel()
-    finite = np.sort(array[np.isfinite(array)])
-    out = array.size - finite.size
-    return finite, (out + np.arange(1, finite.size + 1)) / max(array.size, 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -313,46 +313,3 @@ def _label(tower: str | None) -> tuple[str, str]:
 def _in_name(number: float, digits: int = 3) -> str:
     """030 for 30, 12p5 for 12.5."""
     return f"{number:0{digits}.0f}" if float(number).is_integer() else f"{number:g}".replace(".", "p").replace("+", "")
-
-
-def summary_of(result: MapResult) -> dict[str, Any]:
-    """Numbers of the maps for ``metrics.json`` and ``--json``; NaN becomes null in :mod:`~aerpaw_cmp.maps.export`."""
-    rows, columns = result.grid.shape
-    content: dict[str, Any] = {
-        "grid": {"positions": len(result.grid), "rows": rows, "columns": columns, "spacing_m": result.grid.spacing_m},
-        "towers": {
-            name: {"served": int((result.serving == i).sum()), "position_m": result.towers_m[i]}
-            for i, name in enumerate(result.tower_names)
-        },
-        "rss": {tower or "joint": _rss_summary(result, tower) for tower in (None, *result.tower_names)},
-        "rank": {tower or "joint": _rank_summary(result, tower) for tower in (None, *result.tower_names)},
-    }
-    return content
-
-
-def _rss_summary(result: MapResult, tower: str | None) -> dict[str, Any]:
-    found: dict[str, Any] = {}
-    kinds: tuple[Antennas, ...] = ("siso", "mimo")
-    for antennas in kinds:
-        found[antennas] = []
-        for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
-            covered = values[np.isfinite(values)]
-            low, middle, high = np.percentile(covered, [10, 50, 90]) if covered.size else [np.nan] * 3
-            row = {"altitude_m": height, "coverage": covered.size / max(values.size, 1)}
-            row |= {
-                "out_of_coverage": values.size - covered.size,
-                "p10_dbm": low,
-                "median_dbm": middle,
-                "p90_dbm": high,
-            }
-            found[antennas].append(row)
-    return found
-
-
-def _rank_summary(result: MapResult, tower: str | None) -> list[dict[str, Any]]:
-    shares = result.rank_shares(tower)
-    return [
-        {"altitude_m": height, "k": k, "shares": dict(zip(class_names(HIGHEST_RANK), shares[row, column], strict=True))}
-        for row, height in enumerate(result.rank_altitudes_m)
-        for column, k in enumerate(result.ks)
-    ]

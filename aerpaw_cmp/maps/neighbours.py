@@ -74,7 +74,9 @@ def nearest(
     tree = cKDTree(samples_m)
     for start in range(0, len(targets_m), CHUNK):
         part = np.arange(start, min(start + CHUNK, len(targets_m)))
-        _fill_nearest(tree, targets_m, part, radius_m, skip, index, distance)
+        _fill_nearest(
+            tree=tree, targets_m=targets_m, todo=part, radius_m=radius_m, skip=skip, index=index, distance=distance
+        )
     return Neighbours(index, distance)
 
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import Any, Literal
+from dataclasses import dataclass, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -19,6 +19,7 @@ from .evaluate import (
     blocked,
     interval_coverage,
     learning_curve,
+    leave_one_out,
     leave_one_out_estimate,
     score,
 )
@@ -132,7 +133,7 @@ def interpolation_study(
         "serving-tower mean": ServingTowerMean(towers_m),
     }
     scores = {"Kriging": score(values, estimate)}
-    scores |= {name: score(values, leave_one_out_estimate(peer, points, values)[0]) for name, peer in peers.items()}
+    scores |= {name: leave_one_out(peer, points, values) for name, peer in peers.items()}
     sill = kriging.sill_.reshape(values.shape[1:])
     relative = np.where(sill > 0, variance / np.where(sill > 0, sill, 1.0), np.nan)
     return Study(
@@ -236,17 +237,3 @@ def honest_study(
         sizes,
         learning_curve(wide, points, values, sizes, seed=seed),
     )
-
-
-def summary_of_study(study: Study, honest: HonestStudy | None = None) -> dict[str, Any]:
-    """Numbers of the studies for ``metrics.json`` and ``--json``; NaN becomes null in the export."""
-    content: dict[str, Any] = {
-        "correlation": asdict(study.correlation),
-        "fit": asdict(study.fit),
-        "leave_one_out": {name: asdict(found) for name, found in study.scores.items()},
-        "intervals": asdict(study.intervals),
-        "intervals_paper": asdict(study.intervals_paper),
-    }
-    if honest is not None:
-        content["honest"] = asdict(honest)
-    return content

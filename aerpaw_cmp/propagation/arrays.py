@@ -13,7 +13,7 @@ from typing import Protocol
 
 import numpy as np
 
-from ..common.units import ComplexArray, FloatArray
+from ..common.units import THERMAL_NOISE_DBM_HZ, ComplexArray, FloatArray
 from ..site.antennas import Isotropic as Isotropic
 
 
@@ -83,7 +83,8 @@ class Link:
     """Radio settings of a replay.
 
     ``tower_arrays`` maps tower names to arrays, in replay order. The channel matrix is always
-    ``(n_rx, n_tx)``; ``uav_transmits`` decides which end is which.
+    ``(n_rx, n_tx)``; ``uav_transmits`` decides which end is which. A link received below ``noise_floor_dbm`` is out of
+    coverage; by default that is the thermal noise of 1 Hz, which no receiver hears beneath.
     """
 
     carrier_hz: float
@@ -91,6 +92,7 @@ class Link:
     uav_array: Array
     transmit_power_dbm: float = 40.0
     uav_transmits: bool = True
+    noise_floor_dbm: float = THERMAL_NOISE_DBM_HZ
 
 
 def rotation_from_yaw_pitch_roll(yaw_rad: FloatArray, pitch_rad: FloatArray, roll_rad: FloatArray) -> FloatArray:

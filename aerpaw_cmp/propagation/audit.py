@@ -1,4 +1,4 @@
-"""One engine checked against the other on a spread of links."""
+"""One engine checked against the other on a spread of links, and its fields against two references."""
 
 from __future__ import annotations
 
@@ -9,13 +9,18 @@ from pathlib import Path
 import numpy as np
 
 from ..common.units import FloatArray, IntArray
+from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Link, Poses
 from .crowns import Crowns
+from .field_audit import REFERENCE_LINKS, Expected, against_reference, against_sionna, impossible, spread_over_paths
 from .image import planes_of
 from .paths import PathSet, joined
 from .tracer import Engine, Loss, Replay
 from .tracer import replay as run_replay
+
+FIELD_SAMPLES = 100_000
+"""Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them."""
 
 RANK_K = (10.0, 100.0, 1000.0)
 """Singular-value ratios of the paper."""
@@ -60,6 +65,8 @@ class Audit:
     seconds, reference_seconds : float
         Time of the replay (all its links) and of the reference on the checked links; a reference whose paths came
         from the cache counts with the time its search once took.
+    field : FieldAudit or None
+        Of the fields, where one was asked for.
     """
 
     engine: str
@@ -68,6 +75,7 @@ class Audit:
     difference: Difference
     seconds: float
     reference_seconds: float
+    field: FieldAudit | None = None
 
     @property
     def missing_paths(self) -> int:
@@ -105,6 +113,7 @@ class Audit:
             "rank_disagreement": {f"{k:g}": share for k, share in d.rank_disagreement.items()},
             "seconds": self.seconds,
             "reference_seconds": self.reference_seconds,
+            "field": None if self.field is None else self.field.as_dict(),
         }
 
 
@@ -123,6 +132,9 @@ def audit(
     crowns: Crowns | None = None,
     cache_dir: str | Path | None = None,
     ks: Sequence[float] = RANK_K,
+    expected: Expected | None = None,
+    reference_links: int = REFERENCE_LINKS,
+    complete: bool = True,
 ) -> Audit:
     """Check a replay by another engine, on the whole scene (nothing left out).
 
@@ -140,6 +152,12 @@ def audit(
         As given to the replay.
     ks : sequence of float
         Singular-value ratios of the rank comparison.
+    expected : Expected, optional
+        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.field_audit`).
+    reference_links : int
+        Poses that the second implementation computes.
+    complete : bool
+        Whether the replay claims to have every path.
 
     Returns
     -------
@@ -160,7 +178,19 @@ def audit(
         crowns=crowns,
         cache_dir=cache_dir,
     )
+    field = None
+    if expected is not None:
+        few_kinds = spread_over_paths(replay, chosen, reference_links)
+        field = against_reference(
+            site, poses, replay, few_kinds, expected, ks=ks, max_depth=max_depth, complete=complete
+        )
+        field += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
+        field += against_sionna(
+            site, link, poses, replay, chosen, expected,
+            max_depth=max_depth, samples=min(samples, FIELD_SAMPLES), batch=batch, complete=complete,
+        )  # fmt: skip
     return Audit(
+        field=field,
         engine=replay.engine,
         reference=other,
         links=len(chosen) * len(replay.towers),
@@ -182,8 +212,8 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
     """Differences of a replay from a reference that has only the poses ``chosen``."""
     # numbered together: the facets of crowns that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
-    ours = _keys(replay, plane[0], chosen)
-    theirs = _keys(reference, plane[1], np.arange(len(chosen)))
+    ours = set(_keys(replay, plane[0], chosen))
+    theirs = set(_keys(reference, plane[1], np.arange(len(chosen))))
     level, level_reference = replay.rss_dbm[chosen], reference.rss_dbm
     both = np.isfinite(level) & np.isfinite(level_reference)
     error = np.abs(level[both] - level_reference[both])
@@ -204,15 +234,23 @@ def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dic
     return {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference, k))) for k in ks}  # type: ignore[arg-type]
 
 
-def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> set[tuple[int, ...]]:
-    """Paths as (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
+def extra_rows(replay: Replay, reference: Replay, chosen: IntArray) -> IntArray:
+    """Paths of a replay that the reference, which has only the poses ``chosen``, has not."""
+    plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
+    theirs = set(_keys(reference, plane[1], np.arange(len(chosen))))
+    return np.array([row for key, row in _keys(replay, plane[0], chosen).items() if key not in theirs], dtype=np.int64)
+
+
+def _keys(replay: Replay, planes: IntArray, chosen: IntArray) -> dict[tuple[int, ...], int]:
+    """Rows of paths by (place in ``chosen``, tower, planes): coplanar faces are the same mirror."""
     place = np.full(int(max(chosen.max(initial=-1), replay.paths.pose.max(initial=-1))) + 1, -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
-    paths: PathSet = replay.paths.select(place[replay.paths.pose] >= 0)
+    index = np.flatnonzero(place[replay.paths.pose] >= 0)
+    paths: PathSet = replay.paths.select(index)
     plane = np.append(planes, -1)
     rows = np.column_stack([place[paths.pose], paths.tower, plane[paths.faces]])
     # without the padding: the two may have different depths
-    return {tuple(n for n in row if n >= 0) for row in rows.tolist()}
+    return {tuple(n for n in row if n >= 0): int(at) for row, at in zip(rows.tolist(), index, strict=True)}
 
 
 def _number(value: float | FloatArray) -> float | None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray, wavelength_m
+from ..common.units import FloatArray, db_from_amplitude, wavelength_m
 from ..site.materials import material
 from .channel import reflection_coefficients
 
@@ -28,7 +28,7 @@ def free_space_dbm(
     """
     distance = np.linalg.norm(targets_m[:, None, :] - sources_m[None, :, :], axis=2)
     with np.errstate(divide="ignore"):
-        return np.asarray(transmit_power_dbm + 20.0 * np.log10(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
+        return np.asarray(transmit_power_dbm + db_from_amplitude(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
 
 
 def two_ray_dbm(
@@ -82,7 +82,7 @@ def two_ray_dbm(
         # the difference of the two lengths, without cancellation
         extra = 4.0 * high * low / (bounced + direct)
         field = 1.0 / direct + gamma / bounced * np.exp(-2j * np.pi * extra / wavelength)
-        level = transmit_power_dbm + 20.0 * np.log10(wavelength / (4.0 * np.pi) * np.abs(field))
+        level = transmit_power_dbm + db_from_amplitude(wavelength / (4.0 * np.pi) * np.abs(field))
     return np.asarray(np.where(high >= 0.0, level, np.nan))
 
 

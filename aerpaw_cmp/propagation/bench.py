@@ -153,7 +153,15 @@ class _Runner:
             result = replay(self.site, self.link, self.poses, max_depth=depth)
         difference = compare(result, self.reference, self.all, self.ks)
         return self._row(
-            "image", None, "float64", depth, 1, result.seconds, memory.peak_mib, difference, len(self.poses)
+            engine="image",
+            samples=None,
+            arrays="float64",
+            depth=depth,
+            thinning=1,
+            seconds=result.seconds,
+            peak_mib=memory.peak_mib,
+            difference=difference,
+            poses=len(self.poses),
         )
 
     def thinned(self, step: int) -> Row:
@@ -165,7 +173,15 @@ class _Runner:
         level = np.stack([_between(self.all, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
         difference = self._difference(result.h[nearest], level, self.all)
         return self._row(
-            "image", None, "float64", self.depth, step, result.seconds, memory.peak_mib, difference, len(self.poses)
+            engine="image",
+            samples=None,
+            arrays="float64",
+            depth=self.depth,
+            thinning=step,
+            seconds=result.seconds,
+            peak_mib=memory.peak_mib,
+            difference=difference,
+            poses=len(self.poses),
         )
 
     def sionna(self, samples: int) -> Row:
@@ -175,7 +191,15 @@ class _Runner:
             result = self._replay_sionna(samples, self.all)
         difference = compare(result, self.reference, self.all, self.ks)
         return self._row(
-            "sionna", samples, "float64", self.depth, 1, result.seconds, memory.peak_mib, difference, len(self.poses)
+            engine="sionna",
+            samples=samples,
+            arrays="float64",
+            depth=self.depth,
+            thinning=1,
+            seconds=result.seconds,
+            peak_mib=memory.peak_mib,
+            difference=difference,
+            poses=len(self.poses),
         )
 
     def _replay_sionna(self, samples: int, chosen: Any) -> Replay:
@@ -209,7 +233,17 @@ class _Runner:
             h = channels(poses)
             seconds = time.perf_counter() - started
         difference = self._difference(h, rss_dbm(mean_pair_power(h), self.link.transmit_power_dbm), chosen)
-        return self._row("sionna", samples, name, self.depth, 1, seconds, memory.peak_mib, difference, len(chosen))
+        return self._row(
+            engine="sionna",
+            samples=samples,
+            arrays=name,
+            depth=self.depth,
+            thinning=1,
+            seconds=seconds,
+            peak_mib=memory.peak_mib,
+            difference=difference,
+            poses=len(chosen),
+        )
 
     def _difference(self, h: ComplexArray, level: FloatArray, chosen: Any) -> Difference:
         from ..compare.rank import channel_rank

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.units import AnyArray, ComplexArray, FloatArray, IntArray, db_from_power, wavelength_m
+from ..common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
 from ..site.materials import face_material
 from .arrays import Array, Link, Poses
 from .paths import Faces, PathSet
@@ -92,7 +92,7 @@ def channel_matrices(
     for rows, tower in _chunks(paths, len(arrays), uav * ports):
         one = _chunk_field(paths, rows, faces, tables, sources_m[tower], arrays[tower], poses, link)
         if loss_db is not None:
-            one *= (10.0 ** (-loss_db[rows] / 20.0))[:, None, None]
+            one *= amplitude_from_db(-loss_db[rows])[:, None, None]
         path_power[rows] = (one.real**2 + one.imag**2).mean(axis=(1, 2))
         key = paths.pose[rows] * len(arrays) + tower
         first = np.flatnonzero(np.diff(key, prepend=-1))
@@ -318,15 +318,15 @@ class _Materials:
         )
 
 
-def rss_dbm(power: FloatArray, transmit_power_dbm: float) -> FloatArray:
-    """Received power [dBm]; NaN where ``power`` is zero (no path).
+def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float = -np.inf) -> FloatArray:
+    """Received power [dBm]; NaN where ``power`` is zero (no path) or the level is below the noise floor [dBm].
 
     ``power`` is the mean over element pairs of ``|h|^2``: the transmit power is shared equally by the transmitting
     ports, which send independent signals, and the received power is the mean over the receiving ports. With one
     element at both ends it is ``|h|^2``.
     """
     level = transmit_power_dbm + db_from_power(power)
-    return np.asarray(np.where(power > 0.0, level, np.nan))
+    return np.asarray(np.where((power > 0.0) & (level >= noise_floor_dbm), level, np.nan))
 
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
@@ -334,38 +334,3 @@ def mean_pair_power(h: ComplexArray) -> FloatArray:
     scale = np.abs(h).max(axis=(-2, -1), keepdims=True, initial=0.0)
     safe = np.where(scale > 0.0, scale, 1.0)
     return np.asarray((np.abs(h / safe) ** 2).mean(axis=(-2, -1)) * scale[..., 0, 0] ** 2)
-
-
-def local_mean_dbm(level_dbm: FloatArray, position_m: FloatArray, window_m: float) -> FloatArray:
-    """Mean power over a window along the track.
-
-    Parameters
-    ----------
-    level_dbm : (poses, towers)
-        NaN counts as no sample.
-    position_m : (poses, 3)
-        In flight order.
-    window_m : float
-        Poses within half of it along the track are averaged, in linear units.
-
-    Returns
-    -------
-    (poses, towers)
-        NaN where a window has no sample.
-    """
-    along = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(position_m, axis=0), axis=1))])
-    first = np.searchsorted(along, along - window_m / 2, side="left")
-    last = np.searchsorted(along, along + window_m / 2, side="right")
-    good = np.isfinite(level_dbm)
-    # relative to the strongest level, so that the running sum keeps its digits
-    top = np.max(level_dbm, axis=0, where=good, initial=-np.inf)
-    power = np.where(
-        good, 10.0 ** ((np.where(good, level_dbm, top) - np.where(np.isfinite(top), top, 0.0)) / 10.0), 0.0
-    )
-    zero = np.zeros((1, level_dbm.shape[1]))
-    total = np.concatenate([zero, np.cumsum(power, axis=0)])
-    count = np.concatenate([zero, np.cumsum(good, axis=0)])
-    n = count[last] - count[first]
-    with np.errstate(invalid="ignore", divide="ignore"):
-        mean = (total[last] - total[first]) / n
-        return np.asarray(np.where(n > 0, top + 10.0 * np.log10(np.maximum(mean, 1e-300)), np.nan))

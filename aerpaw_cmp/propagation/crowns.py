@@ -156,7 +156,9 @@ class Crowns:
         for tower, source in enumerate(sources_m):
             poses = np.flatnonzero(alive[tower])
             for before, after, plane in _sequences(np.flatnonzero(ground[tower]), max_depth):
-                search = _Search(self, faces, hiding, plane, before, after, dem)
+                search = _Search(
+                    crowns=self, faces=faces, hiding=hiding, ground=plane, before=before, after=after, dem=dem
+                )
                 found.append(search(source, targets_m, poses, tower, max_depth))
         paths = merge(found, max_depth, None)
         return self._with_facets(paths, faces, max_depth)

@@ -80,16 +80,16 @@ def _ground(height_m: float, material: str, several: bool) -> _Face:
     label = f"ground at {height_m:g} m" if several else "ground"
     infinite = (np.inf, np.inf)
     return _Face(
-        _UP,
-        np.array([1.0, 0, 0]),
-        np.array([0, 1.0, 0]),
-        height_m,
-        (-np.inf, -np.inf),
-        infinite,
-        None,
-        material,
-        label,
-        -1,
+        normal=_UP,
+        along=np.array([1.0, 0, 0]),
+        across=np.array([0, 1.0, 0]),
+        offset_m=height_m,
+        lower=(-np.inf, -np.inf),
+        upper=infinite,
+        polygon=None,
+        material=material,
+        label=label,
+        solid=-1,
     )
 
 
@@ -135,16 +135,16 @@ def _walls(building: Building, footprint: Polygon, solid: int) -> list[_Face]:
             faces.append(
                 # along x up = (along_north, -along_east, 0): the outward normal
                 _Face(
-                    normal,
-                    along,
-                    _UP,
-                    offset,
-                    (first, foot),
-                    (first + length, top),
-                    None,
-                    building.material,
-                    label,
-                    solid,
+                    normal=normal,
+                    along=along,
+                    across=_UP,
+                    offset_m=offset,
+                    lower=(first, foot),
+                    upper=(first + length, top),
+                    polygon=None,
+                    material=building.material,
+                    label=label,
+                    solid=solid,
                 )
             )
     return faces
@@ -165,7 +165,18 @@ def _roof(building: Building, footprint: Polygon, solid: int) -> _Face:
         shapely.prepare(polygon)
     height = building.base_m + building.height_m
     label = f"{building.name} roof"
-    return _Face(_UP, along, across, height, (low_a, low_b), (high_a, high_b), polygon, building.material, label, solid)
+    return _Face(
+        normal=_UP,
+        along=along,
+        across=across,
+        offset_m=height,
+        lower=(low_a, low_b),
+        upper=(high_a, high_b),
+        polygon=polygon,
+        material=building.material,
+        label=label,
+        solid=solid,
+    )
 
 
 def inside(faces: Faces, index: IntArray, points_m: FloatArray, tolerance_m: float) -> BoolArray:

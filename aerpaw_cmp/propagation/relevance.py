@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
+from ..common.units import BoolArray, FloatArray, IntArray, amplitude_from_db, wavelength_m
 from .arrays import Array, Link
 from .image import CELLS_PER_CHUNK, Sequences, meets_last_face, scene_tolerance_m, trace_back
 from .paths import Faces
@@ -67,7 +67,7 @@ class Relevance:
     @property
     def allowed_share(self) -> float:
         """Largest ratio of what is left out to what is kept."""
-        return float(1.0 - 10.0 ** (-self.relevance_db / 20.0))
+        return float(1.0 - amplitude_from_db(-self.relevance_db))
 
     def __call__(self, tower: int, levels: list[Sequences]) -> list[Sequences]:
         """Drop the weakest sequences while all but a few links bear their sum."""

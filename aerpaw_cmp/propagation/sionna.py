@@ -102,8 +102,8 @@ class _Scene:
     """object id -> face of each triangle"""
 
 
-def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float) -> _Scene:
-    """Scene of the faces ``chosen``: one mesh per material."""
+def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float, *, own_table: bool = False) -> _Scene:
+    """Scene of the faces ``chosen``: one mesh per material; ``own_table`` takes Sionna's own constants of P.2040."""
     import mitsuba as mi
     import sionna.rt as rt
 
@@ -121,18 +121,25 @@ def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float) ->
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices[corners], np.float32).ravel())
         parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
         parameters.update()
-        objects.append(rt.SceneObject(mi_mesh=mesh, name=f"faces-{name}", radio_material=_material(name, carrier_hz)))
+        objects.append(
+            rt.SceneObject(mi_mesh=mesh, name=f"faces-{name}", radio_material=_material(name, carrier_hz, own_table))
+        )
         owners.append(owner[rows])
     scene.add(objects)
     return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
 
 
-def _material(name: str, carrier_hz: float) -> Any:
+def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
     import sionna.rt as rt
 
     what = material(name)
     eta = what.relative_permittivity(carrier_hz)
     thick = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m
+    if own_table:
+        from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
+
+        if name in ITU_MATERIALS_PROPERTIES:
+            return rt.ITURadioMaterial(f"m-{name}", name, thickness=thick)
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
         f"m-{name}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
@@ -194,10 +201,19 @@ class _Finder:
     batch : int
     synthetic : bool
         Plane waves over the arrays, or each element its own end.
+    patterns : (str, str)
+        Sionna's names of the elements' patterns at the sources and at the targets.
     """
 
     def __init__(
-        self, built: _Scene, sources: _Ends, elements_m: FloatArray, batch: int, *, synthetic: bool = True
+        self,
+        built: _Scene,
+        sources: _Ends,
+        elements_m: FloatArray,
+        batch: int,
+        *,
+        synthetic: bool = True,
+        patterns: tuple[str, str] = ("iso", "iso"),
     ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
@@ -205,8 +221,9 @@ class _Finder:
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = SPECULAR_TABLE_SLOTS
         self.built, self.batch, self.synthetic = built, batch, synthetic
         scene = built.scene
-        for name, elements in (("tx_array", sources.elements_m), ("rx_array", elements_m)):
-            pattern = rt.antenna_pattern.antenna_pattern_registry.get("iso")(polarization="VH")
+        arrays = (("tx_array", sources.elements_m, patterns[0]), ("rx_array", elements_m, patterns[1]))
+        for name, elements, kind in arrays:
+            pattern = rt.antenna_pattern.antenna_pattern_registry.get(kind)(polarization="VH")
             wavelength = float(np.asarray(scene.wavelength).ravel()[0])
             setattr(scene, name, rt.AntennaArray(pattern, _points(elements / wavelength)))
         for i in range(len(sources.centres_m)):
@@ -343,6 +360,130 @@ def find_paths(
         del built
     found = merge(pieces, max_depth, faces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
+
+
+@dataclass(frozen=True, slots=True)
+class Coefficients:
+    """Paths as Sionna itself has them, nothing refined.
+
+    Parameters
+    ----------
+    paths : PathSet
+        With Sionna's own reflection points.
+    gain : (paths, 2, 2) complex
+        UAV elements by tower elements, carrier phase included.
+    length_m : (paths,)
+        Along Sionna's reflection points, in float64.
+    """
+
+    paths: PathSet
+    gain: ComplexArray
+    length_m: FloatArray
+
+
+def own_coefficients(
+    faces: Faces,
+    sources_m: FloatArray,
+    poses: Poses,
+    probe: Link,
+    turns: tuple[FloatArray, FloatArray],
+    *,
+    usable: BoolArray,
+    excluded: BoolArray,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+) -> Coefficients:
+    """Sionna's complex coefficient of each path, for the audit of the field.
+
+    Sionna's constants of P.2040, rotations, patterns, slants, Fresnel coefficients and spreading; only the carrier
+    phase is taken over the length of its path in float64, since it would form ``2 pi f tau`` in float32.
+
+    Parameters
+    ----------
+    faces, sources_m, usable, excluded, max_depth, samples, batch
+        As in :func:`find_paths`.
+    poses : Poses
+    probe : Link
+        Two elements of one pattern in each array's centre.
+    turns : ((towers, 3, 3), (poses, 3, 3))
+        Device to site, of the towers' arrays and of the UAV's at each pose.
+
+    Returns
+    -------
+    Coefficients
+    """
+    load_variant()
+    arrays = list(probe.tower_arrays.values())
+    reach = 4.0 * float(max(np.abs(poses.position_m).max(), np.abs(sources_m).max(), 100.0))
+    pieces: list[PathSet] = []
+    gains: list[ComplexArray] = []
+    for sharing, chosen in _groups(faces, sources_m, usable):
+        for name in dict.fromkeys(arrays[t].patterns[0].name for t in sharing):
+            towers = np.array([t for t in sharing if arrays[t].patterns[0].name == name])
+            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True)
+            ends = _Ends(sources_m[towers], turns[0][towers], np.zeros((1, 3)))
+            patterns = (name, probe.uav_array.patterns[0].name)
+            with _Finder(built, ends, np.zeros((1, 3)), batch, patterns=patterns) as finder:
+                for start in range(0, len(poses), batch):
+                    some = np.arange(start, min(start + batch, len(poses)))
+                    target = _Ends(poses.position_m[some], turns[1][some], np.zeros((1, 3)))
+                    part, gain = _raw_paths(finder, built, target, some, towers, max_depth, samples)
+                    weights = _slants(probe.uav_array), np.stack([_slants(arrays[t]) for t in part.tower])
+                    gains.append(np.einsum("pab,au,pbv->puv", gain, weights[0], weights[1]))
+                    pieces.append(part)
+            del built
+    empty = PathSet.empty(max_depth)
+    paths = empty if not pieces else PathSet(
+        *(np.concatenate([getattr(p, n) for p in pieces]) for n in ("pose", "tower", "depth", "faces", "vertices_m"))
+    )  # fmt: skip
+    gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
+    kept = ~excluded[paths.tower, paths.pose]
+    paths, gain = paths.select(kept), gain[kept]
+    length = _lengths(paths, sources_m, poses.position_m)
+    cycles = length / wavelength_m(probe.carrier_hz)
+    return Coefficients(paths, gain * np.exp(-2j * np.pi * (cycles - np.round(cycles)))[:, None, None], length)
+
+
+def _slants(array: Array) -> FloatArray:
+    """Weights (V and H, elements) of slanted elements: model 2 of TR 38.901 is a combination of the two."""
+    return np.stack([np.cos(array.slant_rad), np.sin(array.slant_rad)])
+
+
+def _raw_paths(
+    finder: _Finder, built: _Scene, target: _Ends, poses: IntArray, towers: IntArray, max_depth: int, samples: int
+) -> tuple[PathSet, ComplexArray]:
+    """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
+    found = finder.trace(target, max_depth, samples)
+    real, imaginary = (np.asarray(part.numpy()) for part in found.a)
+    raw: dict[str, Any] = {
+        "valid": found.valid.numpy()[: len(poses)],
+        "kind": found.interactions.numpy()[:, : len(poses)],
+        "shape": found.objects.numpy()[:, : len(poses)],
+        "primitive": found.primitives.numpy()[:, : len(poses)],
+    }
+    receiver, tower, path = np.nonzero(raw["valid"])
+    steps = min(max_depth, len(raw["kind"]))
+    kinds = raw["kind"][:, receiver, tower, path]
+    good = np.flatnonzero(((kinds == 0) | (kinds == 1)).all(axis=0))
+    receiver, tower, path = receiver[good], tower[good], path[good]
+    pose, source, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
+    points = np.full((len(pose), max_depth, 3), np.nan)
+    points[:, :steps] = np.moveaxis(found.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
+    points[sequence < 0] = np.nan
+    gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
+    return PathSet(pose, source, (sequence >= 0).sum(axis=1), sequence, points), gain
+
+
+def _lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+    """Length of each path along its reflection points (paths,) [m]."""
+    total, last = np.zeros(len(paths)), sources_m[paths.tower]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        end = paths.vertices_m[:, step] if step < paths.vertices_m.shape[1] else targets_m[paths.pose]
+        used = np.asarray(np.isfinite(end).all(axis=1))
+        total[used] += np.linalg.norm(end[used] - last[used], axis=1)
+        last = np.where(used[:, None], end, last)
+    return total
 
 
 def own_channels(
@@ -496,4 +637,4 @@ def _relocate(
     return np.asarray(result)
 
 
-__all__ = ["engine_versions", "find_paths", "load_variant", "own_channels"]
+__all__ = ["Coefficients", "engine_versions", "find_paths", "load_variant", "own_channels", "own_coefficients"]

@@ -394,11 +394,13 @@ def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: st
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
+    level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
+    heard = np.isfinite(level_dbm)
     return Replay(
-        rss_dbm=rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm),
-        rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm),
-        h=fields.h,
-        has_path=has_path,
+        rss_dbm=level_dbm,
+        rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
+        h=np.where(heard[:, :, None, None], fields.h, 0.0),
+        has_path=has_path & heard,
         paths=paths,
         faces=scene.faces,
         seconds=0.0,

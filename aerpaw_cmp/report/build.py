@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..common.jsonable import fields_of, json_safe
-from ..common.units import AnyArray, FloatArray, IntArray
+from ..common.units import AnyArray, FloatArray, IntArray, db_from_amplitude
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
@@ -34,6 +34,7 @@ def report_data(
     *,
     speed: Sequence[record.SpeedRow] = (),
     notes: Sequence[str] = (),
+    other_inputs: Sequence[record.InputFile] = (),
     stages_s: Mapping[str, float] | None = None,
     paths: Sequence[record.PosePaths] = (),
 ) -> record.ReportData:
@@ -49,6 +50,8 @@ def report_data(
         The table of speed against error.
     notes : sequence of str
         Remarks beside those of the flight file.
+    other_inputs : sequence of InputFile
+        Files besides the logs: settings, site, antennas.
     stages_s : mapping of str to float
         Seconds per stage.
     """
@@ -65,7 +68,7 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=inputs_of(data),
+        inputs=(*inputs_of(data), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(
@@ -254,8 +257,8 @@ def _clock_entry(clock: ClockResult) -> dict[str, Any]:
 def rank_panel(result: RankResult) -> record.RankPanel:
     """The rank of one tower."""
     score, position = result.score, result.position_m
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio_db = 20.0 * np.log10(result.sigma[:, 1:] / result.sigma[:, :1])
+    with np.errstate(invalid="ignore"):  # no channel: 0 / 0
+        ratio_db = db_from_amplitude(result.sigma[:, 1:] / result.sigma[:, :1])
     return record.RankPanel(
         tower=result.tower,
         time=result.time,

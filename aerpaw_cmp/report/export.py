@@ -40,10 +40,12 @@ def metrics(data: ReportData) -> dict[str, Any]:
                 "accepted": f.accepted,
                 "rejected": f.rejected,
                 "blank": f.blank,
+                "role": f.role,
                 "warnings": list(f.warnings),
             }
             for f in data.inputs
         ],
+        "settings": json_safe(data.settings),
         "rss": rss,
         "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
@@ -138,6 +140,7 @@ def _engine_metrics(engine: Engine) -> dict[str, Any]:
             "extra_paths": audit.extra_paths,
             "rss_max_error_db": audit.rss_max_error_db,
             "rank_disagreement": {k_key(k): v for k, v in audit.rank_disagreement.items()},
+            "field": None if audit.fields is None else audit.fields.as_dict(),
             "seconds": audit.seconds,
             "reference_seconds": audit.reference_seconds,
         },

@@ -142,6 +142,13 @@ def warnings(data: ReportData) -> list[str]:
             f"{count(audit.extra_paths)} that only the {data.engine.engine if data.engine else ''} engine has, "
             f"on {count(audit.links)} links."
         )
+    if audit is not None and audit.fields is not None and audit.fields.failed:
+        found.append(
+            "The audit of the field failed, so no level or rank below can be relied on: "
+            + "; ".join(audit.fields.failures[:3])
+            + (f"; and {audit.fields.failed - 3} more" if audit.fields.failed > 3 else "")
+            + "."
+        )
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
         found.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import InputError, UsageError
-from ..common.units import AnyArray, ComplexArray, FloatArray, db_from_power, power_from_db
+from ..common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db, db_from_power, power_from_db
 from ..logs.matfile import read_arrays
 
 HALF_WAVE_DIPOLE_GAIN = 1.640_922_376_984_585
@@ -252,7 +252,7 @@ def read_pattern_text(
     _check_units(rows, path)
     folded, table = _as_grid(rows, path)
     amplitude_db, phase = table[..., [4, 3]], table[..., [6, 5]]
-    fields = np.moveaxis(10 ** (amplitude_db / 20) * np.exp(1j * phase), -1, 0)
+    fields = np.moveaxis(amplitude_from_db(amplitude_db) * np.exp(1j * phase), -1, 0)
     e_theta, e_phi = _unfold(fields) if folded else fields
     along = _points_along_phi(e_theta.T, e_phi.T)
     clockwise = not along if azimuth is None else azimuth == "clockwise"

@@ -146,7 +146,15 @@ def import_footprints(
         result.actions += content.notes
         if content.kind in OSM_KINDS:
             result.credits.append(f"{Path(path).name}: (c) OpenStreetMap contributors, ODbL")
-        _sort(content, Path(path), frame, untagged, default_height_m, shapes, result.actions)
+        _sort(
+            content=content,
+            path=Path(path),
+            frame=frame,
+            untagged=untagged,
+            default_height_m=default_height_m,
+            shapes=shapes,
+            actions=result.actions,
+        )
         for tree in content.trees:
             result.trees += _single_trees(tree, frame, result.actions)
     _warn_of_feet(shapes["building"], result.actions)

@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import ComplexArray, FloatArray
+from ..common.units import ComplexArray, FloatArray, amplitude_from_db
 
 
 def harmonics(azimuth_rad: ArrayLike, order: int) -> FloatArray:
@@ -57,5 +57,5 @@ class InstalledPattern:
         e_theta, e_phi = self.base.field(theta_rad, phi_rad)
         terms = harmonics(phi_rad, len(self.harmonics_db) // 2)
         gain_db = np.sin(np.asarray(theta_rad, dtype=np.float64)) * (terms @ np.asarray(self.harmonics_db))
-        factor = 10.0 ** (gain_db / 20.0)
+        factor = amplitude_from_db(gain_db)
         return e_theta * factor, e_phi * factor

@@ -376,7 +376,7 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
     towers = {}
     for name, tower in model.towers.items():
         with _at("towers", name):
-            towers[name] = _tower(name, tower, model, frame, datum, dem, notes)
+            towers[name] = _tower(name=name, model=tower, site=model, frame=frame, datum=datum, dem=dem, notes=notes)
             _check_tower(towers[name], model.area_m, frame)
     with _at("area_m"):
         area = _area(model.area_m, towers)
@@ -531,7 +531,14 @@ def _tower(
             f"{what}: the antenna lies {-height:g} m below the ground", cause="a height of another reference"
         )
     return Tower(
-        name, chosen.latitude_deg, chosen.longitude_deg, float(east), float(north), height, ground, chosen.source
+        name=name,
+        latitude_deg=chosen.latitude_deg,
+        longitude_deg=chosen.longitude_deg,
+        east_m=float(east),
+        north_m=float(north),
+        antenna_height_m=height,
+        ground_m=ground,
+        source=chosen.source,
     )
 
 

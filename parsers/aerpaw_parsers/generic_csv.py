@@ -20,6 +20,9 @@ from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Str
 from . import _frames, _lines, _time
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
+_VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
+"""Columns that a record of a kind is about."""
+
 _TEXT = re.compile(_time.TIME + _time.ZONE)
 _PLAIN = re.compile(_lines.NUMBER)
 
@@ -57,8 +60,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
             expected=", ".join(allowed),
             cause=f"did you mean {near[0]!r}?" if near else None,
         )
-    needed = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
-    lacking = [name for name in ("time", *needed[options.kind]) if name not in options.columns]
+    lacking = [name for name in ("time", *_VALUE[options.kind]) if name not in options.columns]
     if lacking:
         raise UsageError(
             f"'columns:' lacks {', '.join(lacking)}", expected=f"e.g. columns: {{{lacking[0]}: {header[0]!r}}}"
@@ -78,10 +80,20 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     return options.kind, {column: header.index(name) for column, name in options.columns.items()}
 
 
+_NONE = (b"", b"nan", b"na", b"n/a", b"none", b"null", b"-", b"--", b"-inf", b"-infinity")
+"""What stands for no value; -inf dB is no signal. Any other word, and +inf, is flagged."""
+
+
 def _numbers(cells: list[str]) -> FloatArray:
-    """Numbers of a column; what is none becomes NaN."""
+    """Numbers of a column; what is none becomes NaN, and +inf where it is a word: the limits flag it."""
     stripped = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
-    return np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in stripped], dtype=np.float64)
+    return np.array([_number(cell) for cell in stripped], dtype=np.float64)
+
+
+def _number(cell: bytes) -> float:
+    if _PLAIN.fullmatch(cell):
+        return float(cell)
+    return np.nan if cell.lower() in _NONE else np.inf
 
 
 def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
@@ -123,12 +135,19 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
     flag = _lines.flags(len(rows))
     instants.flag(flag)
-    values, extra = _values(kind, {name: _numbers(texts) for name, texts in column.items()}, flag, options)
+    numbers = {name: _numbers(texts) for name, texts in column.items()}
+    odd = np.any([np.isposinf(numbers[name]) for name in _VALUE[kind]], axis=0)
+    _lines.add_flag(flag, odd, "no_number")
+    values, extra = _values(kind, {k: np.where(np.isposinf(v), np.nan, v) for k, v in numbers.items()}, flag, options)
     if lines.unterminated:
         _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
     frame = _frames.frame(kind, instants.time, rows + 1, flag, values)[valid].reset_index(drop=True)
     stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
     warnings = [*instants.warnings, *_frames.steps_back(frame)]
+    if (odd & valid).any():
+        first_odd = int(rows[odd & valid][0]) + 1
+        words = "1 row is" if (odd & valid).sum() == 1 else f"{int((odd & valid).sum())} rows are"
+        warnings.append(f"{words} flagged no_number; the first: line {first_odd}, a word or an infinity; not scored")
     if kind == "rss" and options.unit is None:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
@@ -169,7 +188,7 @@ def _values(
     """Columns by the rules of the kind, and the attributes that go with them."""
     if kind == "rss":
         silent = ~(values["rss_db"] > options.floor_db)
-        _lines.add_flag(flag, silent, "out_of_coverage")
+        _lines.add_flag(flag, silent & (flag != "no_number"), "out_of_coverage")
         values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
         return values, {"unit": options.unit or "dB re full scale"}
     if kind == "rank":
@@ -177,7 +196,7 @@ def _values(
         rank = ri + 1 if options.ri_base == "zero" else ri
         good = (rank >= 1) & (rank <= 8)
         none = np.isnan(ri) | ((ri == 0) & (options.ri_base == "one"))
-        _lines.add_flag(flag, none, "no_csi")
+        _lines.add_flag(flag, none & (flag != "no_number"), "no_csi")
         _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
         values["rank"] = np.where(good, rank, np.nan)
         return values, {"ri_base": options.ri_base}

@@ -17,7 +17,8 @@ from aerpaw_cmp.compare.result import FlightResult, RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import body_rotation
-from aerpaw_cmp.jobs.compare_flight import audit_replays, compare_rank_series, compare_rss_series, pairs_of
+from aerpaw_cmp.jobs.audit_flight import audit_replays
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.replay import replay_rank, replay_rss
 from aerpaw_cmp.jobs.run import _paths_of_pose
@@ -503,7 +504,7 @@ def test_a_ratio_to_noise_is_not_taken_for_a_level_in_silence(tmp_path: Path) ->
     assert said[0].startswith("quality.csv: 'quality'")
 
 
-@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308"])
+@pytest.mark.parametrize("absurd", ["inf", "1e30", "500", "-inf", "1e308", "strong"])
 def test_one_absurd_level_changes_no_number_and_is_told(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], absurd: str
 ) -> None:
@@ -517,11 +518,12 @@ def test_one_absurd_level_changes_no_number_and_is_told(
     (tmp_path / "USRP1.csv").write_text("\n".join(lines) + "\n")
     metrics = report_completes(path, capsys)
     found = metrics["rss"]["LW1"]["USRP1"]
-    if absurd in ("inf", "-inf"):  # no number for the reader of plain tables: no signal
+    if absurd == "-inf":  # of decibels: no signal
         assert found["n_out_of_coverage"] == 1
     else:
-        assert found["n_flagged"] == {"level_out_of_range": 1}
-        assert any("level_out_of_range" in text for text in metrics["warnings"])
+        flag = "level_out_of_range" if absurd[0].isdigit() else "no_number"
+        assert found["n_flagged"] == {flag: 1}
+        assert any(f"1 row is flagged {flag}" in text for text in metrics["warnings"])
         assert found["n_out_of_coverage"] == 0
     for key in ("offset_db", "rmse_db", "n", "at_search_edge"):
         assert found[key] == pytest.approx(want[key]), key

@@ -59,7 +59,7 @@ def test_score_closed_form():
 
 def test_leave_one_out_keeps_altitude_and_k():
     values = np.random.default_rng(1).normal(size=(len(GRID), 3, 2))
-    table = evaluate.leave_one_out_table({"mean": Spy(), "nearest": Nearest()}, GRID.points_m, values)
+    table = {n: evaluate.leave_one_out(m, GRID.points_m, values) for n, m in (("mean", Spy()), ("nearest", Nearest()))}
     assert table["nearest"].mae.shape == (3, 2)
     n = len(GRID)
     expected = np.abs((values.sum(axis=0) - values) / (n - 1) - values).mean(axis=0)
@@ -109,18 +109,15 @@ def test_kriging_wins_where_its_model_holds_and_its_variance_is_honest():
     """A Gaussian field with the model's correlation: best linear predictor, calibrated intervals."""
     values = simulated_field(GRID.points_m, 2, fields=40, noise=0.1)
     model = OrdinaryKriging(lambda d: 0.9 * exponential(d), sill=1.0)
-    table = evaluate.leave_one_out_table(
-        {
-            "kriging": model,
-            "idw": InverseDistance(),
-            "nearest": Nearest(),
-            "spline": IndexInterpolation("spline", GRID),
-            "makima": IndexInterpolation("makima", GRID),
-            "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
-        },
-        GRID.points_m,
-        values,
-    )
+    models = {
+        "kriging": model,
+        "idw": InverseDistance(),
+        "nearest": Nearest(),
+        "spline": IndexInterpolation("spline", GRID),
+        "makima": IndexInterpolation("makima", GRID),
+        "tower": ServingTowerMean([[100.0, 100.0], [500.0, 400.0]]),
+    }
+    table = {name: evaluate.leave_one_out(one, GRID.points_m, values) for name, one in models.items()}
     rmse = {name: float(s.rmse.mean()) for name, s in table.items()}
     assert min(rmse, key=lambda name: rmse[name]) == "kriging", rmse
     estimate, variance = evaluate.leave_one_out_estimate(model, GRID.points_m, values)

@@ -10,7 +10,6 @@ from aerpaw_cmp.maps.grid import (
     Grid,
     class_names,
     class_shares,
-    coverage_share,
     serving_tower,
     voronoi_borders,
     without_coverage_as_nan,
@@ -106,6 +105,5 @@ def test_out_of_coverage_is_a_class_and_never_a_number():
     assert class_shares(rank).tolist() == [0.2, 0.4, 0.2, 0.0, 0.2]
     assert class_names() == ("Z", "1", "2", "3", "4")
     assert np.nanmean(without_coverage_as_nan(rank)) == 2.0
-    assert coverage_share(rank > 0) == 0.8
     with pytest.raises(ValueError, match="exceeds"):
         class_shares([5])

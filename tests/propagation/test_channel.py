@@ -22,7 +22,7 @@ from aerpaw_cmp.propagation.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.propagation.channel import local_mean_dbm, mean_pair_power, reflection_coefficients, rss_dbm
+from aerpaw_cmp.propagation.channel import mean_pair_power, reflection_coefficients, rss_dbm
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.materials import material
 
@@ -333,19 +333,7 @@ def test_power_sum_is_the_mean_over_random_phases(scenes):
     coherent = 10 * np.log10(np.mean(10 ** (result.rss_dbm / 10)))
     assert coherent == pytest.approx(10 * np.log10(np.mean(10 ** (result.rss_power_dbm / 10))), abs=0.1)
     assert np.ptp(result.rss_dbm) > 1.0
-    smooth = local_mean_dbm(result.rss_dbm, poses.position_m, 4.0)
-    assert np.abs(smooth - result.rss_power_dbm).max() < 0.5 < np.abs(result.rss_dbm - result.rss_power_dbm).max()
-
-
-def test_local_mean_by_hand():
-    level = np.array([[-60.0], [-63.0], [np.nan], [-70.0], [np.nan]])
-    position = np.zeros((5, 3))
-    position[:, 0] = [0.0, 1.0, 2.0, 3.0, 10.0]
-    mean = local_mean_dbm(level, position, 2.0)[:, 0]
-    pair = 10 * np.log10((10**-6.0 + 10**-6.3) / 2)
-    two = 10 * np.log10((10**-6.3 + 10**-7.0) / 2)
-    assert mean[:4] == pytest.approx([pair, pair, two, -70.0])
-    assert np.isnan(mean[4])
+    assert np.abs(result.rss_dbm - result.rss_power_dbm).max() > 0.5
 
 
 def test_rss_of_no_power_is_nan():

@@ -539,5 +539,5 @@
   document.documentElement.classList.add("live");
   controls();
   everything();
-  window.explorer = { state, statistics, rankStatistics, choose, span, get data() { return data; } };
+  window.explorer = { state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), data };
 })();

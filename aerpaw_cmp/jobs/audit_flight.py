@@ -1,0 +1,240 @@
+"""Audit of a flight's replays: paths by the other engine, fields by Sionna and by a second implementation.
+
+What the second implementation is given comes from the settings, not from the arrays and losses that the replay made
+of them, so that a fault in between is seen.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..common.stages import Progress, silent
+from ..common.units import AnyArray, FloatArray
+from ..compare.field_difference import FieldAudit
+from ..compare.result import AuditResult, EngineResult
+from ..flight.data import FlightData
+from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
+from ..propagation.audit import Audit, audit
+from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
+from ..propagation.reference import (
+    C_MPS,
+    PATTERNS,
+    ExpectedArray,
+    ExpectedLink,
+    ExpectedLoss,
+    Pattern,
+    aircraft,
+    layout_positions,
+    turned,
+)
+from .replay import Replayed, attitude_rotation, path_loss, reflecting_crowns
+
+ATTITUDE_ROWS = 200
+"""Logged attitudes that are turned into rotations a second time."""
+
+ATTITUDE_TOLERANCE_RAD = 1e-6
+"""Both are float64; telemetry instants are exact to a nanosecond."""
+
+REFERENCE_LINKS_AT_MOST = 64
+"""Of all series together, at least three each: some 0.1 s apiece."""
+
+NOT_COVERED = (
+    "whether reflection off smooth half-spaces and flat walls is what the place does",
+    "positions of towers, footprints and trees, and the track's positions",
+    "geometry of paths off crowns; terrain that blocks",
+)
+"""What no audit of the replay can see."""
+
+
+def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
+    """The engine record, with the audit where ``rt.audit_links`` asks for one."""
+    rt = data.settings.rt
+    return EngineResult(
+        engine=rt.engine,
+        links=sum(len(r.poses) for r in replays),
+        seconds=sum(r.replay.seconds for r in replays),
+        paths=sum(len(r.replay.paths) for r in replays),
+        settings={
+            "max_depth": rt.max_depth,
+            "samples": rt.samples,
+            "attitude": rt.attitude,
+            "foliage": rt.foliage,
+            **_crown_settings(rt, replays),
+        },
+        left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
+        audit=_audit(data, replays, progress) if rt.audit_links else None,
+    )
+
+
+def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
+    """Whether opaque crowns reflect, and how many paths bounce off one."""
+    if rt.foliage != "opaque":
+        return {}
+    bounced = sum(int(r.replay.paths.off_crown.sum()) for r in replays)
+    return {"crown_reflections": rt.crown_reflections, "paths_off_crowns": bounced}
+
+
+def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
+    """One audit over all series: links are shared out in proportion to their poses."""
+    site, rt, ks = data.site, data.settings.rt, data.settings.rank.k
+    total = sum(len(r.poses) for r in replays)
+    parts: list[Audit] = []
+    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+        count = len(replayed.poses)
+        links = min(count, math.ceil(rt.audit_links * count / max(total, 1)))
+        if links == 0:
+            continue
+        progress(f"audit {replayed.replay.towers[0]}: {links} links")
+        parts.append(
+            audit(
+                site,
+                replayed.link,
+                replayed.poses,
+                replayed.replay,
+                links=links,
+                max_depth=rt.max_depth,
+                samples=rt.samples,
+                batch=rt.batch,
+                loss=path_loss(site.trees, rt, replayed.link.carrier_hz),
+                crowns=reflecting_crowns(site.trees, rt),
+                cache_dir=None if rt.cache else "",
+                ks=ks,
+                expected=expected,
+                reference_links=int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS)),
+                complete=rt.relevance_db is None,
+            )
+        )
+    if not parts:
+        return None
+    errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
+    links = sum(p.links for p in parts)
+    found = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
+    return AuditResult(
+        reference=parts[0].reference,
+        links=links,
+        missing_paths=sum(p.missing_paths for p in parts),
+        extra_paths=sum(p.extra_paths for p in parts),
+        rss_max_error_db=max(errors, default=float("nan")),
+        rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
+        seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
+        reference_seconds=sum(p.reference_seconds for p in parts),
+        note="The time of the engine is its share for the audited links; that of the reference includes its start-up.",
+        fields=dataclasses.replace(found, not_covered=(*found.not_covered, *NOT_COVERED)),
+    )
+
+
+# --- what the settings say -------------------------------------------------------------------------------------------
+
+
+def expectations(data: FlightData, replays: Sequence[Replayed]) -> list[Expected]:
+    """For each replay what the settings say of its link and losses."""
+    settings = [*(s.link for s in data.rss), *[data.settings.link.rank] * len(data.rank)]
+    loss = expected_loss(data.settings.rt)
+    if len(settings) != len(replays):  # part of the flight: from the links themselves
+        return [Expected.of(r.link, loss) for r in replays]
+    return [
+        Expected(expected_link(link, list(r.link.tower_arrays), data.folder), loss)
+        for link, r in zip(settings, replays, strict=True)
+    ]
+
+
+def expected_loss(rt: RtSettings) -> ExpectedLoss:
+    """Foliage and reflection loss as ``rt`` has them."""
+    return ExpectedLoss(
+        model=rt.foliage_model if rt.foliage == "attenuating" else rt.foliage,
+        gamma_db_per_m=rt.gamma_db_per_m,
+        maximum_db=rt.maximum_loss_db,
+        in_leaf=rt.leaves == "in",
+        reflection_db=rt.reflection_loss_db,
+    )
+
+
+def expected_link(settings: LinkSettings, towers: Sequence[str], folder: Path) -> ExpectedLink:
+    """A link of flight.yaml."""
+    wavelength = C_MPS / settings.carrier_hz
+    return ExpectedLink(
+        carrier_hz=settings.carrier_hz,
+        transmit_power_dbm=settings.transmit_power_dbm,
+        uav_transmits=settings.uav_transmits,
+        towers={name: expected_array(settings.towers.get(name, settings.tower), wavelength, folder) for name in towers},
+        uav=expected_array(settings.uav, wavelength, folder),
+    )
+
+
+def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> ExpectedArray:
+    """An array of flight.yaml, laid out a second time."""
+    positions = layout_positions(settings.layout, wavelength, settings.elements, settings.positions_m)
+    slants = settings.slant_deg if isinstance(settings.slant_deg, list) else [settings.slant_deg]
+    antennas = settings.antennas or [settings.antenna]
+
+    def per_element(values: Sequence[object]) -> list[object]:
+        return list(values) * len(positions) if len(values) == 1 else list(values)
+
+    return ExpectedArray(
+        positions_m=positions,
+        slants_deg=tuple(float(x) for x in per_element(slants)),  # type: ignore[arg-type]
+        patterns=tuple(_pattern(a, folder) for a in per_element(antennas)),  # type: ignore[arg-type]
+        mount=turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
+    )
+
+
+def _pattern(settings: AntennaSettings, folder: Path) -> Pattern:
+    """A formula a second time, or what an antenna file says."""
+    if settings.model in PATTERNS and not settings.installed_db:
+        return PATTERNS[settings.model]
+    pattern: Pattern = scalar_pattern(load_pattern(settings, folder))
+    return pattern
+
+
+# --- attitude --------------------------------------------------------------------------------------------------------
+
+
+def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudit:
+    """Rotations of the track at telemetry instants against the logged angles, turned a second time."""
+    mode = data.settings.rt.attitude
+    if mode == "ignored" or data.track is None:
+        turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
+        moved = mode == "ignored" and turned_anyway
+        return FieldAudit(failures=("rt.attitude is 'ignored' and the UAV's array turns",) if moved else ())
+    times, angles = _logged_attitudes(data)
+    if not len(times):
+        return FieldAudit(not_covered=("the attitude: the telemetry has none",))
+    rows = np.unique(np.linspace(0, len(times) - 1, min(len(times), ATTITUDE_ROWS)).round().astype(int))
+    at = data.track.pose_at(times[rows])
+    used = np.flatnonzero(at.valid & at.attitude_known)
+    rotation = attitude_rotation(at, mode)
+    worst = 0.0
+    for index in used:
+        roll, pitch, yaw = (float(x) for x in angles[rows[index]])
+        expected = np.array(aircraft(*((roll, pitch) if mode == "logged" else (0.0, 0.0)), yaw))
+        worst = max(worst, _angle(expected, rotation[index]))
+    failures = (f"rotations differ from the logged attitude by {worst:.2g} rad",) if worst > _tolerance() else ()
+    return FieldAudit(attitude_rows=len(used), attitude_max_rad=worst, failures=failures)
+
+
+def _tolerance() -> float:
+    return ATTITUDE_TOLERANCE_RAD
+
+
+def _angle(one: FloatArray, two: FloatArray) -> float:
+    """Largest difference of two rotations' entries [rad]."""
+    return float(np.abs(one - two).max())
+
+
+def _logged_attitudes(data: FlightData) -> tuple[AnyArray, FloatArray]:
+    """Instants (n,) and roll, pitch, yaw (n, 3) [deg] of telemetry rows whose instant occurs once."""
+    import pandas as pd
+
+    frames = [s.frame for f in data.files for s in f.result.streams if s.kind == "telemetry"]
+    if not frames:
+        return np.zeros(0, dtype="datetime64[ns]"), np.zeros((0, 3))
+    frame = frames[0]
+    frame = frame[pd.notna(frame["time"]) & ~frame["time"].duplicated(keep=False)]
+    angles = frame[["roll_deg", "pitch_deg", "yaw_deg"]].to_numpy(dtype=np.float64)
+    good = np.isfinite(angles).all(axis=1)
+    return np.asarray(frame["time"].to_numpy())[good], angles[good]

@@ -1,0 +1,94 @@
+"""Every file that a report was made from, besides the logs: settings, site, antennas, elevation, reference powers.
+
+No list of keys: whatever text of the flight file or of the site file names a file is one, so that a new key cannot be
+forgotten.
+"""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Iterator, Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from ..common.outputs import file_digest
+from ..flight.settings import FlightFile
+from ..report.data import InputFile
+
+
+def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = None) -> tuple[InputFile, ...]:
+    """The flight file, the site file and every file that either names, but for the logs.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        As checked.
+    flight : Path
+        The flight file.
+    logs_root : Path, optional
+        Where logs and antenna files resolve besides the folder of the flight file.
+
+    Returns
+    -------
+    tuple of InputFile
+        Path as it is named (the packaged site: as the package names it), SHA-256, and as role the key that names it.
+        They have no lines to account for.
+    """
+    content = settings.model_dump(exclude={"logs"})
+    roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
+    found = {flight.resolve(): _entry(flight.name, flight, "flight file")}
+    for key, text, place in _files(content, roots):
+        if key != "site.file":
+            found.setdefault(place.resolve(), _entry(text, place, key))
+    for entry, place in _site_inputs(settings, flight.parent):
+        found.setdefault(place.resolve(), entry)
+    return tuple(found.values())
+
+
+def _site_inputs(settings: FlightFile, folder: Path) -> Iterator[tuple[InputFile, Path]]:
+    """The site file and what it names."""
+    from ..site.siteyaml import site_model
+
+    name = settings.site.file
+    path = folder / name
+    if path.is_file():
+        yield _entry(name, path, "site file"), path
+        model = site_model(path)
+    else:
+        model = site_model(name)
+        packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
+        with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / packaged) as file:
+            if file.is_file():
+                yield _entry(f"aerpaw_cmp/site/data/{packaged}", file, "site file (packaged)"), file
+        return
+    for key, text, place in _files(model.model_dump(), [path.parent]):
+        yield _entry(text, place, f"site: {key}"), place
+
+
+def _files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
+    """Dotted key, text and place of every value that names a file."""
+    for key, text in _texts(content, ""):
+        for root in roots:
+            place = root / text
+            if text and "\0" not in text and os.path.isfile(place):  # noqa: PTH113  never raises
+                yield key, text, place
+                break
+
+
+def _texts(value: Any, key: str) -> Iterator[tuple[str, str]]:
+    """Every text in nested settings with its dotted key."""
+    if isinstance(value, (str, Path)):
+        yield key, str(value)
+    elif isinstance(value, dict):
+        for name, item in value.items():
+            yield from _texts(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, (list, tuple)):
+        for index, item in enumerate(value):
+            yield from _texts(item, f"{key}.{index}" if key else str(index))
+
+
+def _entry(name: str, place: Path, role: str) -> InputFile:
+    return InputFile(
+        path=name, sha256=file_digest(place), reader="", lines=0, accepted=0, rejected=0, blank=0, role=role
+    )

@@ -1,0 +1,465 @@
+"""The field of a replay checked by two others: Sionna's own coefficients, and a second implementation.
+
+1. *Sionna* traces the audited links once more and gives, for each path, its own complex coefficient with one element at
+   each array centre, in both slants, from its own materials, patterns and rotations. Float32: power within
+   ``POWER_TOLERANCE_DB``, phase within ``PHASE_TOLERANCE_RAD`` on paths shorter than ``PHASE_RANGE_M``.
+2. :mod:`aerpaw_cmp.propagation.reference` computes a few links of each replay from the settings: which paths there are,
+   H of every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
+from ..compare.field_difference import FieldAudit
+from ..site.site import Site
+from .arrays import Array, Isotropic, Link, Poses
+from .channel import channel_matrices
+from .image import planes_of
+from .paths import Faces, PathSet
+from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
+from .scene import Scene
+from .tracer import Replay
+
+POWER_TOLERANCE_DB = 0.05
+"""Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
+at the edge of a pattern's cut-off the coefficient turns that into some hundredths of a decibel."""
+
+PHASE_TOLERANCE_RAD = 0.01
+"""Float32 moves a reflection point off its plane by 1e-4 m at most within ``PHASE_RANGE_M``: 7e-3 rad at 3.4 GHz."""
+
+PHASE_RANGE_M = 300.0
+
+WEAK_DB = 20.0
+"""Entries this far below the largest of a path's four are compared with the largest: float32 has no digits for them."""
+
+EXACT_TOLERANCE = 1e-6
+"""Of H against the second implementation, relative to the root of the links' mean path power; both are float64."""
+
+SIONNA_MARGIN_M = 2e-3
+"""A path that a move of an edge by this much makes or breaks may differ in float32."""
+
+REFERENCE_LINKS = 8
+"""Links per replay for the second implementation."""
+
+SIONNA_PATTERNS = {"iso": "iso", "hw_dipole": "hw_dipole", "tr38901": "tr38901"}
+"""Patterns of this package that Sionna has too."""
+
+
+@dataclass(frozen=True, slots=True)
+class Expected:
+    """What the settings of a flight say, for the second implementation."""
+
+    link: ExpectedLink
+    loss: ExpectedLoss = field(default_factory=ExpectedLoss)
+
+    @classmethod
+    def of(cls, link: Link, loss: ExpectedLoss | None = None) -> Expected:
+        """From a link itself: layout, slants and mounts are then taken as they are."""
+        towers = {name: expected_array(array) for name, array in link.tower_arrays.items()}
+        uav = expected_array(link.uav_array)
+        known = ExpectedLink(link.carrier_hz, link.transmit_power_dbm, link.uav_transmits, towers, uav)
+        return cls(known, loss or ExpectedLoss())
+
+
+def expected_array(array: Array) -> ExpectedArray:
+    """An array's own numbers."""
+    patterns = array.patterns * len(array) if len(array.patterns) == 1 else array.patterns
+    return ExpectedArray(
+        tuple((float(x), float(y), float(z)) for x, y, z in array.positions_m),
+        tuple(float(x) for x in np.degrees(array.slant_rad)),
+        tuple(scalar_pattern(pattern) for pattern in patterns),
+        matrix_of(array.mount),
+    )
+
+
+def scalar_pattern(pattern: Any) -> Any:
+    """One direction of a pattern of this package."""
+
+    def of(theta: float, phi: float) -> tuple[complex, complex]:
+        e_theta, e_phi = pattern.field(np.array(theta), np.array(phi))
+        return complex(e_theta), complex(e_phi)
+
+    return of
+
+
+# ---------------------------------------------------------------- the second implementation
+
+
+def against_reference(
+    site: Site,
+    poses: Poses,
+    replay: Replay,
+    chosen: IntArray,
+    expected: Expected,
+    *,
+    ks: Sequence[float],
+    max_depth: int,
+    complete: bool = True,
+) -> FieldAudit:
+    """A few links of a replay computed a second time.
+
+    Parameters
+    ----------
+    site, poses, replay
+        Of the replay.
+    chosen : (links,) int
+        Poses; each tower of the replay is taken at each.
+    expected : Expected
+    ks : sequence of float
+    max_depth : int
+    complete : bool
+        Whether the replay claims to have every path (nothing left out as irrelevant).
+
+    Returns
+    -------
+    FieldAudit
+    """
+    total = FieldAudit(reference_links=len(chosen) * len(replay.towers))
+    for number, name in enumerate(replay.towers):
+        reference = Reference(site, name, expected.link, expected.loss)
+        for row in chosen:
+            mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
+            link = _OneLink(reference, replay, poses, int(row), number, mine)
+            total += link.paths_checked(max_depth, complete and site.dem is None)
+            try:
+                total += link.field_checked(ks)
+            except LookupError as error:
+                total += FieldAudit(not_covered=(f"the material {error.args[0]} at this carrier",))
+    return total
+
+
+def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
+    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist."""
+    count = 0
+    for row in rows:
+        tower = int(replay.paths.tower[row])
+        reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
+        link = _OneLink(reference, replay, poses, int(replay.paths.pose[row]), tower, np.array([row]))
+        sequence = link.sequence(int(row))
+        if not replay.paths.off_crown[row] and (sequence is None or reference.verdict(sequence, link.target) is False):
+            count += 1
+    failures = (f"{count} paths that cannot exist",) if count else ()
+    return FieldAudit(phantom_paths=count, failures=failures)
+
+
+@dataclass(frozen=True, slots=True)
+class _OneLink:
+    reference: Reference
+    replay: Replay
+    poses: Poses
+    row: int
+    tower: int
+    mine: IntArray
+
+    @property
+    def target(self) -> tuple[float, float, float]:
+        east, north, up = self.poses.position_m[self.row].tolist()
+        return east, north, up
+
+    @property
+    def name(self) -> str:
+        return f"{self.replay.towers[self.tower]}, pose {self.row}"
+
+    def sequence(self, path: int) -> tuple[Mirror, ...] | None:
+        """The mirrors of a path of the replay, looked up in the site; None where the site has no such face."""
+        faces, vertices = self.replay.paths.faces[path], self.replay.paths.vertices_m[path]
+        found = []
+        for face, vertex in zip(faces[faces >= 0].tolist(), vertices, strict=False):
+            mirror = _mirror_of(self.reference, self.replay.faces, face, vertex)
+            if mirror is None:
+                return None
+            found.append(mirror)
+        return tuple(found)
+
+    def paths_checked(self, max_depth: int, complete: bool) -> FieldAudit:
+        """Paths that cannot exist, and paths that are not there."""
+        failures: list[str] = []
+        keys = set()
+        phantom = doubtful = missing = 0
+        ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
+        nowhere = self.target[2] < min(ground, 0.0) or math.dist(self.target, self.reference.source) < 0.01
+        for path in self.mine:
+            sequence = self.sequence(path)
+            keys.add(None if sequence is None else _key(sequence))
+            if self.replay.paths.off_crown[path]:
+                continue
+            verdict = False if sequence is None or nowhere else self.reference.verdict(sequence, self.target)
+            phantom += verdict is False
+            doubtful += verdict is None
+        if phantom:
+            failures.append(f"{self.name}: {phantom} paths that cannot exist")
+        if complete and not nowhere:
+            for sequence in self.reference.sequences(self.target, max_depth) or ():
+                key = _key(sequence)
+                if key not in keys and self.reference.verdict(sequence, self.target):
+                    missing += 1
+                    keys.add(key)
+            if missing:
+                failures.append(f"{self.name}: {missing} paths are missing")
+        return FieldAudit(missing_paths=missing, phantom_paths=phantom, doubtful=doubtful, failures=tuple(failures))
+
+    def field_checked(self, ks: Sequence[float]) -> FieldAudit:
+        """H, RSS and rank from the replay's own list of paths."""
+        from ..compare.rank import channel_rank
+
+        paths, replay = [], self.replay
+        for path in self.mine:
+            sequence = self.sequence(path)
+            if sequence is None:
+                return FieldAudit(doubtful=1)  # a failure already
+            tree = replay.paths.tree[path][: len(sequence)].tolist()
+            loss = self.reference.loss_db(sequence, self.target, tree)
+            if loss is None:
+                return FieldAudit(doubtful=1)
+            paths.append((sequence, loss))
+        link = self.reference.link
+        h, power = self.reference.matrix(paths, self.target, matrix_of(self.poses.rotation[self.row]))
+        h = h.T if link.uav_transmits else h
+        ours = replay.h[self.row, self.tower]
+        failures: list[str] = []
+        if ours.shape != h.shape:
+            return FieldAudit(failures=(f"{self.name}: H is {ours.shape}, expected {h.shape}",))
+        size = math.sqrt(power) or 1e-30
+        error = float(np.abs(ours - h).max()) / size
+        if not error <= EXACT_TOLERANCE:
+            failures.append(f"{self.name}: H differs by {error:.2g} of its size")
+        levels = [
+            (replay.rss_dbm, float((np.abs(h) ** 2).mean())),
+            (replay.rss_power_dbm, power),
+        ]
+        worst = 0.0
+        for level, value in levels:
+            off = _level_error(float(level[self.row, self.tower]), value, link.transmit_power_dbm, size)
+            if off > 1e-3:
+                failures.append(f"{self.name}: RSS differs by {off:.2g} dB")
+            worst = max(worst, off)
+        sigma = np.linalg.svd(h, compute_uv=False)
+        differs = False
+        for k in ks:
+            near = power > 0 and (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()
+            expected = int((sigma > sigma[0] / k).sum()) if power > 0 else 0
+            differs |= not near and int(channel_rank(ours, k)) != expected
+        if differs:
+            failures.append(f"{self.name}: another rank")
+        return FieldAudit(
+            reference_paths=len(paths), h_max_error=error, rss_max_error_db=worst, rank_differs=int(differs),
+            failures=tuple(failures),
+        )  # fmt: skip
+
+
+def _level_error(level_dbm: float, power: float, transmit_dbm: float, size: float) -> float:
+    """Difference of a level [dB] beyond what rounding does in a fade; infinite where only one of the two is covered."""
+    if power <= (1e-9 * size) ** 2:  # nothing, or a fade deeper than 180 dB
+        return 0.0 if not math.isfinite(level_dbm) or power > 0 else math.inf
+    if not math.isfinite(level_dbm):
+        return math.inf
+    off = abs(level_dbm - transmit_dbm - 10 * math.log10(power))
+    rounding = 20 / math.log(10) * EXACT_TOLERANCE * size / math.sqrt(power)
+    return max(0.0, off - rounding)
+
+
+def _mirror_of(reference: Reference, faces: Faces, face: int, vertex: FloatArray) -> Mirror | None:
+    normal, offset = faces.normal[face], float(faces.offset_m[face])
+    solid = int(faces.solid[face])
+    if solid >= len(reference.site.buildings):
+        return Mirror(tuple(normal.tolist()), offset, "vegetation", solid=-1)
+    point = tuple(vertex.tolist())
+    same = [
+        m
+        for m in reference.mirrors
+        if m.solid == solid
+        and abs(m.offset_m - offset) < 1e-6
+        and max(abs(a - b) for a, b in zip(m.normal, normal.tolist(), strict=True)) < 1e-9
+    ]
+    return max(same, key=lambda m: m.margin(point)) if same else None
+
+
+def _key(sequence: Sequence[Mirror]) -> tuple[tuple[float, ...], ...]:
+    """Planes of a sequence: coplanar faces are one mirror."""
+    return tuple(tuple(round(x, 6) + 0.0 for x in (*m.normal, m.offset_m)) for m in sequence)
+
+
+def spread_over_paths(replay: Replay, chosen: IntArray, count: int) -> IntArray:
+    """Poses of ``chosen`` that together meet as many kinds of paths as possible: faces, and crowns."""
+    if len(chosen) <= count:
+        return chosen
+    seen: dict[int, set[tuple[int, ...]]] = {int(row): set() for row in chosen}
+    for pose, tower, faces in zip(
+        replay.paths.pose.tolist(), replay.paths.tower.tolist(), replay.paths.faces.tolist(), strict=True
+    ):
+        if pose in seen:
+            seen[pose].add((tower, *faces))
+    picked: list[int] = []
+    met: set[tuple[int, ...]] = set()
+    rest = list(seen)
+    while len(picked) < count:
+        best = max(rest, key=lambda row: (len(seen[row] - met), len(seen[row])))
+        picked.append(best)
+        met |= seen[best]
+        rest.remove(best)
+    return np.array(sorted(picked), dtype=np.int64)
+
+
+# ---------------------------------------------------------------- Sionna's own coefficients
+
+
+def against_sionna(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    replay: Replay,
+    chosen: IntArray,
+    expected: Expected,
+    *,
+    max_depth: int,
+    samples: int,
+    batch: int,
+    complete: bool = True,
+) -> FieldAudit:
+    """Each path's power, phase and polarisation against what Sionna itself computes."""
+    from .sionna import own_coefficients
+
+    few = Poses(poses.position_m[chosen], poses.rotation[chosen])
+    scene = Scene.of(site, link, few)
+    probe, covered = _probe(link)
+    turns = (
+        np.array([expected.link.towers[name].mount for name in link.tower_arrays]),
+        few.rotation @ np.array(expected.link.uav.mount),
+    )
+    theirs = own_coefficients(
+        scene.faces, scene.sources_m, few, probe, turns, usable=scene.usable, excluded=scene.excluded,
+        max_depth=max_depth, samples=samples, batch=batch,
+    )  # fmt: skip
+    place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
+    place[chosen] = np.arange(len(chosen))
+    rows = np.flatnonzero((place[replay.paths.pose] >= 0) & ~replay.paths.off_crown)
+    ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
+    mine, other = _matched(ours, replay.faces, theirs.paths, scene.faces)
+    total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, other)
+    if complete and site.dem is None:
+        lacking = np.setdiff1d(np.arange(len(theirs.paths)), other)
+        total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
+    return replace(total, not_covered=covered)
+
+
+def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
+    """The link with two crossed elements in each array's centre, with the pattern and slant of its first element."""
+    left: list[str] = []
+
+    def centre(array: Array) -> Array:
+        first = array.patterns[0]
+        if first.name not in SIONNA_PATTERNS:
+            left.append(f"the antenna pattern '{first.name}' (Sionna is asked with isotropic elements)")
+            first = Isotropic()
+        slants = array.slant_rad[0] + np.array([0.0, np.pi / 2])
+        return Array(np.zeros((2, 3)), slants, (first,), array.mount)
+
+    towers = {name: centre(array) for name, array in link.tower_arrays.items()}
+    return replace(link, tower_arrays=towers, uav_array=centre(link.uav_array), uav_transmits=False), tuple(
+        dict.fromkeys(left)
+    )
+
+
+def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
+    """Indices of the paths that both have."""
+    from .paths import joined
+
+    plane = planes_of(joined(our_faces, their_faces))
+
+    def keys(paths: PathSet, start: int) -> list[tuple[int, ...]]:
+        number = np.append(plane[start:], -1)
+        rows = np.column_stack([paths.pose, paths.tower, number[paths.faces]])
+        return [tuple(n for n in row if n >= 0) for row in rows.tolist()]
+
+    known = {key: index for index, key in enumerate(keys(theirs, len(our_faces)))}
+    pairs = [(i, known[key]) for i, key in enumerate(keys(ours, 0)) if key in known]
+    both = np.array(pairs, dtype=np.int64).reshape(-1, 2)
+    return both[:, 0], both[:, 1]
+
+
+def _paths_against_sionna(
+    ours: PathSet, replay: Replay, scene: Scene, few: Poses, probe: Link, theirs: Any, other: IntArray
+) -> FieldAudit:
+    count = len(ours)
+    if not count:
+        return FieldAudit()
+    # each path alone: a pose of its own
+    alone = replace(ours, pose=np.arange(count))
+    spots = Poses(few.position_m[ours.pose], few.rotation[ours.pose])
+    h = channel_matrices(alone, replay.faces, scene.sources_m, spots, probe).h[np.arange(count), ours.tower]
+    reference = theirs.gain[other]
+    size = np.abs(reference).max(axis=(1, 2))
+    strong = np.abs(reference) > size[:, None, None] * 10 ** (-WEAK_DB / 20)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        power = np.where(strong, np.abs(20 * np.log10(np.abs(h) / np.abs(reference))), 0.0)
+        # a weak entry counts by its difference as a share of the largest
+        weak = 20 * np.log10(1 + np.abs(h - reference * np.exp(1j * np.angle(h / reference))) / size[:, None, None])
+        power = np.where(strong, power, np.nan_to_num(weak)).max(axis=(1, 2))
+        phase = np.where(strong, np.abs(np.angle(h / reference)), 0.0).max(axis=(1, 2))
+    near = theirs.length_m[other] < PHASE_RANGE_M
+    failures = []
+    bad = int((~(power <= POWER_TOLERANCE_DB)).sum())
+    if bad:
+        failures.append(f"{bad} paths differ from Sionna's own by up to {np.nanmax(power):.3g} dB")
+    wrong = int((~(phase[near] <= PHASE_TOLERANCE_RAD)).sum())
+    if wrong:
+        failures.append(f"{wrong} paths differ from Sionna's own by up to {np.nanmax(phase[near]):.3g} rad")
+    rss = _link_error(ours, h, reference, near, len(few), len(replay.towers))
+    if rss > 2 * POWER_TOLERANCE_DB:
+        failures.append(f"the RSS of a link differs from Sionna's own paths by {rss:.3g} dB")
+    return FieldAudit(
+        paths=count,
+        power_max_db=float(np.nanmax(power)),
+        power_rms_db=float(np.sqrt(np.nanmean(power**2))),
+        phases=int(near.sum()),
+        phase_max_rad=float(np.nanmax(phase[near], initial=0.0)),
+        phase_rms_rad=float(np.sqrt((phase[near] ** 2).mean())) if near.any() else 0.0,
+        link_rss_max_db=rss,
+        failures=tuple(failures),
+    )
+
+
+def _link_error(
+    paths: PathSet, h: ComplexArray, reference: ComplexArray, near: BoolArray, poses: int, towers: int
+) -> float:
+    """Largest difference of the coherent power of links near by that are not in a fade [dB]."""
+    link = paths.pose * towers + paths.tower
+    sums = []
+    for value in (h, reference):
+        total = np.zeros((poses * towers, *value.shape[1:]), dtype=np.complex128)
+        np.add.at(total, link, value)
+        sums.append((np.abs(total) ** 2).mean(axis=(1, 2)))
+    alone = np.bincount(link, weights=(np.abs(h) ** 2).mean(axis=(1, 2)), minlength=poses * towers)
+    all_near = np.bincount(link, weights=~near, minlength=poses * towers) == 0
+    good = all_near & (sums[1] > 0.01 * alone) & (alone > 0)
+    return float(np.abs(10 * np.log10(sums[0][good] / sums[1][good])).max(initial=0.0))
+
+
+def _lacking(
+    site: Site, replay: Replay, theirs: PathSet, faces: Faces, rows: IntArray, few: Poses, expected: Expected
+) -> FieldAudit:
+    """Paths that only Sionna has: missing where they exist beyond doubt, else its float32 edge."""
+    missing = doubtful = 0
+    references = [Reference(site, name, expected.link, expected.loss) for name in replay.towers]
+    for row in rows:
+        reference = references[int(theirs.tower[row])]
+        sequence = []
+        for face, vertex in zip(theirs.faces[row].tolist(), theirs.vertices_m[row], strict=True):
+            if face >= 0:
+                sequence.append(_mirror_of(reference, faces, face, vertex))
+        if None in sequence:
+            doubtful += 1
+            continue
+        east, north, up = few.position_m[theirs.pose[row]].tolist()
+        exists = reference.verdict(sequence, (east, north, up), SIONNA_MARGIN_M)  # type: ignore[arg-type]
+        missing += exists is True
+        doubtful += exists is not True
+    failures = (f"{missing} paths that Sionna has are missing",) if missing else ()
+    return FieldAudit(missing_paths=missing, doubtful=doubtful, failures=failures)

@@ -1,0 +1,618 @@
+"""A second, independent replay of single links: slow, one element pair at a time, for the audit.
+
+Written from the recommendations, not from the rest of this package, and sharing no code with it: rotations as
+products of three turns, arrays from their published layout, constants of ITU-R P.2040-4 and P.833 a second time,
+reflection by components across and along the plane of incidence, paths by trying every sequence of faces against the
+footprints, chords in crowns by bisection. What it is given is the site, the settings and the poses. Antenna files are
+taken from the replay as they are.
+"""
+
+from __future__ import annotations
+
+import cmath
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+import shapely
+from shapely.geometry import LineString, Point, Polygon
+
+from ..common.units import ComplexArray, FloatArray
+from ..site.site import Site, Tower, Trees
+
+Vector = tuple[float, float, float]
+Matrix = tuple[Vector, Vector, Vector]
+Wave = tuple[complex, complex, complex]
+Pattern = Callable[[float, float], tuple[complex, complex]]
+"""``(theta_rad, phi_rad) -> (E_theta, E_phi)`` in the device frame."""
+
+C_MPS = 299_792_458.0
+EPS0 = 8.8541878128e-12
+
+MARGIN_M = 1e-6
+"""Paths that a change of the geometry by this much makes or breaks are not judged."""
+
+# ITU-R P.2040-4 table 3: lowest and highest GHz, a, b, c, d; and the thickness of a wall of it [m], None a half-space
+P2040: dict[str, tuple[float, float, float, float, float, float, float | None]] = {
+    "vacuum": (0.001, 100, 1.0, 0.0, 0.0, 0.0, None),
+    "concrete": (1, 100, 5.24, 0.0, 0.0462, 0.7822, 0.3),
+    "brick": (1, 40, 3.91, 0.0, 0.0238, 0.16, 0.2),
+    "plasterboard": (1, 100, 2.73, 0.0, 0.0085, 0.9395, 0.025),
+    "wood": (0.001, 100, 1.99, 0.0, 0.0047, 1.0718, 0.15),
+    "glass": (0.1, 100, 6.31, 0.0, 0.0036, 1.3394, 0.006),
+    "ceiling_board": (1, 100, 1.48, 0.0, 0.0011, 1.0750, 0.02),
+    "chipboard": (1, 100, 2.58, 0.0, 0.0217, 0.7800, 0.02),
+    "plywood": (1, 40, 2.71, 0.0, 0.33, 0.0, 0.02),
+    "marble": (1, 60, 7.074, 0.0, 0.0055, 0.9262, 0.03),
+    "floorboard": (50, 100, 3.66, 0.0, 0.0044, 1.3515, 0.02),
+    "asphalt_concrete": (1, 40, 4.83, 0.0, 0.0108, 1.3969, None),
+    "metal": (1, 100, 1.0, 0.0, 1e7, 0.0, 0.005),
+    "very_dry_ground": (1, 10, 3.0, 0.0, 0.00015, 2.52, None),
+    "medium_dry_ground": (1, 10, 15.0, -0.1, 0.035, 1.63, None),
+    "wet_ground": (1, 10, 30.0, -0.4, 0.15, 1.30, None),
+}
+
+# ---------------------------------------------------------------- what is expected
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedArray:
+    """Elements of one device as the settings describe them.
+
+    Parameters
+    ----------
+    positions_m : tuple of (x, y, z)
+    slants_deg : tuple of float
+    patterns : tuple of Pattern
+        One per element.
+    mount : Matrix
+        Device to carrier.
+    """
+
+    positions_m: tuple[Vector, ...]
+    slants_deg: tuple[float, ...]
+    patterns: tuple[Pattern, ...]
+    mount: Matrix
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedLink:
+    """Radio settings as they were given."""
+
+    carrier_hz: float
+    transmit_power_dbm: float
+    uav_transmits: bool
+    towers: dict[str, ExpectedArray]
+    uav: ExpectedArray
+
+
+@dataclass(frozen=True, slots=True)
+class ExpectedLoss:
+    """Foliage and reflection loss as they were given.
+
+    Parameters
+    ----------
+    model : {"none", "p833", "weissberger", "opaque"}
+    gamma_db_per_m, maximum_db : float or None
+        In place of P.833's.
+    in_leaf : bool
+    reflection_db : float
+        Per reflection.
+    """
+
+    model: str = "none"
+    gamma_db_per_m: float | None = None
+    maximum_db: float | None = None
+    in_leaf: bool = True
+    reflection_db: float = 0.0
+
+
+def layout_positions(
+    layout: str, wavelength: float, elements: int = 4, positions_m: Sequence[Sequence[float]] | None = None
+) -> tuple[Vector, ...]:
+    """Element positions of a layout of flight.yaml, in the device frame (x forward, y left, z up) [m]."""
+    if layout == "custom":
+        return tuple((float(p[0]), float(p[1]), float(p[2])) for p in positions_m or ())
+    if layout == "tower_comparison":  # arXiv 2502.10324 VII-D: 60 mm, 1.68 m, 60 mm, the first port leftmost
+        return ((0.0, 0.9, 0.0), (0.0, 0.84, 0.0), (0.0, -0.84, 0.0), (0.0, -0.9, 0.0))
+    q = wavelength / 4
+    if layout == "uav_comparison":  # 2 x 2, column by column from the left, the upper one first
+        return ((0.0, q, q), (0.0, q, -q), (0.0, -q, q), (0.0, -q, -q))
+    n = 1 if layout == "single" else elements
+    return tuple((0.0, wavelength / 2 * ((n - 1) / 2 - k), 0.0) for k in range(n))
+
+
+def isotropic(_theta: float, _phi: float) -> tuple[complex, complex]:
+    """Unit gain, along theta."""
+    return 1.0 + 0j, 0j
+
+
+def half_wave_dipole(theta: float, _phi: float) -> tuple[complex, complex]:
+    """2.15 dBi along z, Balanis eq. 4-84; the gain is 4 / Cin(2 pi)."""
+    sine = math.sin(theta)
+    if abs(sine) < 1e-9:
+        return 0j, 0j
+    return complex(math.sqrt(1.6409223769845851) * math.cos(math.pi / 2 * math.cos(theta)) / sine), 0j
+
+
+def tr38901(theta: float, phi: float) -> tuple[complex, complex]:
+    """TR 38.901 table 7.3-1, 8 dBi."""
+    t, p = math.degrees(theta), (math.degrees(phi) + 180) % 360 - 180
+    down = min(min(12 * ((t - 90) / 65) ** 2, 30) + min(12 * (p / 65) ** 2, 30), 30)
+    return complex(10 ** ((8 - down) / 20)), 0j
+
+
+PATTERNS: dict[str, Pattern] = {"iso": isotropic, "dipole": half_wave_dipole, "tr38901": tr38901}
+"""By their names in flight.yaml."""
+
+
+def permittivity(name: str, carrier_hz: float) -> tuple[complex, float | None] | None:
+    """Complex relative permittivity and thickness of a material; None where the table above has none."""
+    key = name.lower().replace("-", "_").replace(" ", "_")
+    key = key[4:] if key.startswith("itu_") else key
+    if key == "vegetation":  # 1.1, and 0.5 dB/m for weak loss
+        sigma = 2 * math.sqrt(1.1) * (0.5 * math.log(10) / 20) * EPS0 * C_MPS
+        return 1.1 - 1j * sigma / (2 * math.pi * carrier_hz * EPS0), None
+    ghz = carrier_hz / 1e9
+    if key not in P2040 or not P2040[key][0] <= ghz <= P2040[key][1]:
+        return None
+    _, _, a, b, c, d, thickness = P2040[key]
+    return a * ghz**b - 1j * c * ghz**d / (2 * math.pi * carrier_hz * EPS0), thickness
+
+
+# ---------------------------------------------------------------- vectors
+
+
+def _dot(a: Vector, b: Vector) -> float:
+    return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+
+
+def _cross(a: Vector, b: Vector) -> Vector:
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
+
+
+def _plus(a: Vector, b: Vector, scale: float = 1.0) -> Vector:
+    return (a[0] + scale * b[0], a[1] + scale * b[1], a[2] + scale * b[2])
+
+
+def _unit(a: Vector) -> Vector:
+    size = math.sqrt(_dot(a, a))
+    return (a[0] / size, a[1] / size, a[2] / size)
+
+
+def _times(m: Matrix, v: Vector) -> Vector:
+    return (_dot(m[0], v), _dot(m[1], v), _dot(m[2], v))
+
+
+def product(a: Matrix, b: Matrix) -> Matrix:
+    """Matrix product."""
+    columns = [(b[0][k], b[1][k], b[2][k]) for k in range(3)]
+    rows = [tuple(_dot(row, column) for column in columns) for row in a]
+    return tuple(rows)  # type: ignore[return-value]
+
+
+def turned(yaw_deg: float, pitch_deg: float, roll_deg: float) -> Matrix:
+    """TR 38.901 (7.1-4): roll about x, then pitch about y, then yaw about z, each turning right about its axis."""
+    a, b, c = (math.radians(x) for x in (yaw_deg, pitch_deg, roll_deg))
+    about_z: Matrix = ((math.cos(a), -math.sin(a), 0.0), (math.sin(a), math.cos(a), 0.0), (0.0, 0.0, 1.0))
+    about_y: Matrix = ((math.cos(b), 0.0, math.sin(b)), (0.0, 1.0, 0.0), (-math.sin(b), 0.0, math.cos(b)))
+    about_x: Matrix = ((1.0, 0.0, 0.0), (0.0, math.cos(c), -math.sin(c)), (0.0, math.sin(c), math.cos(c)))
+    return product(about_z, product(about_y, about_x))
+
+
+def aircraft(roll_deg: float, pitch_deg: float, yaw_deg: float) -> Matrix:
+    """Forward-left-up to east-north-up, by way of the textbook's forward-right-down to north-east-down."""
+    r, p, y = (math.radians(x) for x in (roll_deg, pitch_deg, yaw_deg))
+    heading: Matrix = ((math.cos(y), -math.sin(y), 0.0), (math.sin(y), math.cos(y), 0.0), (0.0, 0.0, 1.0))
+    nose_up: Matrix = ((math.cos(p), 0.0, math.sin(p)), (0.0, 1.0, 0.0), (-math.sin(p), 0.0, math.cos(p)))
+    wing_down: Matrix = ((1.0, 0.0, 0.0), (0.0, math.cos(r), -math.sin(r)), (0.0, math.sin(r), math.cos(r)))
+    to_ned = product(heading, product(nose_up, wing_down))
+    enu_of_ned: Matrix = ((0.0, 1.0, 0.0), (1.0, 0.0, 0.0), (0.0, 0.0, -1.0))
+    frd_of_flu: Matrix = ((1.0, 0.0, 0.0), (0.0, -1.0, 0.0), (0.0, 0.0, -1.0))
+    return product(enu_of_ned, product(to_ned, frd_of_flu))
+
+
+def matrix_of(values: FloatArray) -> Matrix:
+    """A (3, 3) array as a Matrix."""
+    return tuple(tuple(float(x) for x in row) for row in values)  # type: ignore[return-value]
+
+
+# ---------------------------------------------------------------- geometry
+
+
+@dataclass(frozen=True, slots=True)
+class Mirror:
+    """One reflecting plane: a wall, a roof, the ground, or a facet that was given.
+
+    Parameters
+    ----------
+    normal : Vector
+    offset_m : float
+    material : str
+    start, along, length_m, low_m, high_m
+        Of a wall: plan position of one end, its direction, its length, foot and top.
+    roof : Polygon, optional
+    solid : int
+        Building, -1 for the ground.
+    """
+
+    normal: Vector
+    offset_m: float
+    material: str
+    start: tuple[float, float] = (0.0, 0.0)
+    along: tuple[float, float] = (0.0, 0.0)
+    length_m: float = 0.0
+    low_m: float = 0.0
+    high_m: float = 0.0
+    roof: Polygon | None = None
+    solid: int = -1
+
+    def height(self, p: Vector) -> float:
+        """Distance in front of the plane."""
+        return _dot(self.normal, p) - self.offset_m
+
+    def mirrored(self, p: Vector) -> Vector:
+        """The image of a point."""
+        return _plus(p, self.normal, -2.0 * self.height(p))
+
+    def margin(self, p: Vector) -> float:
+        """How far inside its edges a point of the plane lies [m]; negative outside."""
+        if self.roof is not None:
+            spot = Point(p[0], p[1])
+            edge = float(self.roof.boundary.distance(spot))
+            return edge if self.roof.covers(spot) else -edge
+        if self.solid < 0:
+            return math.inf
+        s = (p[0] - self.start[0]) * self.along[0] + (p[1] - self.start[1]) * self.along[1]
+        return min(s, self.length_m - s, p[2] - self.low_m, self.high_m - p[2])
+
+
+def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
+    """Ground of the tower, then walls and roof of each building."""
+    found = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
+    for number, building in enumerate(site.buildings):
+        foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
+        whole = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
+        for part in shapely.get_parts(whole):
+            if part.geom_type != "Polygon" or part.area <= 0:
+                continue
+            for hole, ring in enumerate((part.exterior, *part.interiors)):
+                # the building lies to the left of each edge: outside round its rim, inside round a hole
+                points = list(ring.coords)
+                for a, b in itertools.pairwise(points if ring.is_ccw is (hole == 0) else points[::-1]):
+                    length = math.hypot(b[0] - a[0], b[1] - a[1])
+                    if length == 0:
+                        continue
+                    along = ((b[0] - a[0]) / length, (b[1] - a[1]) / length)
+                    normal = (along[1], -along[0], 0.0)
+                    offset = normal[0] * a[0] + normal[1] * a[1]
+                    found.append(
+                        Mirror(
+                            normal,
+                            offset,
+                            building.material,
+                            start=(a[0], a[1]),
+                            along=along,
+                            length_m=length,
+                            low_m=foot,
+                            high_m=top,
+                            solid=number,
+                        )
+                    )
+            found.append(Mirror((0.0, 0.0, 1.0), top, building.material, roof=part, solid=number))
+    return tuple(found)
+
+
+class Blocks:
+    """The buildings as obstacles, grown or shrunk by a margin."""
+
+    def __init__(self, site: Site) -> None:
+        self._site = site
+        self._shapes: dict[float, list[Polygon]] = {}
+
+    def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
+        """Whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little."""
+        shadow = LineString([a[:2], b[:2]])
+        for number, building in enumerate(self._site.buildings):
+            grown = -MARGIN_M / 10 if number in spared else grow_m
+            top = building.base_m + building.height_m + grown
+            if min(a[2], b[2]) >= top or not self._near(number, a, b):
+                continue
+            shape = self._shape(number, grown)
+            if shadow.length < 1e-9:
+                if shape.contains(Point(a[:2])):
+                    return True
+                continue
+            for piece in shapely.get_parts(shape.intersection(shadow)):
+                if piece.geom_type != "LineString" or piece.length < 1e-9:
+                    continue
+                shares = [shadow.project(Point(c)) / shadow.length for c in piece.coords]
+                if min(a[2] + s * (b[2] - a[2]) for s in shares) < top:
+                    return True
+        return False
+
+    def _near(self, number: int, a: Vector, b: Vector) -> bool:
+        west, south, east, north = self._site.buildings[number].footprint.bounds
+        return not (
+            max(a[0], b[0]) < west - 1
+            or min(a[0], b[0]) > east + 1
+            or max(a[1], b[1]) < south - 1
+            or min(a[1], b[1]) > north + 1
+        )
+
+    def _shape(self, number: int, grow_m: float) -> Polygon:
+        shapes = self._shapes.setdefault(grow_m, [None] * len(self._site.buildings))
+        if shapes[number] is None:
+            shapes[number] = self._site.buildings[number].footprint.buffer(grow_m, join_style="mitre")
+        return shapes[number]
+
+
+# ---------------------------------------------------------------- one link
+
+
+@dataclass(frozen=True, slots=True)
+class Reference:
+    """Links of one tower computed the slow way.
+
+    Parameters
+    ----------
+    site : Site
+    tower : str
+    link : ExpectedLink
+    loss : ExpectedLoss
+    """
+
+    site: Site
+    tower: str
+    link: ExpectedLink
+    loss: ExpectedLoss = field(default_factory=ExpectedLoss)
+    mirrors: tuple[Mirror, ...] = field(init=False)
+    blocks: Blocks = field(init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "mirrors", mirrors_of(self.site, self.site.towers[self.tower]))
+        object.__setattr__(self, "blocks", Blocks(self.site))
+
+    @property
+    def source(self) -> Vector:
+        """Centre of the tower's array."""
+        tower = self.site.towers[self.tower]
+        return (tower.east_m, tower.north_m, tower.ground_m + tower.antenna_height_m)
+
+    def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
+        """All sequences whose images lie on the right sides; None when there are more than the budget."""
+        facing = [m for m in self.mirrors if m.height(target) >= -MARGIN_M]
+        found: list[tuple[Mirror, ...]] = [()]
+        level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
+        for depth in range(1, max_depth + 1):
+            grown = []
+            for past, image in level:
+                for mirror in self.mirrors:
+                    if mirror.height(image) > (0.0 if past else -MARGIN_M) and (not past or mirror is not past[-1]):
+                        grown.append(((*past, mirror), mirror.mirrored(image)))
+            if len(grown) > budget:
+                return None
+            found += [s for s, _ in grown if s[-1] in facing]
+            level = grown if depth < max_depth else []
+        return found
+
+    def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
+        """Whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""
+        points = _bounces(sequence, self.source, target)
+        if points is None:
+            return False
+        margins = [m.margin(p) for m, p in zip(sequence, points[1:-1], strict=True)]
+        last = len(sequence) - 1
+        for step, mirror in enumerate(sequence):
+            before, after = mirror.height(points[step]), mirror.height(points[step + 2])
+            margins += [before + (margin_m if step == 0 else 0.0), after + (margin_m if step == last else 0.0)]
+        worst = min(margins, default=math.inf)
+        if worst < -margin_m:
+            return False
+        strict = loose = False
+        for step, (a, b) in enumerate(itertools.pairwise(points)):
+            spared = tuple(m.solid for m in sequence[max(0, step - 1) : step + 1])
+            loose = loose or self.blocks.cut(a, b, -margin_m, spared)
+            if loose:
+                return False
+            strict = strict or self.blocks.cut(a, b, margin_m, spared)
+        return None if strict or worst < margin_m else True
+
+    def pair(self, sequence: Sequence[Mirror], tx: int, rx: int, target: Vector, turn: Matrix) -> complex:
+        """Amplitude of one path between tower element ``tx`` and UAV element ``rx``, without foliage."""
+        tower, uav = self.link.towers[self.tower], self.link.uav
+        start = _plus(self.source, _times(tower.mount, tower.positions_m[tx]))
+        uav_turn = product(turn, uav.mount)
+        end = _plus(target, _times(uav_turn, uav.positions_m[rx]))
+        image = start
+        for mirror in sequence:
+            image = mirror.mirrored(image)
+        way = _plus(end, image, -1.0)
+        length = math.sqrt(_dot(way, way))
+        if length == 0:
+            return 0j
+        rays = [_unit(way)]
+        for mirror in reversed(sequence):
+            rays.insert(0, _plus(rays[0], mirror.normal, -2.0 * _dot(mirror.normal, rays[0])))
+        wave = _element(tower, tx, tower.mount, rays[0])
+        for mirror, ray, onward in zip(sequence, rays[:-1], rays[1:], strict=True):
+            wave = self._reflected(mirror, wave, ray, onward)
+        seen = _element(uav, rx, uav_turn, (-rays[-1][0], -rays[-1][1], -rays[-1][2]))
+        wavelength = C_MPS / self.link.carrier_hz
+        coupling = sum(a * b for a, b in zip(seen, wave, strict=True))
+        spreading = min(1.0, wavelength / (4 * math.pi * length))
+        return coupling * spreading * cmath.exp(-2j * math.pi * math.fmod(length / wavelength, 1.0))
+
+    def _reflected(self, mirror: Mirror, wave: Wave, ray: Vector, onward: Vector) -> Wave:
+        cosine = min(1.0, abs(_dot(mirror.normal, ray)))
+        across = _cross(ray, mirror.normal)
+        size = math.sqrt(_dot(across, across))
+        if size < 1e-12:  # straight on: any direction will do
+            across, size = (
+                _cross(mirror.normal, (1.0, 0.0, 0.0) if abs(mirror.normal[0]) < 0.9 else (0.0, 1.0, 0.0)),
+                1.0,
+            )
+            size = math.sqrt(_dot(across, across))
+        s = (across[0] / size, across[1] / size, across[2] / size)
+        p_in, p_out = _cross(s, ray), _cross(s, onward)
+        found = permittivity(mirror.material, self.link.carrier_hz)
+        if found is None:
+            raise LookupError(mirror.material)
+        te, tm = fresnel(cosine, *found, C_MPS / self.link.carrier_hz)
+        e_s = sum(a * b for a, b in zip(s, wave, strict=True))
+        e_p = sum(a * b for a, b in zip(p_in, wave, strict=True))
+        e = [te * e_s * s[k] + tm * e_p * p_out[k] for k in range(3)]
+        return e[0], e[1], e[2]
+
+    def loss_db(self, sequence: Sequence[Mirror], target: Vector, bounced: Sequence[int] = ()) -> float | None:
+        """Foliage and reflection loss of a path; None where an opaque tree is only just touched."""
+        total = self.loss.reflection_db * len(sequence)
+        if self.loss.model == "none" or not len(self.site.trees):
+            return total
+        points = _bounces(sequence, self.source, target)
+        if points is None:
+            return None
+        depth = trunks = 0.0
+        for step, (a, b) in enumerate(itertools.pairwise(points)):
+            own = {bounced[k] for k in (step - 1, step) if 0 <= k < len(bounced)}
+            depth += crown_depth_m(self.site.trees, a, b, own)
+            if self.loss.model == "opaque":
+                trunks += crown_depth_m(self.site.trees, a, b, set(), trunks=True)
+        if self.loss.model == "opaque":
+            touched = depth + trunks
+            return None if 0 < touched < 1e-6 else (math.inf if touched else total)
+        return total + foliage_db(self.loss, depth, self.link.carrier_hz)
+
+    def matrix(
+        self, paths: Sequence[tuple[Sequence[Mirror], float]], target: Vector, turn: Matrix
+    ) -> tuple[ComplexArray, float]:
+        """H (uav elements, tower elements) of paths with their losses [dB], and the mean power of each added up."""
+        uav, tower = len(self.link.uav.positions_m), len(self.link.towers[self.tower].positions_m)
+        h = np.zeros((uav, tower), dtype=np.complex128)
+        power = 0.0
+        for sequence, loss in paths:
+            factor = 0.0 if math.isinf(loss) else 10 ** (-loss / 20)
+            one = np.array(
+                [[factor * self.pair(sequence, t, u, target, turn) for t in range(tower)] for u in range(uav)]
+            )
+            h += one
+            power += float((np.abs(one) ** 2).mean())
+        return h, power
+
+
+def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: float) -> tuple[complex, complex]:
+    """Reflection (TE, TM) of ITU-R P.2040-4 (31): half-space; with a thickness the slab of (43) and (44)."""
+    refracted = cmath.sqrt(eta - (1 - cosine * cosine))
+    te, tm = (cosine - refracted) / (cosine + refracted), (eta * cosine - refracted) / (eta * cosine + refracted)
+    if thickness_m is None:
+        return te, tm
+    q = 2 * math.pi * thickness_m / wavelength * refracted
+    echo = cmath.exp(-2j * q)
+    return te * (1 - echo) / (1 - te * te * echo), tm * (1 - echo) / (1 - tm * tm * echo)
+
+
+def _element(array: ExpectedArray, number: int, turn: Matrix, ray: Vector) -> Wave:
+    """Field of an element along ``ray`` in site axes; TR 38.901 7.3.2, model 2."""
+    back: Matrix = tuple(zip(*turn, strict=True))  # type: ignore[assignment]
+    x, y, z = _times(back, ray)
+    theta, phi = math.atan2(math.hypot(x, y), z), math.atan2(y, x)
+    e_theta, e_phi = array.patterns[number](theta, phi)
+    slant = math.radians(array.slants_deg[number])
+    f_theta = math.cos(slant) * e_theta - math.sin(slant) * e_phi
+    f_phi = math.sin(slant) * e_theta + math.cos(slant) * e_phi
+    theta_hat = _times(turn, (math.cos(theta) * math.cos(phi), math.cos(theta) * math.sin(phi), -math.sin(theta)))
+    phi_hat = _times(turn, (-math.sin(phi), math.cos(phi), 0.0))
+    e = [f_theta * theta_hat[k] + f_phi * phi_hat[k] for k in range(3)]
+    return e[0], e[1], e[2]
+
+
+def _bounces(sequence: Sequence[Mirror], source: Vector, target: Vector) -> list[Vector] | None:
+    """[source, reflection points, target] between array centres, or None."""
+    images = [source]
+    for mirror in sequence:
+        images.append(mirror.mirrored(images[-1]))
+    points = [target]
+    for mirror, image in zip(reversed(sequence), reversed(images[1:]), strict=True):
+        ahead, behind = mirror.height(points[0]), -mirror.height(image)
+        if ahead + behind <= 0:
+            return None
+        share = behind / (ahead + behind)
+        points.insert(0, _plus(image, _plus(points[0], image, -1.0), share))
+    return [source, *points]
+
+
+# ---------------------------------------------------------------- foliage
+
+
+def foliage_db(loss: ExpectedLoss, depth_m: float, carrier_hz: float) -> float:
+    """ITU-R P.833 woodland or Weissberger; leafless trees attenuate 1/1.2 of it."""
+    if loss.model == "weissberger":
+        f = (carrier_hz / 1e9) ** 0.284 / (1.0 if loss.in_leaf else 1.2)
+        return float(f * (0.45 * depth_m if depth_m <= 14 else 1.33 * depth_m**0.588))
+    gamma, largest = _p833(carrier_hz / 1e6)
+    gamma = gamma / (1.0 if loss.in_leaf else 1.2) if loss.gamma_db_per_m is None else loss.gamma_db_per_m
+    largest = largest if loss.maximum_db is None else loss.maximum_db
+    return largest * (1 - math.exp(-gamma * depth_m / largest))
+
+
+def _p833(mhz: float) -> tuple[float, float]:
+    """Specific attenuation and largest loss, straight lines in the logarithms between the pairs of P.833."""
+    table = [
+        (105.9, 0.04, 9.4), (466.475, 0.12, 18.0), (949.0, 0.17, 26.5), (1852.2, 0.30, 29.0), (2117.5, 0.34, 34.1),
+    ]  # fmt: skip
+    if mhz <= table[0][0] or mhz >= table[-1][0]:
+        f, gamma, largest = table[0] if mhz <= table[0][0] else table[-1]
+        return gamma * (mhz / f) ** 0.70, largest * (mhz / f) ** 0.43
+    for low, high in itertools.pairwise(table):
+        if mhz <= high[0]:
+            share = math.log(mhz / low[0]) / math.log(high[0] / low[0])
+            return low[1] * (high[1] / low[1]) ** share, low[2] * (high[2] / low[2]) ** share
+    raise AssertionError(mhz)
+
+
+def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trunks: bool = False) -> float:
+    """Length of a segment inside crowns (cones) or trunks (cylinders).
+
+    The largest of the distances outside base, top and side is a convex function along the segment: its minimum by
+    golden section, then the two ends of the chord by bisection.
+    """
+    start, step = np.array(a), np.array(b) - np.array(a)
+    length = float(np.sqrt((step**2).sum()))
+    base = trees.ground_m if trunks else trees.ground_m + trees.crown_base_m
+    top = trees.ground_m + (trees.crown_base_m if trunks else trees.height_m)
+    radius = (trees.trunk_diameter_m if trunks else trees.crown_diameter_m) / 2
+    flat = step[0] ** 2 + step[1] ** 2
+    east, north = trees.east_m - start[0], trees.north_m - start[1]
+    near = np.clip((east * step[0] + north * step[1]) / flat, 0, 1) if flat > 0 else np.zeros(len(trees))
+    close = np.hypot(east - near * step[0], north - near * step[1]) < radius
+    close &= (min(a[2], b[2]) < top) & (max(a[2], b[2]) > base) & (radius > 0) & (top > base)
+    close[list(without)] = False
+    rows = np.flatnonzero(close)
+    if not len(rows) or length == 0:
+        return 0.0
+    east, north, low, high, wide = east[rows], north[rows], base[rows], top[rows], radius[rows]
+
+    def outside(t: FloatArray) -> FloatArray:
+        up = start[2] + t * step[2]
+        side = np.hypot(t * step[0] - east, t * step[1] - north)
+        reach = wide if trunks else wide * (high - up) / (high - low)
+        return np.asarray(np.maximum(np.maximum(low - up, up - high), side - reach))
+
+    left, right, ratio = np.zeros(len(rows)), np.ones(len(rows)), (math.sqrt(5) - 1) / 2
+    for _ in range(70):
+        one, two = right - ratio * (right - left), left + ratio * (right - left)
+        lower = outside(one) < outside(two)
+        left, right = np.where(lower, left, one), np.where(lower, two, right)
+    middle = (left + right) / 2
+    inside = outside(middle) < 0
+    ends = []
+    for edge in (0.0, 1.0):
+        within, beyond = middle, np.full(len(rows), edge)
+        for _ in range(50):
+            half = (within + beyond) / 2
+            good = outside(half) < 0
+            within, beyond = np.where(good, half, within), np.where(good, beyond, half)
+        ends.append(np.where(outside(np.full(len(rows), edge)) < 0, edge, within))
+    return float(((ends[1] - ends[0]) * inside).sum() * length)

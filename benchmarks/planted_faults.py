@@ -1,0 +1,326 @@
+"""Faults planted one at a time into the replay, and whether the audit of a report sees them.
+
+The flight is the sample flight with the aircraft's attitude and attenuating trees, thinned: nothing of the replay lies
+idle. Each fault is a change of one line of the package, made in memory and taken back. Beside the verdict of the audit
+stands what the fault changes: RSS, the phase of H, ranks at K = 10. A fault below 0.1 dB, 0.01 rad and any rank need
+not be seen.
+
+Run: python benchmarks/planted_faults.py [--only TEXT] [--no-sionna] [--markdown] [--json]
+"""
+
+# ruff: noqa: E501 (one fault a line)
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib
+import inspect
+import json
+import sys
+import textwrap
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+ROOT = Path(__file__).parents[1]
+P = "aerpaw_cmp.propagation"
+
+
+@dataclasses.dataclass(frozen=True)
+class Fault:
+    """``old`` becomes ``new`` in a function or method of a module."""
+
+    name: str
+    module: str
+    where: str
+    old: str
+    new: str
+
+
+FAULTS = (
+    Fault("every reflection times -0.1", f"{P}.channel", "_reflect", "(index >= 0)[:, None, None], result", "(index >= 0)[:, None, None], -0.1 * result"),
+    Fault("sign of the reflection", f"{P}.channel", "_reflect", "(index >= 0)[:, None, None], result", "(index >= 0)[:, None, None], -result"),
+    Fault("conjugate carrier phase", f"{P}.channel", "_chunk_field", "np.exp(-2j", "np.exp(2j"),
+    Fault("TE and TM exchanged", f"{P}.channel", "_reflect", "r_te, r_tm = reflection", "r_tm, r_te = reflection"),
+    Fault("p component not turned with the ray", f"{P}.channel", "_reflect", "-r_tm * _mirror(normal, wave)", "-r_tm * wave"),
+    Fault("slant mirrored", f"{P}.channel", "_radiate", "array.slant_rad.reshape", "(-array.slant_rad).reshape"),
+    Fault("slant of the UAV's elements left out", f"{P}.channel", "_radiate", "array.slant_rad.reshape(shape)", "array.slant_rad.reshape(shape) * (axis == 3)"),
+    Fault("1 dB on every path", f"{P}.channel", "_chunk_field", "return np.asarray(received * amplitude", "return np.asarray(1.122 * received * amplitude"),
+    Fault("0.11 dB on every path", f"{P}.channel", "_chunk_field", "return np.asarray(received * amplitude", "return np.asarray(1.01275 * received * amplitude"),
+    Fault("0.011 rad on every path", f"{P}.channel", "_chunk_field", "return np.asarray(received * amplitude", "return np.asarray(np.exp(0.011j) * received * amplitude"),
+    Fault("0.011 rad on every reflection", f"{P}.channel", "_reflect", "(index >= 0)[:, None, None], result", "(index >= 0)[:, None, None], np.exp(0.011j) * result"),
+    Fault("speed of light 3e8 m/s", "aerpaw_cmp.common.units", "wavelength_m", "SPEED_OF_LIGHT_MPS", "3e8"),
+    Fault("spreading over the direct distance", f"{P}.channel", "_chunk_field", "amplitude = np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))", "amplitude = np.minimum(1.0, 1.0 / (4.0 * np.pi * np.linalg.norm(poses.position_m[paths.pose[rows]] - source_m, axis=1)[:, None, None] / wavelength))"),
+    Fault("spreading missing", f"{P}.channel", "_chunk_field", "amplitude = np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))", "amplitude = np.full_like(cycles, 1e-4)"),
+    Fault("angle of incidence of the array's centre plus 1 degree", f"{P}.channel", "_reflect", "cos_theta = np.abs(", "cos_theta = np.cos(np.pi / 180) * np.abs("),
+    Fault("walls as half-spaces", f"{P}.channel", "reflection_coefficients", "slab = np.isfinite(thickness_m)", "slab = np.zeros_like(np.isfinite(thickness_m))"),
+    Fault("second echo of a slab once, not twice through", f"{P}.channel", "reflection_coefficients", "-4j * np.pi", "-2j * np.pi"),
+    Fault("mirrored by half the height", f"{P}.channel", "_chunk_field", "image -= 2.0 *", "image -= 1.99 *"),
+    Fault("H not transposed for a transmitting UAV", f"{P}.channel", "channel_matrices", "if link.uav_transmits:", "if not link.uav_transmits:"),
+    Fault("foliage as 10 log of an amplitude", f"{P}.channel", "channel_matrices", "(-loss_db[rows] / 20.0)", "(-loss_db[rows] / 10.0)"),
+    Fault("tower ports from the right", f"{P}.arrays", "_centred_line", "along_m.mean() - along_m", "along_m - along_m.mean()"),
+    Fault("UAV ports row by row", f"{P}.arrays", "uav_comparison_array", "[0, half, -half], [0, -half, half]", "[0, -half, half], [0, half, -half]"),
+    Fault("UAV array at a whole wavelength", f"{P}.arrays", "uav_comparison_array", "wavelength_m / 4", "wavelength_m / 2"),
+    Fault("roll sign of a mount", f"{P}.arrays", "rotation_from_yaw_pitch_roll", "np.cos(roll), np.sin(roll)", "np.cos(roll), -np.sin(roll)"),
+    Fault("yaw of a mount clockwise", f"{P}.arrays", "rotation_from_yaw_pitch_roll", "np.cos(yaw), np.sin(yaw)", "np.cos(yaw), -np.sin(yaw)"),
+    Fault("roll sign of the aircraft", "aerpaw_cmp.flight.track", "body_rotation", "np.asarray(roll_deg, dtype=np.float64),", "-np.asarray(roll_deg, dtype=np.float64),"),
+    Fault("pitch sign of the aircraft", "aerpaw_cmp.flight.track", "body_rotation", "-np.asarray(pitch_deg", "np.asarray(pitch_deg"),
+    Fault("heading from south", "aerpaw_cmp.flight.track", "body_rotation", "90.0 - np", "-90.0 - np"),
+    Fault("heading plus 2 degrees", "aerpaw_cmp.flight.track", "body_rotation", "90.0 - np", "92.0 - np"),
+    Fault("angles of the aircraft in another order", "aerpaw_cmp.flight.track", "body_rotation", "ZYX", "XYZ"),
+    Fault("concrete as brick", "aerpaw_cmp.site.materials", "material", "return Material(key, _TABLE[key]", "return Material(key, _TABLE['brick' if key == 'concrete' else key]"),
+    Fault("ground of wet earth", "aerpaw_cmp.site.materials", "material", "return Material(key, _TABLE[key]", "return Material(key, _TABLE['wet_ground' if key == 'medium_dry_ground' else key]"),
+    Fault("permittivity with a gain", "aerpaw_cmp.site.materials", "Material.relative_permittivity", "-loss)", "loss)"),
+    Fault("conductivity at 1 GHz", "aerpaw_cmp.site.materials", "Material.conductivity_s_per_m", "(frequency_hz / 1e9) ** d", "1.0 ** d"),
+    Fault("walls 10 % thicker", f"{P}.channel", "_Materials.of", "np.inf if t is None else t for t", "np.inf if t is None else 1.1 * t for t"),
+    Fault("foliage 10 % stronger", f"{P}.foliage", "P833.loss_db", "-self.gamma_db_per_m * depth", "-1.1 * self.gamma_db_per_m * depth"),
+    Fault("foliage without its largest loss", f"{P}.foliage", "P833.loss_db", "-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db)", "self.gamma_db_per_m * depth"),
+    Fault("foliage at the last entry of the table", f"{P}.foliage", "P833.at", "_GAMMA_EXPONENT * (mhz - inside)", "0.0 * (mhz - inside)"),
+    Fault("crowns of twice the radius", f"{P}.foliage", "CrownIndex.__init__", "trees.crown_diameter_m / 2", "trees.crown_diameter_m"),
+    Fault("crowns from the ground", f"{P}.foliage", "CrownIndex.__init__", "base = trees.ground_m + trees.crown_base_m", "base = trees.ground_m + 0.0 * trees.crown_base_m"),
+    Fault("crowns as cylinders", f"{P}.foliage", "CrownIndex.__init__", "self.shape: Shape = shape", "self.shape: Shape = 'cylinder'"),
+    Fault("one segment of a path without foliage", f"{P}.foliage", "foliage_depth_m", "for k in range(last, -2, -1):", "for k in range(last, -1, -1):"),
+    Fault("paths of two reflections dropped", f"{P}.image", "find_paths", "for level in select(tower, tree) if select else tree:", "for level in tree[:2]:"),
+    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(found, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(found, max_depth, faces))"),
+    Fault("direct paths dropped", f"{P}.image", "find_paths", "for level in select(tower, tree) if select else tree:", "for level in tree[1:]:"),
+    Fault("nothing hides", f"{P}.solids", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
+    Fault("walls 5 m longer than they are", f"{P}.faces", "inside", "faces.upper[index] + tolerance_m", "faces.upper[index] + 5.0"),
+    Fault("reflection points off by 1 % of the way", f"{P}.image", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
+    Fault("walls moved by 5 cm", f"{P}.faces", "_walls", "offset = float(normal[:2] @ start)", "offset = float(normal[:2] @ start) + 0.05"),
+    Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),
+    Fault("power summed over the receiving ports", f"{P}.channel", "mean_pair_power", ".mean(axis=(-2, -1))", ".mean(axis=-1).sum(axis=-1)"),
+    Fault("transmit power 1 dB more", f"{P}.channel", "rss_dbm", "transmit_power_dbm + db", "transmit_power_dbm + 1.0 + db"),
+    Fault("K compared with powers", "aerpaw_cmp.compare.rank", "rank_from_singular_values", "(1.0 / k + margin)", "(1.0 / k**2 + margin)"),
+)  # fmt: skip
+
+
+# ---------------------------------------------------------------- planting
+
+
+@contextmanager
+def planted(fault: Fault) -> Iterator[None]:
+    """The package with one fault."""
+    undo: list[Callable[[], None]] = []
+    try:
+        _plant(fault, undo)
+        yield
+    finally:
+        for step in reversed(undo):
+            step()
+
+
+def _plant(fault: Fault, undo: list[Callable[[], None]]) -> None:
+    module = importlib.import_module(fault.module)
+    owner: Any = module
+    *outer, name = fault.where.split(".")
+    for part in outer:
+        owner = getattr(owner, part)
+    raw = owner.__dict__[name] if outer else getattr(module, name)
+    source = textwrap.dedent(inspect.getsource(_function(raw)))
+    if source.count(fault.old) < 1:
+        raise SystemExit(f"{fault.name}: '{fault.old}' is not in {fault.module}.{fault.where}; the code has changed")
+    scope: dict[str, Any] = {}
+    code = compile("from __future__ import annotations\n" + source.replace(fault.old, fault.new), fault.where, "exec")
+    exec(code, module.__dict__ | {"__name__": module.__name__}, scope)
+    new = scope[name]
+    setattr(owner, name, new)
+    undo.append(lambda: setattr(owner, name, raw))
+    if outer:
+        return
+    # who imported the function by name has it too
+    for other in list(sys.modules.values()):
+        if getattr(other, "__name__", "").startswith("aerpaw_cmp") and other is not module:
+            for attribute, value in list(vars(other).items()):
+                if value is raw:
+                    setattr(other, attribute, new)
+                    undo.append(lambda other=other, attribute=attribute: setattr(other, attribute, raw))
+
+
+def _function(raw: Any) -> Any:
+    if isinstance(raw, property):
+        return raw.fget
+    return raw.__func__ if isinstance(raw, (classmethod, staticmethod)) else raw
+
+
+# ---------------------------------------------------------------- the flight
+
+
+def sample_flight(every: int = 40) -> Any:
+    """The sample flight with attitude and trees, of three series: one tower's two channels, another's, and the rank."""
+    from aerpaw_cmp.flight.data import gather, read_logs
+    from aerpaw_cmp.flight.settings import load_flight
+
+    file = ROOT / "sample_logs" / "flight.yaml"
+    settings = load_flight(file)
+    rt = settings.rt.model_copy(
+        update={"attitude": "logged", "foliage": "attenuating", "audit_links": 60, "samples": 100_000}
+    )
+    settings = settings.model_copy(update={"rt": rt, "rss": settings.rss.model_copy(update={"lag": "off"})})
+    data = gather(settings, file.parent, read_logs(settings, file.parent, None), None)
+    kept = [s for s in data.rss if (s.tower, s.channel) in {("LW1", "USRP2"), ("LW3", "USRP1"), ("LW4", "USRP2")}]
+    thin = [dataclasses.replace(s, time=s.time[::every], measured_db=s.measured_db[::every]) for s in kept]
+    rank = [
+        dataclasses.replace(
+            s,
+            time=s.time[::every],
+            rank=s.rank[::every],
+            sinr_db=s.sinr_db[::every],
+            position_m=None if s.position_m is None else s.position_m[::every],
+        )
+        for s in data.rank
+    ]
+    site = dataclasses.replace(data.site, trees=_stand([data.site.towers[s.tower] for s in kept]))
+    return dataclasses.replace(data, site=site, rss=tuple(thin), rank=tuple(rank))
+
+
+def _stand(towers: list[Any]) -> Any:
+    """Tall trees round the towers, so that foliage is on many paths."""
+    from aerpaw_cmp.site.site import Trees
+
+    rng = np.random.default_rng(5)
+    place = np.concatenate([rng.uniform(-120, 120, (150, 2)) + t.position_m[:2] for t in towers])
+    like = np.ones(len(place))
+    return Trees(place[:, 0], place[:, 1], 0 * like, 25 * like, 8 * like, 4 * like, 0.4 * like)
+
+
+@dataclasses.dataclass(frozen=True)
+class Change:
+    """What a fault does to the replay: largest changes, and links with another rank at K = 10."""
+
+    rss_db: float
+    phase_rad: float
+    ranks: int
+
+    @property
+    def counts(self) -> bool:
+        """Whether the audit has to see it."""
+        return self.rss_db > 0.1 or self.phase_rad > 0.01 or self.ranks > 0
+
+
+def replays_of(data: Any) -> Any:
+    """All series, replayed."""
+    from aerpaw_cmp.jobs.flight_run import replay_flight
+
+    return replay_flight(data).all
+
+
+def ranks_of(replays: Any) -> list[Any]:
+    """Ranks at K = 10 of each replay, by the package's own count."""
+    from aerpaw_cmp.compare.rank import channel_rank
+
+    return [channel_rank(one.replay.h, 10.0) for one in replays]
+
+
+def change(clean: Any, faulty: Any, clean_ranks: list[Any], faulty_ranks: list[Any]) -> Change:
+    """Of the faulty replay from the clean one."""
+    rss = phase = 0.0
+    for one, two in zip(clean, faulty, strict=True):
+        a, b = one.replay, two.replay
+        covered = np.isfinite(a.rss_dbm) != np.isfinite(b.rss_dbm)
+        both = np.isfinite(a.rss_dbm) & np.isfinite(b.rss_dbm)
+        rss = max(rss, np.inf if covered.any() else 0.0, np.abs(a.rss_dbm - b.rss_dbm)[both].max(initial=0.0))
+        if a.h.shape != b.h.shape:
+            return Change(rss, np.inf, len(a.h))
+        strong = np.abs(a.h) > 0.1 * np.abs(a.h).max(axis=(2, 3), keepdims=True)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            turn = np.abs(np.angle(b.h / a.h))
+        phase = max(phase, float(np.nan_to_num(turn[strong]).max(initial=0.0)))
+    ranks = sum(int((a != b).sum()) for a, b in zip(clean_ranks, faulty_ranks, strict=True))
+    return Change(float(rss), phase, ranks)
+
+
+def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
+    """What ``report --strict`` would name, of the audit."""
+    from aerpaw_cmp.jobs import audit_flight
+
+    if sionna:
+        found = audit_flight.audit_replays(data, replays).audit
+        assert found is not None
+        assert found.fields is not None
+        lost = [f"the engine misses {found.missing_paths} paths"] if found.missing_paths else []
+        return [*lost, *found.fields.failures]
+    return list(reference_only(data, replays).failures)
+
+
+def reference_only(data: Any, replays: Any) -> Any:
+    """The audit without Sionna: the second implementation and the attitude."""
+    from aerpaw_cmp.jobs.audit_flight import attitude_checked, expectations
+    from aerpaw_cmp.propagation.field_audit import against_reference, spread_over_paths
+
+    total = attitude_checked(data, replays)
+    for one, expected in zip(replays, expectations(data, replays), strict=True):
+        chosen = spread_over_paths(one.replay, np.arange(0, len(one.poses), 2), 4)
+        total += against_reference(
+            data.site, one.poses, one.replay, chosen, expected, ks=(10.0,), max_depth=data.settings.rt.max_depth
+        )
+    return total
+
+
+def remembered() -> None:
+    """Sionna's answers do not change with the faults: the same question is asked once."""
+    from aerpaw_cmp.propagation import sionna
+
+    known: dict[bytes, Any] = {}
+    ask = sionna.own_coefficients
+
+    def own_coefficients(faces: Any, sources_m: Any, poses: Any, probe: Any, turns: Any, **options: Any) -> Any:
+        arrays = (faces.normal, faces.offset_m, faces.lower, faces.upper, sources_m, poses.position_m, *turns)
+        slants = [a.slant_rad for a in (*probe.tower_arrays.values(), probe.uav_array)]
+        key = b"".join(np.ascontiguousarray(a).tobytes() for a in (*arrays, *slants, options["usable"]))
+        key += repr((probe.carrier_hz, faces.material)).encode()
+        if key not in known:
+            known[key] = ask(faces, sources_m, poses, probe, turns, **options)
+        return known[key]
+
+    sionna.own_coefficients = own_coefficients
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--only", default="", help="faults whose name contains this")
+    parser.add_argument("--every", type=int, default=40, help="each so-manieth sample of the flight")
+    parser.add_argument("--no-sionna", action="store_true", help="the second implementation alone")
+    parser.add_argument("--markdown", action="store_true", help="the table for docs/numerics.md")
+    parser.add_argument("--json", action="store_true")
+    options = parser.parse_args()
+    data = sample_flight(options.every)
+    clean = replays_of(data)
+    clean_ranks = ranks_of(clean)
+    if not options.no_sionna:
+        remembered()
+    started = time.perf_counter()
+    false_alarms = failures(data, clean, sionna=not options.no_sionna)
+    print(f"clean: {false_alarms or 'no failure'}, {time.perf_counter() - started:.1f} s", file=sys.stderr)
+    rows = []
+    for fault in (f for f in FAULTS if options.only in f.name):
+        with planted(fault):
+            faulty = replays_of(data)
+            found = failures(data, faulty, sionna=not options.no_sionna)
+            faulty_ranks = ranks_of(faulty)
+        effect = change(clean, faulty, clean_ranks, faulty_ranks)
+        rows.append({"fault": fault.name, **dataclasses.asdict(effect), "counts": effect.counts, "caught": bool(found),
+                     "failures": len(found), "first": found[0] if found else ""})  # fmt: skip
+        print(rows[-1], file=sys.stderr)
+    result = {
+        "false_alarms": false_alarms,
+        "faults": len(rows),
+        "that_count": sum(r["counts"] for r in rows),
+        "caught": sum(r["caught"] for r in rows if r["counts"]),
+        "rows": rows,
+    }
+    if options.markdown:
+        print("| fault | RSS [dB] | phase [rad] | ranks, K = 10 | caught |\n| --- | --- | --- | --- | --- |")
+        for r in rows:
+            print(
+                f"| {r['fault']} | {r['rss_db']:.2g} | {r['phase_rad']:.2g} | {r['ranks']} | {'yes' if r['caught'] else 'no'} |"
+            )
+    print(json.dumps(result) if options.json else f"{result['caught']} of {result['that_count']} that count are caught")
+    return int(bool(false_alarms) or result["caught"] < result["that_count"])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

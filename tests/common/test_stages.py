@@ -1,0 +1,56 @@
+"""One timer and one progress: stages add up, a share is a number, and a terminal shows the time left."""
+
+from __future__ import annotations
+
+import sys
+import time
+
+import pytest
+
+from aerpaw_cmp import cli
+from aerpaw_cmp.common.stages import Stages, share_of
+
+
+def test_stages_keep_their_order_and_add_up() -> None:
+    told: list[tuple[str, float | None]] = []
+    stages = Stages(lambda text, fraction=None: told.append((text, fraction)))
+    for name in ("read", "replay", "read"):
+        with stages(name):
+            time.sleep(0.002)
+    with pytest.raises(ZeroDivisionError), stages("fails"):
+        _ = 1 / 0
+    assert list(stages.seconds) == ["read", "replay", "fails"]
+    assert stages.seconds["read"] >= 0.004 > 0.002 <= stages.seconds["replay"]
+    share_of(stages.progress, "maps")(0.5)
+    assert told == [("read", None), ("replay", None), ("read", None), ("fails", None), ("maps", 0.5)]
+
+
+def test_a_share_is_a_line_per_quarter_where_there_is_no_terminal(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = cli._Progress()
+    for i in range(101):
+        progress("sionna LW1", i / 100)
+    progress("50 %")  # a text is a text, whatever it ends with
+    out = capsys.readouterr()
+    assert out.out == ""
+    assert out.err.splitlines() == [f"sionna LW1 {q} %" for q in (25, 50, 75, 100)] + ["50 %"]
+
+
+def test_a_terminal_gets_one_bar_with_the_time_left(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "80")
+    progress = cli._Progress()
+    progress("maps", 0.25)
+    bar = progress._bar
+    time.sleep(0.02)
+    progress("maps", 0.75)
+    assert progress._bar is bar
+    assert bar.tasks[0].percentage == 75
+    assert bar.tasks[0].time_remaining is not None
+    progress("page")
+    assert progress._bar is None
+    err = capsys.readouterr().err
+    assert "maps" in err
+    assert "page" in err

@@ -1,0 +1,68 @@
+"""Below the receiver's noise floor a link is out of coverage."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.units import noise_floor_dbm
+from aerpaw_cmp.flight.settings import LinkSettings
+from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, single_element
+from aerpaw_cmp.propagation.baselines import free_space_dbm
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.siteyaml import load_site
+
+SITE = dataclasses.replace(load_site("lake_wheeler"), buildings=())
+EAST_M = np.array([100.0, 1000.0, 10_000.0, 90_000.0])
+
+
+def flown(floor_dbm: float | None = None, power_dbm: float = 0.0, loss_db: float = 0.0):
+    """Four poses ever farther from LW1, line of sight."""
+    place = SITE.towers["LW1"].position_m
+    position = np.column_stack([place[0] + EAST_M, np.full(4, place[1]), np.full(4, place[2] + 30.0)])
+    poses = Poses(position, np.broadcast_to(np.eye(3), (4, 3, 3)))
+    element = single_element(Isotropic())
+    more = {} if floor_dbm is None else {"noise_floor_dbm": floor_dbm}
+    link = Link(3.3e9, {"LW1": element}, element, transmit_power_dbm=power_dbm, **more)
+    loss = (lambda paths, *_: np.full(len(paths), loss_db)) if loss_db else None
+    expected = free_space_dbm(place[None], position, 3.3e9, power_dbm)[:, 0] - loss_db
+    return replay(SITE, link, poses, max_depth=0, loss=loss), expected
+
+
+def test_links_below_the_floor_have_no_level_no_channel_and_no_rank():
+    expected = flown()[1]
+    floor = 0.5 * (expected[1] + expected[2])
+    found, _ = flown(floor)
+    np.testing.assert_allclose(found.rss_dbm[:2, 0], expected[:2], atol=1e-6)
+    assert np.isnan(found.rss_dbm[2:]).all()
+    assert np.isnan(found.rss_power_dbm[2:]).all()
+    assert not found.has_path[2:].any()
+    assert found.has_path[:2].all()
+    assert not found.h[2:].any()
+    assert found.h[:2].all()
+
+
+def test_no_receiver_hears_beneath_the_thermal_noise_of_one_hertz():
+    assert np.isnan(flown(loss_db=260.0)[0].rss_dbm).all()  # -370 dBm counted as covered, with rank 1
+    assert np.isfinite(flown(loss_db=30.0)[0].rss_dbm).all()
+
+
+def test_floor_of_a_bandwidth():
+    assert noise_floor_dbm(1.0) == pytest.approx(-173.975, abs=1e-3)
+    assert noise_floor_dbm(20e6, 7.0) == pytest.approx(-173.975 + 73.0103 + 7.0, abs=1e-3)
+
+
+def test_settings():
+    def built(**keys):
+        return LinkSettings(carrier_hz=3.3e9, **keys).build(["LW1"], Path()).noise_floor_dbm
+
+    assert built() == pytest.approx(-173.975, abs=1e-3)
+    assert built(noise_floor_dbm=-110.0) == -110.0
+    assert built(bandwidth_hz=1e6, noise_figure_db=5.0) == pytest.approx(-108.975, abs=1e-3)
+    with pytest.raises(ValueError, match="not both"):
+        built(noise_floor_dbm=-110.0, bandwidth_hz=1e6)
+    with pytest.raises(ValueError, match="needs bandwidth_hz"):
+        built(noise_figure_db=5.0)

@@ -1,0 +1,201 @@
+"""The second implementation: against closed forms, against the replay, and faults that it must see."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.propagation import channel, field_audit, reference, solids
+from aerpaw_cmp.propagation.arrays import (
+    linear_array,
+    rotation_from_aircraft,
+    rotation_from_yaw_pitch_roll,
+    tower_comparison_array,
+    uav_comparison_array,
+)
+from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
+from aerpaw_cmp.site.materials import MATERIALS, VEGETATION, material
+from aerpaw_cmp.site.site import Trees
+
+KS = (10.0, 100.0)
+
+
+def stand(count=60, seed=6):
+    rng = np.random.default_rng(seed)
+    like = np.ones(count)
+    return Trees(*rng.uniform(-90, 90, (2, count)), 0 * like, 18 * like, 9 * like, 5 * like, 0.4 * like)
+
+
+def loss_of(trees, model):
+    index = CrownIndex(trees)
+    return lambda p, s, t: foliage_loss_db(s[p.tower], p.vertices_m, t[p.pose], index, model, p.tree)
+
+
+@pytest.fixture
+def case(scenes):
+    rng = np.random.default_rng(41)
+    site = scenes.site(scenes.buildings(rng, 4, spread_m=60.0, holes=True), ((0.0, 0.0, 10.0), (3.0, -5.0, 9.0, 1.5)))
+    angles = rng.uniform(-15, 15, (3, 6))
+    turn = rotation_from_aircraft(angles[0], angles[1], 12 * angles[2])
+    poses = scenes.poses(rng.uniform([-80, -80, 12], [80, 80, 40], (6, 3)), turn)
+    link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
+    return site, link, poses
+
+
+def audited(site, link, poses, found, loss=None, **settings):
+    expected = field_audit.Expected.of(link, loss)
+    rows = np.arange(len(poses))
+    return field_audit.against_reference(site, poses, found, rows, expected, ks=KS, max_depth=2, **settings)
+
+
+@pytest.mark.parametrize("pattern", [None, HalfWaveDipole(), TR38901()])
+def test_replay_equals_the_second_implementation(scenes, case, pattern):
+    site, link, poses = case
+    if pattern is not None:
+        uav = uav_comparison_array(wavelength_m(scenes.carrier_hz), pattern=pattern)
+        link = scenes.link(site, tower_comparison_array(pattern=pattern), uav)
+    found = audited(site, link, poses, replay(site, link, poses))
+    assert found.failures == ()
+    assert found.h_max_error < 1e-11
+    assert (found.missing_paths, found.phantom_paths, found.doubtful) == (0, 0, 0)
+    assert found.reference_paths > 20
+
+
+@pytest.mark.parametrize(
+    ("name", "in_leaf"), [("p833", True), ("p833", False), ("weissberger", True), ("opaque", True)]
+)
+def test_foliage_equals_the_second_implementation(scenes, case, name, in_leaf):
+    site, link, poses = case
+    site = replace(site, trees=stand())
+    model = foliage_model(name, scenes.carrier_hz, in_leaf=in_leaf)
+    crowns = Crowns(site.trees) if name == "opaque" else None
+    result = replay(site, link, poses, loss=loss_of(site.trees, model), crowns=crowns)
+    found = audited(site, link, poses, result, reference.ExpectedLoss(name, in_leaf=in_leaf))
+    assert found.failures == ()
+    bare = replay(site, link, poses)
+    assert not np.allclose(result.rss_dbm, bare.rss_dbm, equal_nan=True)  # trees are in the way
+    lighter = audited(site, link, poses, result, reference.ExpectedLoss("p833", gamma_db_per_m=0.4))
+    assert lighter.failures
+
+
+@pytest.mark.parametrize("frequency_hz", [60e6, 300e6, 1e9, 2e9, 3.4e9, 28e9])
+def test_p833_a_second_time(frequency_hz):
+    depth = np.array([0.5, 5.0, 50.0])
+    ours = foliage_model("p833", frequency_hz).loss_db(depth)
+    theirs = [reference.foliage_db(reference.ExpectedLoss("p833"), d, frequency_hz) for d in depth]
+    assert theirs == pytest.approx(ours, rel=1e-12)
+
+
+@pytest.mark.parametrize("name", MATERIALS)
+def test_materials_a_second_time(name):
+    what = material(name)
+    carrier = {"floorboard": 60e9}.get(name, 3.4e9)
+    eta, thickness = reference.permittivity(name, carrier)
+    assert eta == pytest.approx(what.relative_permittivity(carrier), rel=1e-12)
+    assert thickness == what.thickness_m
+    assert reference.permittivity("vegetation", 3e9)[0] == pytest.approx(VEGETATION.relative_permittivity(3e9))
+
+
+def test_rotations_a_second_time():
+    for a, b, c in np.random.default_rng(1).uniform(-180, 180, (20, 3)):
+        ours = rotation_from_yaw_pitch_roll(*np.radians([a, b, c]))
+        assert np.array(reference.turned(a, b, c)) == pytest.approx(ours, abs=1e-14)
+        assert np.array(reference.aircraft(a, b, c)) == pytest.approx(rotation_from_aircraft(a, b, c), abs=1e-14)
+    # nose up lifts the nose, right wing down lowers the right wing
+    assert reference.aircraft(0, 10, 0)[2][0] > 0
+    assert reference.aircraft(10, 0, 0)[2][1] > 0
+
+
+def test_layouts_a_second_time():
+    wavelength = 0.09
+    for name, array in (
+        ("tower_comparison", tower_comparison_array()),
+        ("uav_comparison", uav_comparison_array(wavelength)),
+        ("linear", linear_array(5, wavelength / 2)),
+        ("single", linear_array(1, wavelength / 2)),
+    ):
+        theirs = np.array(reference.layout_positions(name, wavelength, 5))
+        assert theirs == pytest.approx(array.positions_m, abs=1e-15)
+
+
+def test_free_space_and_a_perfect_ground_in_closed_form(scenes):
+    site = scenes.site()
+    link = field_audit.Expected.of(scenes.link(site)).link
+    one = reference.Reference(site, "LW1", link)
+    turn = reference.turned(0, 0, 0)
+    h = one.pair((), 0, 0, (300.0, 0.0, 10.0), turn)
+    assert abs(h) == pytest.approx(wavelength_m(link.carrier_hz) / (4 * np.pi * 300), rel=1e-12)
+    assert reference.fresnel(1.0, 4 + 0j, None, 0.1) == pytest.approx((-1 / 3, 1 / 3))
+    te, tm = reference.fresnel(0.3, 1e12 - 1e12j, None, 0.1)
+    assert (te, tm) == (pytest.approx(-1, abs=1e-5), pytest.approx(1, abs=1e-4))
+
+
+def test_chord_through_a_crown_in_closed_form():
+    one = Trees(*(np.array([x]) for x in (10.0, 0.0, 0.0, 20.0, 8.0, 4.0, 0.4)))
+    # level, through the axis: the cone is 4 m in radius at 4 m and 0 at 20 m
+    assert reference.crown_depth_m(one, (0, 0, 8), (20, 0, 8), set()) == pytest.approx(6.0, abs=1e-9)
+    assert reference.crown_depth_m(one, (10, 0, 30), (10, 0, 0), set()) == pytest.approx(16.0, abs=1e-9)
+    assert reference.crown_depth_m(one, (0, 0, 2), (20, 0, 2), set(), trunks=True) == pytest.approx(0.4, abs=1e-9)
+    assert reference.crown_depth_m(one, (0, 0, 8), (20, 0, 8), {0}) == 0.0
+
+
+def _wrap(monkeypatch, where, name, change):
+    clean = getattr(where, name)
+    monkeypatch.setattr(where, name, lambda *args: change(clean(*args)))
+
+
+FAULTS = {
+    "reflections times -0.1": (channel, "_reflect", lambda wave: -0.1 * wave),
+    "TE and TM exchanged": (channel, "reflection_coefficients", lambda r: r[::-1]),
+    "0.011 rad": (channel, "_chunk_field", lambda h: h * np.exp(0.011j)),
+    "0.11 dB": (channel, "_chunk_field", lambda h: h * 10 ** (0.11 / 20)),
+    "nothing hides": (solids.Occlusion, "segments", np.zeros_like),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_planted_fault_is_seen(monkeypatch, case, fault):
+    site, link, poses = case
+    _wrap(monkeypatch, *FAULTS[fault])
+    assert audited(site, link, poses, replay(site, link, poses)).failures
+
+
+def test_dropped_and_invented_paths_are_seen(case):
+    site, link, poses = case
+    clean = replay(site, link, poses)
+    fewer = replace(clean, paths=clean.paths.select(np.arange(len(clean.paths)) % 7 > 0))
+    assert audited(site, link, poses, fewer).missing_paths > 0
+    assert audited(site, link, poses, fewer, complete=False).missing_paths == 0
+    faces = clean.paths.faces.copy()
+    row = int(np.flatnonzero(clean.paths.depth == 1)[0])
+    faces[row, 0] = np.flatnonzero(clean.faces.normal[:, 2] == 0)[0]  # over a wall that it does not meet
+    moved = replace(clean, paths=replace(clean.paths, faces=faces))
+    assert audited(site, link, poses, moved).phantom_paths == 1
+
+
+def test_audit_of_several_replays_adds_up():
+    from aerpaw_cmp.compare.field_difference import FieldAudit
+
+    one = FieldAudit(paths=3, power_rms_db=1.0, power_max_db=2.0, failures=("a",))
+    two = FieldAudit(paths=1, power_rms_db=3.0, power_max_db=1.0, failures=("a", "b"))
+    both = one + two
+    assert (both.paths, both.power_max_db, both.failed) == (4, 2.0, 2)
+    assert both.power_rms_db == pytest.approx(np.sqrt((3 * 1 + 9) / 4))
+    assert both.as_dict()["failed"] == 2
+
+
+def test_audited_poses_meet_every_kind_of_path(case):
+    site, link, poses = case
+    found = replay(site, link, poses)
+    few = field_audit.spread_over_paths(found, np.arange(len(poses)), 3)
+    assert len(few) == 3
+
+    def kinds(rows):
+        here = np.isin(found.paths.pose, rows)
+        return len(np.unique(np.column_stack([found.paths.tower, found.paths.faces])[here], axis=0))
+
+    assert kinds(few) >= kinds([0, 1, 2])

@@ -1,0 +1,237 @@
+"""The page in a real browser: numbers, links between the views, keyboard, accessibility, widths, no network."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+from importlib import resources
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.offset import grid_offset
+from aerpaw_cmp.report import write
+
+selenium = pytest.importorskip("selenium", reason="selenium is not installed")
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+pytestmark = pytest.mark.skipif(not (BROWSER and DRIVER), reason="no chromium with chromedriver on this machine")
+
+
+def start(*arguments: str, scripts: bool = True):
+    from selenium.webdriver import Chrome, ChromeOptions
+    from selenium.webdriver.chrome.service import Service
+
+    options = ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", *arguments):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    if not scripts:
+        options.add_experimental_option("prefs", {"profile.managed_default_content_settings.javascript": 2})
+    return Chrome(options=options, service=Service(DRIVER))
+
+
+@pytest.fixture(scope="module")
+def page(small_report, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("page")
+    return write.write_report(small_report, folder, drawn="page").files[0]
+
+
+@pytest.fixture(scope="module")
+def driver(page):
+    found = start("--window-size=1440,1200")
+    found.get(page.as_uri())
+    yield found
+    found.quit()
+
+
+@pytest.fixture(autouse=True)
+def whole_flight(request):
+    if "driver" in request.fixturenames:
+        request.getfixturevalue("driver").execute_script("explorer.span(null)")
+
+
+def choose(driver, element: str, text: str) -> None:
+    from selenium.webdriver.support.ui import Select
+
+    Select(driver.find_element("id", element)).select_by_visible_text(text)
+
+
+def frame(driver) -> None:
+    driver.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done));")
+
+
+def test_nothing_is_said_on_the_console_and_nothing_leaves_the_page(driver):
+    assert [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
+    asked = [
+        message["params"]["request"]["url"]
+        for message in (json.loads(entry["message"])["message"] for entry in driver.get_log("performance"))
+        if message["method"] == "Network.requestWillBeSent"
+    ]
+    assert [url for url in asked if not url.startswith(("file:", "data:", "chrome:"))] == []
+
+
+def test_numbers_of_the_whole_flight_are_those_of_the_report(driver, small_report):
+    for panel in small_report.rss:
+        choose(driver, "choose-series", panel.name)
+        choose(driver, "choose-model", "ray tracing")
+        found = driver.execute_script("return explorer.statistics()")
+        fit = grid_offset(panel.measured_db, panel.simulated_dbm)
+        assert (found["n"], round(found["offset"], 6)) == (fit.n, fit.offset_db)
+        assert found["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
+
+
+def test_a_model_and_a_span_change_the_numbers(driver, small_report):
+    panel = small_report.rss[0]
+    choose(driver, "choose-series", panel.name)
+    choose(driver, "choose-model", "free space")
+    seconds = (panel.time - panel.time[0]) / np.timedelta64(1, "s")
+    first, last = seconds[len(seconds) // 4], seconds[len(seconds) // 2]
+    start_s = driver.execute_script("const s = explorer.data.rss[0]; return explorer.series(s.time)[0]")
+    driver.execute_script("explorer.span([arguments[0], arguments[1]])", start_s + first - 1e-6, start_s + last + 1e-6)
+    inside = (seconds >= first) & (seconds <= last)
+    baseline = next(b for b in panel.baselines if b.name == "free_space")
+    fit = grid_offset(panel.measured_db[inside], baseline.level_dbm[inside])
+    found = driver.execute_script("return explorer.statistics()")
+    assert found["n"] == fit.n
+    assert found["offset"] == pytest.approx(fit.offset_db, abs=1e-6)
+    assert found["rmse"] == pytest.approx(fit.rmse_db, abs=1e-4)
+    frame(driver)
+    assert f"{fit.rmse_db:.2f} dB" in driver.find_element("id", "span").text
+
+
+def test_pointing_at_a_chart_marks_the_pose_in_all_views(driver):
+    from selenium.webdriver import ActionChains
+
+    choose(driver, "choose-model", "ray tracing")
+    over = driver.find_elements("css selector", ".u-over")
+    assert len(over) >= 3
+    ActionChains(driver).move_to_element(over[0]).perform()
+    frame(driver)
+    pose = driver.execute_script("return explorer.state.pose")
+    assert pose is not None
+    facts = driver.find_element("id", "pose").text
+    assert "Residual" in facts
+    assert "East, north, up" in facts
+    ActionChains(driver).move_to_element_with_offset(over[1], 40, 0).perform()
+    frame(driver)
+    assert driver.execute_script("return explorer.state.pose") > pose
+    assert driver.find_element("id", "pose").text != facts
+
+
+def test_dragging_over_a_chart_chooses_a_span_and_escape_takes_it_back(driver):
+    from selenium.webdriver import ActionChains, Keys
+
+    over = driver.find_elements("css selector", ".u-over")[0]
+    whole = driver.execute_script("return explorer.statistics().n")
+    ActionChains(driver).move_to_element_with_offset(over, -80, 0).click_and_hold().move_by_offset(
+        120, 0
+    ).release().perform()
+    frame(driver)
+    assert 0 < driver.execute_script("return explorer.statistics().n") < whole
+    driver.find_element("id", "map").send_keys(Keys.ESCAPE)
+    assert driver.execute_script("return explorer.statistics().n") == whole
+
+
+def test_the_keyboard_steps_through_the_poses(driver):
+    from selenium.webdriver import Keys
+
+    canvas = driver.find_element("id", "map")
+    canvas.send_keys(Keys.ARROW_RIGHT)
+    first = driver.execute_script("return explorer.state.pose")
+    canvas.send_keys(Keys.ARROW_RIGHT)
+    assert driver.execute_script("return explorer.state.pose") > first
+    canvas.send_keys("[")
+    span = driver.execute_script("return explorer.state.span")
+    assert span[0] == driver.execute_script("return explorer.state.pose")
+
+
+def test_the_map_shows_the_flight_from_above_and_in_three_dimensions(driver):
+    ink = "const c = document.getElementById('map'), d = c.getContext('2d').getImageData(0, 0, c.width, c.height).data; const s = new Set(); for (let i = 0; i < d.length; i += 40) s.add(d[i] << 16 | d[i+1] << 8 | d[i+2]); return s.size;"
+    driver.find_element("id", "view-plan").click()
+    frame(driver)
+    assert driver.execute_script(ink) > 8
+    driver.find_element("id", "view-solid").click()
+    frame(driver)
+    assert driver.execute_script(ink) > 8
+    assert driver.execute_script("return explorer.state.tilt") < 1
+
+
+def test_no_serious_finding_of_accessibility(driver):
+    axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is not installed")
+    source = resources.files(axe) / "node_modules" / "axe-core" / "axe.min.js"
+    driver.execute_script(source.read_text(encoding="utf-8"))
+    # HTML 5.2 lets <div> group the items of a <dl>, which the packaged axe does not know yet
+    rules = {"rules": {"dlitem": {"enabled": False}}}
+    found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
+    serious = {
+        v["id"]: [n["html"][:120] for n in v["nodes"]]
+        for v in found["violations"]
+        if v["impact"] in ("serious", "critical")
+    }
+    assert serious == {}
+
+
+@pytest.mark.parametrize("width", [1440, 768, 390])
+def test_nothing_overflows(driver, width):
+    driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride", {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
+    )
+    frame(driver)
+    try:
+        assert driver.execute_script("return document.documentElement.scrollWidth") <= width
+        charts = driver.execute_script(
+            "return [...document.querySelectorAll('.u-wrap')].map(c => c.getBoundingClientRect().right)"
+        )
+        assert charts
+        assert max(charts) <= width
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def test_dark_and_light(driver):
+    seen = []
+    for scheme in ("light", "dark"):
+        driver.execute_cdp_cmd(
+            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
+        )
+        frame(driver)
+        seen.append(driver.execute_script("return getComputedStyle(document.body).backgroundColor"))
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    assert seen == ["rgb(255, 255, 255)", "rgb(23, 23, 23)"]
+
+
+def test_with_scripts_off_the_static_figures_stand(page):
+    found = start(scripts=False)
+    try:
+        found.get(page.as_uri())
+        assert not found.find_element("id", "explorer").is_displayed()
+        assert found.find_element("id", "overview").is_displayed()
+        assert found.find_element("css selector", ".numbers").is_displayed()
+    finally:
+        found.quit()
+
+
+def test_a_broken_formula_would_be_seen(driver, small_report):
+    """The comparison above is no tautology: an offset changed in the page's data changes the page's numbers."""
+    panel = small_report.rss[0]
+    choose(driver, "choose-series", panel.name)
+    right = driver.execute_script("return explorer.statistics().rmseFlight")
+    wrong = driver.execute_script(
+        "const m = explorer.data.rss[0].models[explorer.state.model]; m.offset += 1; "
+        "const v = explorer.statistics().rmseFlight; m.offset -= 1; return v"
+    )
+    assert wrong > right + 0.01
+
+
+def test_only_rank(small_report, tmp_path, driver):
+    bare = dataclasses.replace(small_report, rss=(), pairs=(), speed=())
+    path = write.write_report(bare, tmp_path, drawn="none").files[0]
+    here = driver.current_url
+    driver.get(path.as_uri())
+    try:
+        assert driver.execute_script("return explorer.rankStatistics().n") == np.isfinite(bare.rank[0].measured).sum()
+        assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
+    finally:
+        driver.get(here)

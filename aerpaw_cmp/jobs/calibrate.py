@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -28,8 +27,9 @@ from ..compare.direction_gain import (
     Term,
     column_forms,
 )
+from ..compare.mount import GainOf
 from ..flight.data import FlightData, RssSeries, gather, read_logs
-from ..flight.settings import AntennaSettings, FlightFile, Settings, load_flight, load_pattern
+from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 
@@ -42,7 +42,7 @@ class PatternsSettings(Settings):
 
     uav: AntennaSettings | None = None
     tower: AntennaSettings | None = None
-    towers: dict[str, AntennaSettings] = {}
+    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
     """By ``tower.channel``, where they differ."""
 
 
@@ -85,7 +85,8 @@ class GroundFit:
     @property
     def likely_m(self) -> tuple[float, float]:
         """Heights within 2 of the best log likelihood (some 95 %)."""
-        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > max(self.log_likelihood) - 2.0]  # fmt: skip
+        least = max(self.log_likelihood) - 2.0
+        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
         return min(near), max(near)
 
 
@@ -131,7 +132,7 @@ def calibrate(path: Path, *, logs_root: Path | None = None, stages: Stages | Non
     with stages("read"):
         flights = read_flights(settings, path.parent, logs_root)
     observed, warnings = observe(flights)
-    recipe = recipe_of(settings, observed, flights, logs_root or path.parent)
+    recipe = recipe_of(settings, observed, logs_root or path.parent)
     series = [o.samples for o in observed]
     with stages("fit"):
         learned = calibration.learn(series, recipe)
@@ -189,7 +190,7 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
                 continue
             if guessed > 0.01:
                 warnings.append(
-                    f"{name}: {100 * guessed:.0f} % of the attitudes of {series.tower} {series.channel} are not logged: "
+                    f"{name}: {100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown: "
                     "heading from the track, level flight"
                 )
             carriers.setdefault(one.samples.antenna, {})[name] = series.link.carrier_hz
@@ -256,21 +257,18 @@ def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
     return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
 
 
-def recipe_of(
-    settings: CalibrationFile, observed: Sequence[Observed], flights: Sequence[FlightData], folder: Path
-) -> Recipe:
+def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
     """Terms and patterns as calibration.yaml asks."""
     terms: dict[str, tuple[Term, ...]] = {
         "both": UAV_TERMS + TOWER_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
     }  # fmt: skip
-    patterns: dict[str, calibration.GainOf] = {}
+    patterns: dict[str, GainOf] = {}
     if settings.patterns.uav is not None:
         patterns["uav"] = gain_of(settings.patterns.uav, folder)
     for antenna in dict.fromkeys(o.samples.antenna for o in observed):
         chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
         if chosen is not None:
             patterns[antenna] = gain_of(chosen, folder)
-    del flights
     return Recipe(
         model=GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
         rotation=rotation,
@@ -280,7 +278,7 @@ def recipe_of(
     )
 
 
-def gain_of(settings: AntennaSettings, folder: Path) -> calibration.GainOf:
+def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
     """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
     pattern = load_pattern(settings, folder)
 
@@ -401,8 +399,8 @@ def words_of(
     mean = calibration.mean_rmse
     free, here = mean(headline, "free_space_rmse_db"), mean(headline)
     out = [
-        f"On flights left out the learned antennas leave {here:.2f} dB ({mean(headline, 'rmse_4s_db'):.2f} dB over 4 s); "
-        f"free space leaves {free:.2f} dB."
+        f"On flights left out the learned antennas leave {here:.2f} dB "
+        f"({mean(headline, 'rmse_4s_db'):.2f} dB over 4 s); free space leaves {free:.2f} dB."
     ]
     if sectors := scores["sector_left_out"]:
         base, left = mean(sectors, "free_space_rmse_db"), mean(sectors)
@@ -410,18 +408,22 @@ def words_of(
         share = (base - left) / gain if gain > 0 else 0.0
         out.append(
             f"Towards sectors of directions that the other flights never saw it leaves {left:.2f} dB: "
-            f"{100 * min(max(share, 0.0), 1.0):.0f} % of the gain over free space carries over there; the rest is bound "
-            "to directions and places that were flown before."
+            f"{100 * min(max(share, 0.0), 1.0):.0f} % of the gain over free space carries over there; the rest is "
+            "bound to directions and places that were flown before."
         )
     body, world, wrong = (
         mean(controls.get(name, ())) for name in
         ("body frame, no patterns", "world frame at the UAV", "heading turned the wrong way")
     )  # fmt: skip
     if math.isfinite(body) and math.isfinite(world):
-        kind = "antenna" if body < world - 0.05 else "place as well as antenna: the headings do not tell them apart"
+        kind = (
+            "at least partly antenna"
+            if body < min(world, wrong) - 0.05
+            else ("not told apart from the place: the headings are too much alike")
+        )
         out.append(
-            f"Without patterns, the UAV's gain in the body frame leaves {body:.2f} dB, in the world frame {world:.2f} dB, "
-            f"with the heading turned the wrong way {wrong:.2f} dB: it is {kind}."
+            f"Without patterns, the UAV's gain in the body frame leaves {body:.2f} dB, in the world frame {world:.2f} "
+            f"dB, with the heading turned the wrong way {wrong:.2f} dB: it is {kind}."
         )
     if not scores["heading_left_out"]:
         out.append("No heading could be left out: the flights share one.")
@@ -433,19 +435,3 @@ def words_of(
             f"Roughness of the ground that the data allow: {rough}."
         )  # fmt: skip
     return out
-
-
-def input_paths(settings: CalibrationFile, path: Path, logs_root: Path | None) -> list[Path]:
-    """Files that a calibration reads, as far as settings name them."""
-    from .run import input_files
-
-    found = input_files(settings, path, logs_root)
-    for name in settings.flights:
-        flight = path.parent / name
-        if os.path.isfile(flight):  # noqa: PTH113  never raises
-            found += input_files(_flight_or_nothing(flight), flight, logs_root)
-    return found
-
-
-def _flight_or_nothing(path: Path) -> FlightFile:
-    return load_flight(path)

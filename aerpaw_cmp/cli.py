@@ -203,6 +203,10 @@ def report(
     logs_root: LogsRoot = None,
     engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
     audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    recommend: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
+    ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
         str,
@@ -223,6 +227,7 @@ def report(
         logs_root=logs_root,
         engine=engine,
         audit=audit,
+        recommend=recommend,
         force=force,
         figures=figures,
         style=style,
@@ -267,6 +272,20 @@ def _print_report_summary(outcome: Any) -> None:
             rows,
             "RSS, measured against replayed",
         )
+    rows = [
+        [
+            ("* " if m["recommended"] else "") + m["model"],
+            m["tower"],
+            m["channel"],
+            _number(m["rmse_heldout_db"], "{:.2f}"),
+            _number(m["difference_to_best_db"], "{:+.2f}"),
+            _number(m["seconds"], "{:.1f}"),
+        ]
+        for m in outcome.metrics.get("ladder", ())
+    ]
+    if rows:
+        heads = ["model", "tower", "channel", "RMSE dB", "to the best", "s"]
+        _table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")
     rows = []
     for tower, m in outcome.metrics["rank"].items():
         for k, s in m["simulated"].items():
@@ -298,6 +317,21 @@ def simulate(
 
     for path in run.run_simulate(flight, out=out, force=force, progress=_say):
         print(path)
+
+
+@app.command(help=COMMANDS["sample"])
+def sample(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder that gets flight.yaml and the logs.")] = Path(
+        "sample"
+    ),
+    force: Force = False,
+) -> None:
+    """Copy the sample flight into a folder of your own."""
+    from .jobs.sample import write_sample
+
+    flight = write_sample(out, force=force)
+    print(f"flight: {flight}")
+    print(f"next: aerpaw-cmp report {flight}")
 
 
 @app.command(help=COMMANDS["doctor"])
@@ -485,6 +519,9 @@ def bench(
     _table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
+    if result["report"]:
+        seconds = {name.removeprefix("seconds_"): value for name, value in result["report"].items()}
+        print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
 
 
 @site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")
@@ -506,7 +543,7 @@ def site_import(
 @site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
 def site_show(
     site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
+    out: Out = None,
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045

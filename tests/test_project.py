@@ -105,3 +105,29 @@ def test_no_setting_is_without_effect() -> None:
     for model in models:
         for name in model.model_fields:
             assert re.search(rf"\.{name}\b", code), f"{model.__name__}.{name} is never read"
+
+
+def test_the_architecture_page_shows_the_rooms_that_are_there() -> None:
+    """One line per room in the table and in the picture, in the order that import-linter holds; nothing loose."""
+    package = ROOT / "aerpaw_cmp"
+    rooms = {path.parent.name for path in package.glob("*/__init__.py")}
+    loose = {path.stem for path in package.glob("*.py")} - {"__init__"}
+    assert loose == {"__main__", "cli"}
+    text = (ROOT / "docs" / "architecture.md").read_text()
+    table = re.findall(r"^\| `(\w+)` \|", text, re.MULTILINE)
+    assert set(table) == rooms
+    layers = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"][0]["layers"]
+    order = [layer.removeprefix("aerpaw_cmp.") for layer in layers if layer.removeprefix("aerpaw_cmp.") in rooms]
+    assert set(order) == rooms
+    assert table == order
+    picture = re.search(r"```\n(.*?)```", text, re.DOTALL)
+    assert picture is not None
+    assert [name for name in re.findall(r"^ *(\w+)", picture[1], re.MULTILINE) if name in rooms] == order
+
+
+def test_layers_stand_one_above_the_other() -> None:
+    contracts = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["importlinter"]["contracts"]
+    assert not [layer for layer in contracts[0]["layers"] if ":" in layer or "|" in layer]
+    assert [contract["type"] for contract in contracts][:2] == ["layers", "acyclic_siblings"]
+    assert "ignore_imports" not in contracts[0]
+    assert "ignore_imports" not in contracts[1]

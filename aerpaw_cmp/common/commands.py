@@ -12,6 +12,7 @@ COMMANDS: dict[str, str] = {
     "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",
     "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
+    "sample": "Copy the sample flight, logs and flight.yaml, into a folder of your own.",
     "site": "Import a site from map data (import) or look at one (show).",
     "bench": "Speed against error of the replay on this machine.",
     "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",

@@ -561,6 +561,16 @@ def column_forms(
     """``X' Sigma^-1 X`` (width, width), Sigma the covariance of a model with the gains integrated out.
 
     ``columns(series) -> (bins, width)`` must keep the bins of :meth:`LinkSamples.binned`.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+    model : GainModel
+        Its priors and noise make Sigma.
+    columns : callable
+        The columns X of one series, (bins, width).
+    width : int
+        Number of columns.
     """
     from scipy.linalg import cholesky, solve_triangular
 

@@ -189,6 +189,13 @@ def offset_curve(
 ) -> tuple[FloatArray, FloatArray]:
     """RMSE [dB] at every offset [dB] of the grid: how sharply the data fix the offset.
 
+    Parameters
+    ----------
+    measured_db, simulated_db : array_like, (n,)
+        Levels [dB]; pairs with a NaN do not count.
+    step_db, span_db : float, (float, float)
+        Of the candidate offsets, as in :func:`offset_grid` [dB].
+
     Returns
     -------
     (offsets_db, rmse_db), each (offsets,)
@@ -468,7 +475,22 @@ def reference_power_dbm(
     frequency_hz: float,
     amplifier: bool = False,
 ) -> float:
-    """The reference power [dBm] of one setting, at the nearest gain within 0.5 dB; NaN where the table has none."""
+    """The reference power [dBm] of one setting, at the nearest gain within 0.5 dB; NaN where the table has none.
+
+    Parameters
+    ----------
+    table : iterable of ReferencePower
+        As :func:`read_reference_powers` gives it.
+    node, channel : str
+        Of the USRP port; capitals do not count.
+    category : {"tx", "rx"}
+    gain_db : float
+        Gain setting of the port.
+    frequency_hz : float
+        Carrier; between the columns of the table powers are interpolated.
+    amplifier : bool
+        Whether the power amplifier was on.
+    """
     wanted = (node.lower(), category, channel.lower(), amplifier)
     rows = [row for row in table if (row.node, row.category, row.channel, row.amplifier) == wanted]
     near = sorted(

@@ -13,15 +13,15 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db
 from .statistics import (
     NO_INTERVAL,
     REPLICATES,
     SEED,
     Interval,
+    autocorrelation,
     bootstrap_means,
     interval,
-    memory,
     plain,
     same_places,
     share_interval,
@@ -292,7 +292,7 @@ def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int 
     n = len(one)
     if n < 8 or np.ptp(one) == 0 or np.ptp(two) == 0:
         return float("nan")
-    near = minimum_shift or max(memory(one).block_length, memory(two).block_length)
+    near = minimum_shift or max(autocorrelation(one).block_length, autocorrelation(two).block_length)
     near = int(np.clip(near, 1, n // 4))
     matches = np.zeros(n)
     for rank in np.intersect1d(one, two):
@@ -310,12 +310,24 @@ def histogram_test(
 
     If measured and simulated ranks came from one distribution, exchanging them over whole blocks (as long as the
     sequences remember) would change nothing. NaN without a pair.
+
+    Parameters
+    ----------
+    measured, simulated : array_like, (n,)
+        Ranks of the same samples; NaN and 0 take no part.
+    replicates, seed : int
+        Random exchanges, and of their generator.
+
+    Returns
+    -------
+    float
+        Share of exchanges with a total variation at least as large, the observed one counted among them.
     """
     one, two = _pairs(measured, simulated)
     if not len(one):
         return float("nan")
     difference = _indicators(one) - _indicators(two)
-    length = max(memory(one).block_length, memory(two).block_length, 1)
+    length = max(autocorrelation(one).block_length, autocorrelation(two).block_length, 1)
     sums = np.add.reduceat(difference, np.arange(0, len(one), length), axis=0)
     signs = np.random.default_rng(seed).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
@@ -394,10 +406,19 @@ def k_curve(
     ri, profile = ri[both].astype(np.int64), profile[both]
     if not len(ri):
         nothing = np.full(len(grid), np.nan)
-        return KCurve(grid, nothing, nothing, float("nan"), NO_INTERVAL, float("nan"), NO_INTERVAL, False)
+        return KCurve(
+            k=grid,
+            agreement=nothing,
+            total_variation=nothing,
+            best_k_agreement=float("nan"),
+            best_k_interval=NO_INTERVAL,
+            best_k_total_variation=float("nan"),
+            best_k_total_variation_interval=NO_INTERVAL,
+            at_edge=False,
+        )
     ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
     equal = (ranks == ri[:, None]).astype(np.float64)
-    known = memory(equal.mean(axis=1))
+    known = autocorrelation(equal.mean(axis=1))
     length = known.block_length
     agree = equal.mean(axis=0)
     drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
@@ -408,14 +429,14 @@ def k_curve(
         varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
     best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
     return KCurve(
-        grid,
-        agree,
-        vary,
-        float(best),
-        _central(_middle_of_best(drawn, grid), grid) if known.enough else NO_INTERVAL,
-        float(best_tv),
-        _central(_middle_of_best(-varied, grid), grid) if known.enough else NO_INTERVAL,
-        bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
+        k=grid,
+        agreement=agree,
+        total_variation=vary,
+        best_k_agreement=float(best),
+        best_k_interval=_central(_middle_of_best(drawn, grid), grid) if known.enough else NO_INTERVAL,
+        best_k_total_variation=float(best_tv),
+        best_k_total_variation_interval=_central(_middle_of_best(-varied, grid), grid) if known.enough else NO_INTERVAL,
+        at_edge=bool(np.argmax(agree) == 0 or agree[-1] >= agree.max()),
     )
 
 
@@ -437,14 +458,14 @@ def _central(values: FloatArray, k: FloatArray) -> Interval:
     return float(min(k[first], low)), float(max(k[last], high))
 
 
-def condition_number_rank(h: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
-    """Rank by the condition-number rule of an open UE: layers within ``limit_db`` of the strongest.
+def condition_number_rank(sigma: ArrayLike, *, limit_db: float = 17.0) -> IntArray:
+    """Rank by the condition-number rule of an open UE: singular values (..., n) within ``limit_db`` of the strongest.
 
     srsUE reports two layers when the condition number of its 2 x 2 channel is below 17 dB (``srsran_ue_dl_select_ri``
     in ``lib/src/phy/ue/ue_dl.c``); for more ports the same limit is put on each singular value, 20 log10 of the
     ratio. In terms of K that is 10^(17/20) = 7.08.
     """
-    return channel_rank(h, 10.0 ** (limit_db / 20.0))
+    return rank_from_singular_values(sigma, float(amplitude_from_db(limit_db)))
 
 
 def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0) -> IntArray:
@@ -492,35 +513,6 @@ def capacity_rank(h: ArrayLike, sinr_db: ArrayLike, *, penalty_bits: float = 0.0
     alive = np.isfinite(stacked).all(axis=-1)
     best = np.argmax(np.where(alive[..., None], stacked, 0.0), axis=-1) + 1
     return np.where(alive, best, 0).astype(np.int64)
-
-
-def profile_by_rank(measured: ArrayLike, sigma: ArrayLike) -> dict[int, FloatArray]:
-    """Singular-value profiles behind each measured rank: what the channel was where the RI was 2.
-
-    Parameters
-    ----------
-    measured : array_like, (n,)
-        RI; NaN where none.
-    sigma : array_like, (n, m)
-        Singular values, descending.
-
-    Returns
-    -------
-    dict of int to ndarray, (3, m)
-        Lower quartile, median, upper quartile of ``20 log10 (sigma_i / sigma_1)`` [dB] where the RI was that rank. A
-        threshold rule with K explains a rank r if the median of column r lies above ``-20 log10 K`` and that of
-        column r + 1 below.
-    """
-    ri, profile = _ranks(measured), np.asarray(sigma, dtype=np.float64)
-    alive = (ri >= 1) & (profile[:, 0] > 0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        ratio_db = 20.0 * np.log10(profile / profile[:, :1])
-    result = {}
-    for rank in np.unique(ri[alive]).astype(int):
-        rows = np.sort(ratio_db[alive & (ri == rank)], axis=0)
-        # order statistics, not interpolation: ratios of rank-deficient channels are minus infinity
-        result[int(rank)] = rows[np.round(np.array([0.25, 0.5, 0.75]) * (len(rows) - 1)).astype(int)]
-    return result
 
 
 @dataclass(frozen=True, slots=True)
@@ -759,32 +751,32 @@ def compare_rank(
         raise ValueError(f"H must have shape ({len(ri)}, n_rx, n_tx), found {matrix.shape}")
     sigma = singular_values(matrix)
     simulated = {float(k): rank_from_singular_values(sigma, k) for k in ks}
-    rules = {"condition_number": rank_from_singular_values(sigma, 10.0 ** (17.0 / 20.0))}
+    rules = {"condition_number": condition_number_rank(sigma)}
     report = dict(others or {})
     if sinr_db is not None:
         rules["capacity"] = capacity_rank(matrix, sinr_db)
         report["sinr_db"] = sinr_db
-    known = memory(ri[np.isfinite(ri)])
+    known = autocorrelation(ri[np.isfinite(ri)])
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
-        int(np.isfinite(ri).sum()),
-        known.n_effective,
-        int((~np.isfinite(ri)).sum()),
-        histogram(ri),
-        _histogram_intervals(ri[np.isfinite(ri)], replicates, seed),
-        {k: compare_ranks(ri, rank, replicates=replicates, seed=seed) for k, rank in simulated.items()},
-        {name: compare_ranks(ri, rank, replicates=replicates, seed=seed) for name, rank in rules.items()},
-        k_curve(ri, sigma, replicates=replicates, seed=seed),
-        stale_reports(time, ri, report),
+        n=int(np.isfinite(ri).sum()),
+        n_effective=known.n_effective,
+        n_no_csi=int((~np.isfinite(ri)).sum()),
+        histogram=histogram(ri),
+        histogram_ci95=_histogram_intervals(ri[np.isfinite(ri)], replicates, seed),
+        simulated={k: compare_ranks(ri, rank, replicates=replicates, seed=seed) for k, rank in simulated.items()},
+        rules={name: compare_ranks(ri, rank, replicates=replicates, seed=seed) for name, rank in rules.items()},
+        curve=k_curve(ri, sigma, replicates=replicates, seed=seed),
+        staleness=stale_reports(time, ri, report),
     )
 
 
 def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    found, whole = [], memory(rank)
+    found, whole = [], autocorrelation(rank)
     for bar in _indicators(rank).T:
-        known = memory(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
+        known = autocorrelation(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
         drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates, seed=seed)
         found.append(share_interval(float(bar.mean()), float(drawn.std()), known))
     return found
@@ -797,6 +789,13 @@ def compare_ranks(
 
     The histogram distances compare all measured with all simulated ranks; their intervals come from poses at which
     both exist.
+
+    Parameters
+    ----------
+    measured, simulated : array_like, (n,)
+        Ranks of the same samples: NaN unknown, 0 no channel.
+    replicates, seed : int
+        Of the bootstrap and the permutation test.
     """
     one, two = _ranks(measured), _ranks(simulated)
     bars_one, bars_two = histogram(one), histogram(two)
@@ -805,14 +804,21 @@ def compare_ranks(
     kappa = cohen_kappa(one, two)
     bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, seed)
     return RankFit(
-        bars_two,
-        _histogram_intervals(two[two >= 1], replicates, seed),
-        int((two == 0).sum()),
-        agree, bounds[0], kappa, bounds[1], tv, bounds[2], move, bounds[3],
-        confusion_matrix(one, two),
-        shift_test(one, two),
-        histogram_test(one, two, replicates=replicates, seed=seed),
-    )  # fmt: skip
+        histogram=bars_two,
+        histogram_ci95=_histogram_intervals(two[two >= 1], replicates, seed),
+        out_of_coverage=int((two == 0).sum()),
+        agreement=agree,
+        agreement_ci95=bounds[0],
+        kappa=kappa,
+        kappa_ci95=bounds[1],
+        total_variation=tv,
+        total_variation_ci95=bounds[2],
+        wasserstein=move,
+        wasserstein_ci95=bounds[3],
+        confusion=confusion_matrix(one, two),
+        p_agreement=shift_test(one, two),
+        p_histogram=histogram_test(one, two, replicates=replicates, seed=seed),
+    )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -890,15 +896,15 @@ def repeat_rank(
         Bootstrap.
     """
     one, two = _ranks(rank), _ranks(other_rank)
-    heard, other_heard = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
+    known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
     here, there = same_places(
-        np.asarray(position_m)[heard],
-        np.asarray(other_position_m)[other_heard],
+        np.asarray(position_m)[known],
+        np.asarray(other_position_m)[other_known],
         radius_m=radius_m,
-        heading_deg=None if heading_deg is None else heading_deg[heard],
-        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+        heading_deg=None if heading_deg is None else heading_deg[known],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
     )
-    first, second = one[heard[here]], two[other_heard[there]]
+    first, second = one[known[here]], two[other_known[there]]
     if not len(first):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     agree, kappa = agreement(first, second), cohen_kappa(first, second)
@@ -917,7 +923,7 @@ def _pair_intervals(
     columns = np.column_stack([equal, one, two])
     found: list[Interval] = []
     for influence, statistic, bounds in _pair_statistics(equal, one, two):
-        known = memory(influence)
+        known = autocorrelation(influence)
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
         value = values[len(found)]
         found.append(

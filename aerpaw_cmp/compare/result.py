@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .field_difference import FieldAudit
+from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .statistics import Interval, PairedDifference
@@ -114,7 +115,7 @@ class RssFurther:
 
     A field without a default is always written; one whose default is None only where the flight has it.
     ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
-    the replay is better or worse on the same samples; ``same_footing`` is by simulation and window; ``trimmed``,
+    the replay is better or worse on the same samples; ``averaged`` is by simulation and window; ``trimmed``,
     ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
@@ -129,7 +130,7 @@ class RssFurther:
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
-    same_footing: Mapping[str, Mapping[str, Fit]]
+    averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
     repeatability: Mapping[str, Repeated]
@@ -300,9 +301,13 @@ class EngineResult:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class FlightResult:
-    """Everything that was found about one flight; empty where it has no such series."""
+    """Everything that was found about one flight; empty where it has no such series.
+
+    ``ladder`` holds one row per model, tower and channel; none where it was not climbed.
+    """
 
     rss: tuple[RssResult, ...] = ()
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    ladder: tuple[LadderRow, ...] = ()

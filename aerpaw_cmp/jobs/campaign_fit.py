@@ -203,6 +203,17 @@ def search(
 
     All combinations of values are tried up to :data:`LARGEST_PRODUCT`; beyond, one parameter after the other from
     three starts (the quartiles of every list), until a round changes nothing.
+
+    Parameters
+    ----------
+    benches : mapping of str to Bench
+        Flights by name.
+    grids : mapping of str to sequence of float
+        Values to try, increasing, by dotted flight key.
+    train : sequence of str
+        Names of the flights to fit on.
+    refine : bool
+        Search between the values, too (where all combinations are tried).
     """
 
     def objective(point: Mapping[str, float], flight: str) -> FloatArray:

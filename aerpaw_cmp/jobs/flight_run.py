@@ -11,10 +11,12 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..common.stages import Stages
+from ..compare.ladder import ladder_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
 from .audit_flight import audit_replays
 from .compare_flight import compare_flight
+from .ladder import FlightLadder, flight_ladder
 from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
 
 
@@ -30,11 +32,14 @@ class FlightRun:
         Poses, paths, fields and clock of every series.
     result : FlightResult
         Numbers alone.
+    ladder : FlightLadder, optional
+        Which models the measurement asks for.
     """
 
     data: FlightData
     replays: FlightReplay
     result: FlightResult
+    ladder: FlightLadder | None = None
 
 
 def replay_flight(
@@ -59,16 +64,20 @@ def replay_flight(
         )
 
 
-def run_flight(data: FlightData, stages: Stages | None = None, *, audit: bool = True) -> FlightRun:
-    """Clocks, replay, comparison and audit.
+def run_flight(
+    data: FlightData, stages: Stages | None = None, *, audit: bool = True, ladder: bool = False
+) -> FlightRun:
+    """Clocks, replay, comparison, audit and ladder.
 
     Parameters
     ----------
     data : FlightData
     stages : Stages, optional
-        Times "clocks", "replay", "compare" and "audit".
+        Times "clocks", "replay", "compare", "audit" and "ladder".
     audit : bool
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
+    ladder : bool
+        Also score simpler and richer models of the RSS on stretches left out.
     """
     stages = stages or Stages()
     replays = replay_flight(data, stages)
@@ -77,4 +86,11 @@ def run_flight(data: FlightData, stages: Stages | None = None, *, audit: bool = 
     if audit:
         with stages("audit"):
             result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
-    return FlightRun(data=data, replays=replays, result=result)
+    climbed = None
+    if ladder:
+        with stages("ladder"):
+            climbed = flight_ladder(data, replays, stages.progress)
+        if climbed is not None:
+            rows = ladder_rows(climbed.ladder, climbed.names, replicates=data.settings.rss.bootstrap)
+            result = dataclasses.replace(result, ladder=tuple(rows))
+    return FlightRun(data=data, replays=replays, result=result, ladder=climbed)

@@ -43,7 +43,19 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
 
 
 def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, settings: RssSettings) -> FloatArray:
-    """A simulated level of the replayed poses at the samples (n,), averaged as ``rss.field: local_mean`` asks."""
+    """A simulated level of the replayed poses at the samples (n,), averaged as ``rss.field: local_mean`` asks.
+
+    Parameters
+    ----------
+    series : RssSeries
+        For its times.
+    replayed : Replayed
+        Says at which samples a pose was known.
+    level_db : (poses,)
+        At the replayed poses [dB].
+    settings : RssSettings
+        ``field`` and ``window_s``.
+    """
     level = replayed.spread(level_db)
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
 

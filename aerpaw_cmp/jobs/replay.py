@@ -295,7 +295,20 @@ def _poses(track: TrackPoses, attitude: str) -> Poses:
 def replay_poses(
     site: Site, rt: RtSettings, link: Link, poses: Poses, *, engine: Engine | None = None, progress: Progress = silent
 ) -> Replay:
-    """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``."""
+    """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
+
+    Parameters
+    ----------
+    site : Site
+    rt : RtSettings
+        Depth, samples, foliage and the rest.
+    link : Link
+        Carrier, power and arrays; its towers are those of ``site`` by name.
+    poses : Poses
+    engine : {"image", "sionna"}, optional
+    progress : Progress
+        Share done; of the sionna engine alone.
+    """
     engine = engine or rt.engine
     name = f"{engine} {'+'.join(link.tower_arrays)}"
     return replay(

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -30,6 +30,20 @@ def run_ingest(
 
     With ``draft``, a first flight.yaml is written too, and what is left to check in it stands under "draft".
     With ``force``, the two may replace files that this tool did not write, but no input.
+
+    Parameters
+    ----------
+    paths : list of Path
+        Log files and folders.
+    out : Path, optional
+        The flight file (HDF5) to write.
+    draft : Path, optional
+        The flight.yaml to write.
+    reader : str, optional
+        Of all files, in place of recognising them.
+    force : bool
+    options
+        Fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
     """
     from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -62,6 +76,16 @@ def run_simulate(
     """Write the logs that ``flight.plan`` describes, beside the flight file or below ``out``.
 
     A log that is not marked as synthetic (in truth.json) is replaced with ``force`` only.
+
+    Parameters
+    ----------
+    flight : Path
+        flight.yaml with ``flight.plan``.
+    out : Path, optional
+        Folder of the logs.
+    force : bool
+    progress : Progress
+        Gets the name of each log.
     """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
@@ -90,12 +114,15 @@ def run_report(
     logs_root: Path | None = None,
     engine: str | None = None,
     audit: str | None = None,
+    recommend: Path | None = None,
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
+
+    With ``recommend``, the flight file with the settings of the model that the ladder recommends is written there.
 
     Parameters
     ----------
@@ -104,6 +131,8 @@ def run_report(
         Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
         In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+    recommend : Path, optional
+        Where to write it.
     force : bool
         Replace what this tool did not write.
     figures : {"page", "none", "svg", "png", "pdf", "all"}
@@ -126,36 +155,44 @@ def run_report(
     settings = _overridden(load_flight(flight), engine, audit)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
-    with OutputFolder(folder, job="report", inputs=inputs, force=force) as output:
+    with ExitStack() as outputs:
+        output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
+        target = None
+        if recommend is not None:
+            _beside(recommend, flight, logs_root)
+            target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
-        record = _replayed_and_compared(settings, flight, logs_root, stages)
+        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        if target is not None:
+            from .ladder import recommended_text
+
+            target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
 
+def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
+    """Paths in a flight file are relative to its folder: a changed one must stand beside it."""
+    if logs_root is None and os.path.realpath(recommend.parent) != os.path.realpath(flight.parent):
+        raise UsageError(
+            f"--recommend in another folder than {flight}",
+            expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
+            path=recommend,
+        )
+
+
 def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
     """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
-    roots = [path.parent] if logs_root is None else [path.parent, logs_root]
-    named = [root / text for text in _texts(settings.model_dump()) for root in roots if text and "\0" not in text]
-    return [path, *(file for file in dict.fromkeys(named) if os.path.isfile(file))]  # noqa: PTH113  never raises
+    from .manifest import named_files
 
-
-def _texts(value: Any) -> Iterator[str]:
-    """Every text in nested settings."""
-    if isinstance(value, (str, Path)):
-        yield str(value)
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _texts(item)
-    elif isinstance(value, (list, tuple)):
-        for item in value:
-            yield from _texts(item)
+    roots = [path.parent] if logs_root is None else [logs_root, path.parent]
+    return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
 def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
-    """The record of a report: read, replay, compare, audit."""
+    """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
     from ..flight.data import gather, read_logs
 
     with stages("read"):
@@ -164,7 +201,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    found = run_flight(data, stages)
+    found = run_flight(data, stages, ladder=True)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links:
@@ -177,7 +214,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .pose_paths import pose_paths
 
     notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    return report_data(
+    record = report_data(
         data,
         found.result,
         speed=speed,
@@ -185,6 +222,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
         other_inputs=other_inputs(settings, flight, logs_root),
         paths=pose_paths(data, found.replays),
     )
+    return record, found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -225,33 +263,79 @@ def run_bench(
     ratios: bool = True,
     progress: Progress = silent,
 ) -> dict[str, Any]:
-    """Speed against error of the replay, and how many times faster than its peers each part is, from one run."""
-    from ..propagation.bench import path_search, random_scene, speed_against_error
-    from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
+    """Speed against error of the replay, and how many times faster than its peers each part is, from one run.
+
+    Parameters
+    ----------
+    poses : int
+        Of the flight that is replayed.
+    samples : tuple of int
+        Rays per tower of the sionna engine.
+    ratios : bool
+        Compare with the peers, too.
+    progress : Progress
+
+    Returns
+    -------
+    dict
+        ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
+    """
+    from ..propagation.bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    found: dict[str, Any] = {}
-    if ratios:
-        progress("path search against PathSolver at 1e6 samples")
-        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
-        progress("Kriging against PyKrige")
-        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
-        progress("ingest against pandas")
-        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    found = _against_peers(progress) if ratios else {}
     return {
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None and "ratio" in value},
+        "report": found.get("report"),
         "details": found,
     }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """How many times faster than each peer; at equal error and with the same work on both sides first."""
+    from . import peer_ratios as peers
+
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = peers.path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = peers.kriging_shared_weights()
+    found: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige_c_27_fields": shared,
+        "kriging_vs_pykrige": peers.kriging_vs_pykrige(),
+    }
+    progress("ingest against pandas")
+    for lines, value in peers.ingest_at_sizes().items():
+        found["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
+    progress("a report, cold and warm")
+    found["report"] = peers.report_cold_and_warm()
+    return found
 
 
 def run_site_import(
     files: list[Path], out: Path, *, base: str = "lake_wheeler", untagged: str | None = None, force: bool = False
 ) -> list[str]:
-    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them."""
+    """Write a site.yaml with the towers of ``base`` and what stands in map files; gives what was done to them.
+
+    Parameters
+    ----------
+    files : list of Path
+        GeoJSON, OSM XML, Overpass JSON, KML or KMZ.
+    out : Path
+        The site.yaml to write.
+    base : str
+        Site whose towers and settings are kept.
+    untagged : str, optional
+        What areas without a tag are: building, forest or geofence.
+    force : bool
+        Replace a file that this tool did not write.
+    """
     from ..site.footprints import import_site, site_yaml
 
     with OutputFile(out, own=is_sealed, inputs=[*files, Path(base)], force=force) as output:
@@ -263,7 +347,7 @@ def run_site_import(
 
 def run_site_show(
     site: str | None,
-    out: Path,
+    out: Path | None = None,
     *,
     flight: Path | None = None,
     logs_root: Path | None = None,
@@ -274,6 +358,23 @@ def run_site_show(
     """Plan view, 3-D picture and a page of the scene; with a flight its track, with a pose its paths.
 
     Without a site the flight's own is shown; with neither, the packaged one.
+
+    Parameters
+    ----------
+    site : str, optional
+        site.yaml, or the name of a packaged site.
+    out : Path
+        Folder of the pictures.
+    flight : Path, optional
+        flight.yaml whose track is drawn.
+    logs_root : Path, optional
+        Folder against which its logs resolve.
+    pose : int, optional
+        Point of the track whose paths are drawn.
+    export : bool
+        Also the scene as PLY and Mitsuba XML.
+    force : bool
+        Replace files that this tool did not write.
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
@@ -290,6 +391,8 @@ def run_site_show(
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         inputs += input_files(settings, flight, logs_root)
     track, paths = None, ()
+    if out is None:
+        out = Path("reports") / f"site-{Path(site or (settings.site.file if settings else 'lake_wheeler')).stem}"
     with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")
@@ -491,6 +594,22 @@ def run_campaign(
     progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
+
+    Parameters
+    ----------
+    path : Path
+        campaign.yaml.
+    out : Path, optional
+        Folder of the results.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    workers : int
+        Processes.
+    cluster : str, optional
+        Address of a Dask scheduler, in place of processes.
+    force : bool
+        Write into a folder that holds files of others.
+    progress : Progress
 
     Raises
     ------

@@ -140,6 +140,18 @@ class _Projection:
         bounds: tuple[float, float, float],
         rate_bounds_per_m: tuple[float, float] | None,
     ) -> _Projection:
+        """The problem of one curve: pairs without a number or a weight take no part.
+
+        Parameters
+        ----------
+        distance_m, correlation : array_like, (n,)
+        weights : array_like, (n,), optional
+            Relative; 1 each without.
+        bounds : (low, high, total)
+            Of each amplitude, and of their sum.
+        rate_bounds_per_m : (slow, fast), optional
+            Of the rates; by default from the distances.
+        """
         d = np.asarray(distance_m, dtype=np.float64).ravel()
         y = np.asarray(correlation, dtype=np.float64).ravel()
         w = np.ones_like(d) if weights is None else np.asarray(weights, dtype=np.float64).ravel()

@@ -95,7 +95,20 @@ def leave_one_out_estimate(model: Predictor, points_m: ArrayLike, values: ArrayL
 def held_out_estimate(
     model: Predictor, points_m: ArrayLike, values: ArrayLike, test: BoolArray
 ) -> tuple[FloatArray, FloatArray]:
-    """Train on the positions outside ``test`` (n,), predict those inside; NaN elsewhere; shape of ``values``."""
+    """Train on the positions outside ``test`` (n,), predict those inside; NaN elsewhere; shape of ``values``.
+
+    Parameters
+    ----------
+    model : Predictor
+    points_m : array_like, (n, 2) or (n, 3)
+    values : array_like, (n, ...)
+    test : (n,) bool
+        Positions that are predicted.
+
+    Returns
+    -------
+    (estimate, variance), each (n, ...)
+    """
     points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
     flat = data.reshape(len(data), -1)
     estimate, variance = np.full_like(flat, np.nan), np.full_like(flat, np.nan)
@@ -109,6 +122,23 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
 
     Near neighbours of a left-out position are left out with it, so that the score says how the interpolator
     bridges gaps of about ``block_m``. Blocks start at the south-western position.
+
+    Parameters
+    ----------
+    model : Predictor
+    points_m : array_like, (n, 2) or (n, 3)
+    values : array_like, (n, ...)
+    block_m : float
+        Side of a block.
+
+    Raises
+    ------
+    UsageError
+        If the side is not positive.
+
+    Notes
+    -----
+    Spatially blocked cross-validation (Roberts et al. 2017, doi:10.1111/ecog.02881).
     """
     if not block_m > 0:
         raise UsageError(f"blocks of {block_m} m", expected="a positive length")
@@ -119,7 +149,16 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
 
 
 def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: IntArray) -> Score:
-    """Leave out one group of positions (n,) at a time: blocks, flights, days."""
+    """Leave out one group of positions (n,) at a time: blocks, flights, days.
+
+    Parameters
+    ----------
+    model : Predictor
+    points_m : array_like, (n, 2) or (n, 3)
+    values : array_like, (n, ...)
+    group : (n,) int
+        Positions of one number are left out together.
+    """
     data = np.asarray(values, dtype=np.float64)
     estimate = np.full_like(data, np.nan)
     for number in np.unique(group):
@@ -200,9 +239,9 @@ class IntervalCoverage:
     level : (levels,)
         Nominal probability of the interval.
     observed : (levels,)
-        Share of values inside; equal to ``level`` for an honest variance and normal errors.
+        Share of values inside; equal to ``level`` for a calibrated variance and normal errors.
     standardised_variance : float
-        Mean of error^2 / variance: 1 for an honest variance, above 1 when it is too small.
+        Mean of error^2 / variance: 1 for a calibrated variance, above 1 when it is too small.
     n : int
         Values with an estimate and a variance above 0.
     """
@@ -219,7 +258,15 @@ def interval_coverage(
     variance: ArrayLike,
     levels: Sequence[float] = (0.5, 0.8, 0.9, 0.95),
 ) -> IntervalCoverage:
-    """Share of values within the central normal intervals of estimate and variance, all of the same shape."""
+    """Share of values within the central normal intervals of estimate and variance, all of the same shape.
+
+    Parameters
+    ----------
+    values, estimate, variance : array_like, (...)
+        True values, predictions, and the variances claimed for them; NaN takes no part.
+    levels : sequence of float
+        Probabilities of the intervals.
+    """
     from scipy.stats import norm
 
     truth, guess, spread = (np.asarray(a, dtype=np.float64) for a in (values, estimate, variance))
@@ -244,6 +291,21 @@ def learning_curve(
     """MAE (sizes, ...) on the positions not sampled, against the number of random samples, mean over repeats.
 
     The samples of a smaller size are part of those of a larger one, so that the curve is not blurred by luck.
+
+    Parameters
+    ----------
+    model : Predictor
+    points_m : array_like, (n, 2) or (n, 3)
+    values : array_like, (n, ...)
+    sizes : sequence of int
+        Numbers of samples, each below n.
+    repeats, seed : int
+        Random orders of the positions, and of their generator.
+
+    Raises
+    ------
+    UsageError
+        If a size leaves nothing to predict.
     """
     points, data = np.asarray(points_m, dtype=np.float64), np.asarray(values, dtype=np.float64)
     wrong = [size for size in sizes if not 0 < size < len(points)]

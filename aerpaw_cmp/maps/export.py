@@ -35,7 +35,18 @@ ZIP_DATE = (1980, 1, 1, 0, 0, 0)
 
 
 def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer]) -> Path:
-    """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers."""
+    """One row per position in index order: index, row, column, east, north, latitude, longitude, then the layers.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    """
     import pandas as pd
 
     _check(grid, layers)
@@ -59,7 +70,20 @@ def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[L
 def write_json(
     path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer], summary: Mapping[str, Any] | None = None
 ) -> Path:
-    """Axes, layers (in index order, ``null`` out of coverage) and a free summary as one JSON object."""
+    """Axes, layers (in index order, ``null`` out of coverage) and a free summary as one JSON object.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    summary : mapping, optional
+        Anything that JSON can hold, once NaN is null.
+    """
     _check(grid, layers)
     content = {
         "origin": {"latitude_deg": frame.latitude_deg, "longitude_deg": frame.longitude_deg},
@@ -91,7 +115,22 @@ def write_geojson(
     towers_m: Mapping[str, Sequence[float]] | None = None,
     borders: Sequence[Border] = (),
 ) -> Path:
-    """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946)."""
+    """Cells as polygons with the layers as properties, towers as points, serving borders as lines (RFC 7946).
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    towers_m : mapping of str to (3,), optional
+        Positions of the towers, east, north, up.
+    borders : sequence of Border
+        Lines between the areas that two towers serve.
+    """
     _check(grid, layers)
     rings = _cell_corners(grid, frame)
     columns = {layer.name: json_safe(layer.values) for layer in layers}
@@ -153,7 +192,24 @@ def write_kmz(
     *,
     title: str = "Coverage and rank",
 ) -> Path:
-    """Ground overlays with one legend each (only the first is switched on), towers and serving borders."""
+    """Ground overlays with one legend each (only the first is switched on), towers and serving borders.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    towers_m : mapping of str to (3,), optional
+        Positions of the towers, east, north, up.
+    borders : sequence of Border
+        Lines between the areas that two towers serve.
+    title : str
+        Name of the document.
+    """
     _check(grid, layers)
     box = _bounding_box(grid, frame)
     parts = [_kml_overlay(layer, box, visible=number == 0) for number, layer in enumerate(layers)]
@@ -302,6 +358,18 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
 def write_netcdf(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer], title: str = "") -> Path:
     """NetCDF following CF-1.10: (north, east) grids in the site's azimuthal equidistant projection, with lat/lon.
 
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
+    title : str
+        Attribute of the file.
+
     Raises
     ------
     UsageError
@@ -367,6 +435,16 @@ def _cf_values(grid: Grid, layer: Layer) -> tuple[AnyArray, dict[str, Any]]:
 
 def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer]) -> Path:
     """GeoTIFF with one float32 band per layer (its name and unit in the tags), north up, NaN out of coverage.
+
+    Parameters
+    ----------
+    path : path
+        The file; replaced where it exists.
+    grid : Grid
+    frame : SiteFrame
+        From local metres to latitude and longitude.
+    layers : sequence of Layer
+        Values in index order, (positions,), NaN out of coverage.
 
     Raises
     ------

@@ -139,6 +139,20 @@ def random_within(
     """M samples drawn without replacement among those within the radius, as the paper's Step 1 may be read.
 
     Parameters as in :func:`nearest`; ``seed`` fixes the draw, ``chunk`` bounds the memory and does not change it.
+
+    Parameters
+    ----------
+    samples_m, targets_m : (n, 2 or 3), (t, 2 or 3)
+        Positions.
+    m : int
+        Samples per target, at most.
+    radius_m : float
+    seed : int
+        Fixes the draw.
+    skip : (t,) int, optional
+        Sample that is not to be taken for a target (leave-one-out).
+    chunk : int
+        Targets at a time: bounds the memory and does not change the draw.
     """
     from scipy.spatial import cKDTree
 

@@ -135,6 +135,15 @@ def field_correlation(
 
     NaN values take no part; a pair counts once, with the mean over the fields that both positions have. Fields that
     are constant or have fewer than two values are left out and counted.
+
+    Parameters
+    ----------
+    points_m : array_like, (n, 2) or (n, 3)
+        Distances are horizontal.
+    fields : array_like, (n, ...)
+        Values at the positions, NaN unknown.
+    width_m, maximum_m : float
+        Width of the bins of distance, and the largest distance.
     """
     points, data = _points_and_vectors(points_m, fields)
     present = np.isfinite(data)
@@ -153,7 +162,21 @@ def field_correlation(
 def semivariance(
     points_m: ArrayLike, values: ArrayLike, *, width_m: float = PAPER_WIDTH_M, maximum_m: float = PAPER_MAXIMUM_M
 ) -> BinnedCorrelation:
-    """Matheron's semivariance of one field (n,): half the mean squared difference, in ``correlation``'s place."""
+    """Matheron's semivariance of one field (n,): half the mean squared difference, in ``correlation``'s place.
+
+    Parameters
+    ----------
+    points_m : array_like, (n, 2) or (n, 3)
+        Distances are horizontal.
+    values : array_like, (n,)
+        NaN takes no part.
+    width_m, maximum_m : float
+        Width of the bins of distance, and the largest distance.
+
+    Notes
+    -----
+    ``gamma(h) = mean((z_i - z_j)^2) / 2`` over the pairs of a bin (Matheron 1963, doi:10.2113/gsecongeo.58.8.1246).
+    """
     points, data = _points_and_vectors(points_m, values)
     kept = np.isfinite(data).all(axis=1)
     bins = _bin_pairs(points[kept], _HalfSquaredDifference(data[kept]), width_m, maximum_m)

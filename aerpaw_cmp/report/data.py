@@ -15,6 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..compare.ladder import LadderRow
 from ..compare.result import AuditResult, EngineResult
 from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
@@ -105,7 +106,7 @@ class Baseline:
 class Variant:
     """Another way to simulate the same panel, as a row of one table: iso arrays, measured patterns, with trees ...
 
-    ``fitted`` names what was fitted, and on which flight.
+    ``fitted`` names what was fitted, and on which flight; ``paired`` compares the report's own model with this one.
     """
 
     name: str
@@ -113,6 +114,7 @@ class Variant:
     rmse_db: float
     rmse_ci95_db: Interval | None = None
     fitted: str = "offset, on this flight"
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -433,7 +435,7 @@ class ReportData:
         UTC, ISO 8601.
     versions : mapping of str to str
     inputs : tuple of InputFile
-    track, waypoints, rss, rank, pairs, engine, speed
+    track, waypoints, rss, rank, pairs, engine, ladder, speed
         See their classes.
     synthetic : bool
         The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
@@ -461,6 +463,7 @@ class ReportData:
     rank: tuple[RankPanel, ...] = ()
     pairs: tuple[ChannelPair, ...] = ()
     engine: EngineResult | None = None
+    ladder: tuple[LadderRow, ...] = ()
     speed: tuple[SpeedRow, ...] = ()
     synthetic: bool = False
     warnings: tuple[str, ...] = ()

@@ -15,6 +15,7 @@ from .rank_figures import agreement_curve, confusion, rank_histograms, rank_maps
 from .rss_figures import (
     altitude,
     channel_difference,
+    ladder,
     overview,
     residual_against_geometry,
     rss_diagnostics,
@@ -43,6 +44,19 @@ def plates(data: ReportData) -> list[Plate]:
             result += _rss_plates(data, panel)
     for pair in data.pairs:
         result.append(_pair_plate(data, pair))
+    if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
+        result.append(
+            Plate(
+                name="ladder",
+                section="ladder",
+                title="Models from the simplest to the richest",
+                caption="RMSE on stretches left out, a line per tower and channel. Whiskers: 95 % interval of the "
+                "difference to the best model on the same samples. Filled: the recommended model.",
+                alt=f"RMSE of {len({row.model for row in data.ladder})} models on stretches left out.",
+                draw=lambda: ladder(data.ladder),
+                page=True,
+            )
+        )
     for rank in data.rank:
         if len(rank.time):
             result += _rank_plates(data, rank)

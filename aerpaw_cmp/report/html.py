@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from ..compare.ladder import LadderRow
 from ..logs.records import has_wall_clock
 from . import words
 from .canvas import Picture, smaller, start_of
@@ -164,6 +165,17 @@ def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
     return sections
 
 
+def ladder_table(data: ReportData) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
+    """Model, whether recommended, seconds, and its rows by tower and channel."""
+    table: dict[str, dict[str, LadderRow]] = {}
+    for row in data.ladder:
+        table.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
+    return [
+        (model, any(r.recommended for r in rows.values()), max(r.seconds for r in rows.values()), rows)
+        for model, rows in table.items()
+    ]
+
+
 def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page.
 
@@ -194,6 +206,8 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         ranks=RANKS,
         headline=words.headline(data),
         verdicts=words.verdicts(data),
+        ladder_verdict=words.ladder_verdict(data),
+        ladder=ladder_table(data),
         warnings=words.warnings(data),
         baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
         speed_ks=sorted({k for row in data.speed for k in row.rank_disagreement}),

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from ..common.units import FloatArray
+from ..compare.ladder import LadderRow
 from .canvas import (
     MEASURED,
     SIMULATED,
@@ -21,6 +23,7 @@ from .canvas import (
     draw_waypoints,
     figure,
     frame_around,
+    legend_below,
     lonely,
     only,
     pretty,
@@ -404,4 +407,30 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
     ax.set_xlabel(time_label(start))
     ax.set_ylabel(f"{pair.first} − {pair.second} [dB]")
     fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4, markerscale=3)
+    return fig
+
+
+def ladder(rows: Sequence[LadderRow]) -> Figure:
+    """RMSE of each model on stretches left out, a marker per tower and channel."""
+    models = list(dict.fromkeys(row.model for row in rows))
+    channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
+    fig = figure((9.2, 0.36 * len(models) + 1.5))
+    ax = fig.subplots()
+    for number, (tower, channel) in enumerate(channels):
+        own = [row for row in rows if (row.tower, row.channel) == (tower, channel) and np.isfinite(row.rmse_heldout_db)]
+        at = np.array([models.index(row.model) for row in own]) + 0.5 * ((number + 0.5) / len(channels) - 0.5)
+        rmse = np.array([row.rmse_heldout_db for row in own])
+        bounds = np.array([row.difference_to_best_ci95_db for row in own]) - np.array(
+            [[row.difference_to_best_db] for row in own]
+        )
+        colour = f"C{number % 10}"
+        spread = np.nan_to_num(np.abs(bounds.T))
+        ax.errorbar(rmse, at, xerr=spread, fmt="none", ecolor=colour, elinewidth=1.0, capsize=2.0)
+        ax.scatter(rmse, at, s=26, facecolor=[colour if row.recommended else "white" for row in own], edgecolor=colour,
+                   marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip())  # fmt: skip
+    ax.set_yticks(range(len(models)), models)
+    ax.invert_yaxis()
+    ax.set_xlabel("RMSE on stretches left out [dB]")
+    ax.grid(axis="y", visible=False)
+    legend_below(ax)
     return fig

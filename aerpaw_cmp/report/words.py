@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
+from ..compare.ladder import LadderRow
 from .data import Interval, RankPanel, ReportData, RssPanel
 
 _TITLES = {"free_space": "free space", "two_ray": "two-ray ground"}
@@ -71,6 +73,38 @@ def _listed(names: list[str]) -> str:
 def verdicts(data: ReportData) -> list[str]:
     """One or two sentences per panel: how well the ray tracing predicts, and against what."""
     return [rss_verdict(panel) for panel in data.rss] + [rank_verdict(panel) for panel in data.rank]
+
+
+AS_SET, FREE_SPACE = "as set in flight.yaml", "free space"
+"""Names of two rungs of the ladder."""
+
+
+def ladder_verdict(data: ReportData) -> str:
+    """What the scene needs: whether the replay as set is worth its trouble, and which model does better."""
+    rows = [row for row in data.ladder if math.isfinite(row.rmse_heldout_db)]
+    chosen = next((row.model for row in rows if row.recommended), None)
+    if chosen is None:
+        return ""
+    mean = {name: _pooled([r for r in rows if r.model == name]) for name in (AS_SET, FREE_SPACE, chosen)}
+    named = f"\u201c{chosen}\u201d"
+    how = "the simplest model within one standard error of the best"
+    if chosen == AS_SET:
+        return f"The settings of this flight file are {how}: {mean[AS_SET]:.1f} dB on stretches left out."
+    text = f"Not this replay but {named} is {how}: {mean[chosen]:.1f} dB"
+    if math.isfinite(mean[AS_SET]) and math.isfinite(mean[FREE_SPACE]) and mean[AS_SET] > mean[FREE_SPACE]:
+        text = (
+            f"With these settings the replay is WORSE than free space on stretches left out ({mean[AS_SET]:.1f} "
+            f"against {mean[FREE_SPACE]:.1f} dB); the better model is {named}, {how}: {mean[chosen]:.1f} dB"
+        )
+    elif math.isfinite(mean[AS_SET]):
+        text += f" on stretches left out, {mean[AS_SET]:.1f} dB with these settings"
+    return text + " (report --recommend writes its settings)."
+
+
+def _pooled(rows: Sequence[LadderRow]) -> float:
+    """RMSE over all towers and channels."""
+    n = sum(row.n for row in rows)
+    return math.sqrt(sum(row.n * row.rmse_heldout_db**2 for row in rows) / n) if n else float("nan")
 
 
 def rss_verdict(panel: RssPanel) -> str:

@@ -13,6 +13,7 @@ from aerpaw_cmp.compare.rank import (
     capacity_rank,
     channel_rank,
     cohen_kappa,
+    commonest_rank,
     compare_rank,
     compare_ranks,
     condition_number_rank,
@@ -21,7 +22,7 @@ from aerpaw_cmp.compare.rank import (
     histogram_test,
     k_curve,
     k_grid,
-    profile_by_rank,
+    repeat_rank,
     shift_test,
     singular_values,
     stale_reports,
@@ -240,7 +241,7 @@ def test_the_grid_of_k_holds_the_papers_values():
 def test_condition_number_rule():
     limit = 10 ** (-17 / 20)
     h = np.stack([np.diag([1, limit * 1.01]), np.diag([1, limit * 0.99])])
-    assert condition_number_rank(h).tolist() == [2, 1]
+    assert condition_number_rank(singular_values(h)).tolist() == [2, 1]
 
 
 def test_capacity_rank_limits():
@@ -283,15 +284,6 @@ def test_stale_ri_is_recognised():
     assert stale_reports(time, np.full(300, NAN)).verdict == "no rank"
 
 
-def test_profile_tells_why_a_rank_was_two():
-    profile = np.tile([1, 0.5, 0.01, 0.0], (40, 1))
-    profile[::2, 1] = 0.02
-    ranks = np.where(np.arange(40) % 2, 2.0, 1.0)
-    found = profile_by_rank(ranks, profile)
-    assert found[2][1].tolist() == pytest.approx([0, 20 * np.log10(0.5), -40, -np.inf])
-    assert found[1][1][1] == pytest.approx(20 * np.log10(0.02))
-
-
 def test_rank_intervals_hold_the_truth_of_a_known_process():
     rng = np.random.default_rng(31)
     hits = np.zeros(3)
@@ -329,3 +321,28 @@ def test_as_dict_has_the_stable_names():
     import json
 
     json.dumps(found, allow_nan=False)
+
+
+def test_the_commonest_rank_is_the_forecast_that_needs_no_model():
+    found = commonest_rank([2.0] * 70 + [1.0] * 20 + [3.0] * 10 + [np.nan] * 5)
+    assert (found.rank, found.agreement) == (2, 0.7)
+    assert commonest_rank([np.nan]).rank == 0
+
+
+def test_repeat_kappa_of_two_passes():
+    rng = np.random.default_rng(3)
+    here = np.column_stack([np.linspace(0, 900, 900), np.zeros((900, 2))])
+    rank = rng.integers(1, 5, 900).astype(float)
+    there = here[::-1] + rng.normal(0, 0.1, here.shape)
+    same = repeat_rank(here, rank, there, rank[::-1])
+    assert same.n == pytest.approx(900, abs=20)
+    assert same.kappa > 0.99
+    assert repeat_rank(here, rank, there, rng.permutation(rank)).kappa == pytest.approx(0.0, abs=0.1)
+    half = np.where(rng.random(900) < 0.5, rank[::-1], rng.permutation(rank))
+    found = repeat_rank(here, rank, there, half)
+    assert found.kappa_ci95[0] < 0.5 < found.kappa_ci95[1]
+    nowhere = repeat_rank(here, rank, there + 50.0, rank)
+    assert nowhere.n == 0
+    assert np.isnan(nowhere.kappa)
+    north, south = np.zeros(900), np.full(900, 180.0)
+    assert repeat_rank(here, rank, there, rank, heading_deg=north, other_heading_deg=south).n == 0

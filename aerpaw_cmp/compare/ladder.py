@@ -1,0 +1,201 @@
+"""What a scene needs: a ladder of models, scored on stretches of the flight that had no part in their offset.
+
+Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
+stretches; the offset of a model is fitted without a stretch and scored on it, in turn. Models are compared on the same
+samples by paired differences, and the simplest one within one standard error of the best is recommended: what a flight
+cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section 3.4.3: the 1 SE rule).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray, IntArray
+from .statistics import NO_INTERVAL, REPLICATES, Interval, PairedDifference, paired_difference
+
+BLOCKS = 8
+"""Stretches that a flight is cut into."""
+
+LEAST_COVERED = 0.8
+"""A model that has no level at more than a fifth of the samples cannot be compared with the others."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Rung:
+    """One model: its name, its level (n,) [dBm] at the samples of each series, and what it cost [s]."""
+
+    model: str
+    level_db: tuple[FloatArray, ...]
+    seconds: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LadderRow:
+    """A model on one tower and channel.
+
+    Parameters
+    ----------
+    model, tower, channel : str
+    rmse_heldout_db : float
+        Over all stretches left out [dB]; NaN where the model has too few levels.
+    difference_to_best_db, difference_to_best_ci95_db : float, (low, high)
+        RMSE minus that of the best model on the same samples [dB].
+    n : int
+        Samples that all compared models share.
+    seconds : float
+        For the whole flight.
+    recommended : bool
+        The simplest model within one standard error of the best, over all series of the flight.
+    """
+
+    model: str
+    tower: str
+    channel: str
+    rmse_heldout_db: float
+    difference_to_best_db: float
+    difference_to_best_ci95_db: Interval
+    n: int
+    seconds: float
+    recommended: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Ladder:
+    """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.
+
+    ``rmse_db`` is over all series; ``best`` and ``recommended`` are indices of rungs, None where nothing was compared.
+    """
+
+    rungs: tuple[Rung, ...]
+    error_db: tuple[tuple[FloatArray, ...], ...]
+    rmse_db: tuple[float, ...]
+    best: int | None
+    recommended: int | None
+
+
+def stretches_of(samples: int, blocks: int = BLOCKS) -> IntArray:
+    """Stretch of each sample (n,): equally many neighbouring samples each."""
+    return np.asarray(np.arange(samples) * blocks // max(samples, 1), dtype=np.int64)
+
+
+def climb(
+    measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = BLOCKS,
+    replicates: int = REPLICATES,
+) -> Ladder:  # fmt: skip
+    """Score the rungs of a ladder, given from the simplest to the most complex model.
+
+    Parameters
+    ----------
+    measured_db : sequence of (n,)
+        By series, in time order; NaN does not count [dB].
+    time_s : sequence of (n,)
+        Orders the errors of all series, so that channels that share their instants share their blocks [s].
+    rungs : sequence of Rung
+        Simplest first: ties go to the earlier one.
+    blocks : int
+        Stretches, of equally many samples.
+    replicates : int
+        Of the paired differences.
+
+    Returns
+    -------
+    Ladder
+    """
+    enough = [_covers(measured_db, rung) for rung in rungs]
+    shared = [_shared(m, [r.level_db[i] for r, ok in zip(rungs, enough, strict=True) if ok])
+              for i, m in enumerate(measured_db)]  # fmt: skip
+    errors = tuple(
+        tuple(
+            held_out_error_db(m, level, keep, blocks) if ok else np.full(len(m), np.nan)
+            for m, level, keep in zip(measured_db, rung.level_db, shared, strict=True)
+        )
+        for rung, ok in zip(rungs, enough, strict=True)
+    )
+    joined = [np.concatenate(e)[_in_time(time_s)] if e else np.zeros(0) for e in errors]
+    rmse = tuple(_rmse(e) for e in joined)
+    if not any(np.isfinite(rmse)):
+        return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, recommended=None)
+    best = int(np.nanargmin(rmse))
+    recommended = best
+    for index, error in enumerate(joined[:best]):
+        if np.isfinite(rmse[index]) and _as_good(error, joined[best], replicates):
+            recommended = index
+            break
+    return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=best, recommended=recommended)
+
+
+def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]], *, replicates: int = REPLICATES) -> list[LadderRow]:
+    """The ladder per tower and channel; ``names`` are (tower, channel) of each series."""
+    rows = []
+    for series, (tower, channel) in enumerate(names):
+        for index, rung in enumerate(ladder.rungs):
+            error = ladder.error_db[index][series]
+            found = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
+            rows.append(
+                LadderRow(
+                    model=rung.model,
+                    tower=tower,
+                    channel=channel,
+                    rmse_heldout_db=_rmse(error),
+                    difference_to_best_db=float("nan") if found is None else found.difference_db,
+                    difference_to_best_ci95_db=NO_INTERVAL if found is None else found.difference_ci95_db,
+                    n=int(np.isfinite(error).sum()),
+                    seconds=rung.seconds,
+                    recommended=index == ladder.recommended,
+                )
+            )
+    return rows
+
+
+def held_out_error_db(
+    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = BLOCKS
+) -> FloatArray:
+    """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
+
+    Examples
+    --------
+    >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), blocks=2).tolist()
+    [-2.0, -2.0, 2.0, 2.0]
+    """
+    rows = np.flatnonzero(keep)
+    difference = measured_db[rows] - level_db[rows]
+    stretch = stretches_of(len(rows), blocks)
+    count = np.bincount(stretch, minlength=blocks)
+    total = np.bincount(stretch, weights=difference, minlength=blocks)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        offset = (total.sum() - total) / (count.sum() - count)
+    error = np.full(len(measured_db), np.nan)
+    error[rows] = difference - offset[stretch]
+    return error
+
+
+def compared(error_db: FloatArray, best_db: FloatArray, replicates: int = REPLICATES) -> PairedDifference:
+    """A model against the best one; errors of stretches left out count as they are."""
+    return paired_difference(error_db, best_db, free_offset=False, replicates=max(replicates, 2))
+
+
+def _as_good(error: FloatArray, best: FloatArray, replicates: int) -> bool:
+    found = compared(error, best, replicates)
+    return bool(found.difference_db <= found.standard_error_db)
+
+
+def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:
+    wanted = sum(int(np.isfinite(m).sum()) for m in measured)
+    both = (int((np.isfinite(m) & np.isfinite(x)).sum()) for m, x in zip(measured, rung.level_db, strict=True))
+    return sum(both) >= LEAST_COVERED * max(wanted, 1)
+
+
+def _shared(measured: FloatArray, levels: Sequence[FloatArray]) -> BoolArray:
+    return np.asarray(np.isfinite([measured, *levels]).all(axis=0))
+
+
+def _in_time(time_s: Sequence[FloatArray]) -> IntArray:
+    return np.argsort(np.concatenate(list(time_s)), kind="stable")
+
+
+def _rmse(error: FloatArray) -> float:
+    good = error[np.isfinite(error)]
+    return float(np.sqrt(np.mean(good**2))) if len(good) else float("nan")

@@ -1,0 +1,326 @@
+"""The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
+
+Stages come one after the other (antennas, ground, buildings, trees); each adds its variants to the best model so far,
+by the RMSE on stretches left out. Everything but the offset is fixed beforehand.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+import yaml
+
+from ..common.errors import UsageError
+from ..common.stages import Progress, silent
+from ..common.units import FloatArray
+from ..common.yamlfile import parse_yaml
+from ..compare.ladder import Ladder, Rung, climb
+from ..flight.data import FlightData
+from ..flight.settings import FlightFile
+from ..propagation.arrays import Link, Poses
+from ..propagation.channel import channel_matrices, mean_pair_power, rss_dbm
+from ..propagation.tracer import Replay, replay
+from ..site.antennas import Isotropic
+from ..site.installed import InstalledPattern
+from ..site.site import Site
+from .levels import Levels, levels_of
+from .replay import FlightReplay, Replayed, attitude_rotation, path_loss
+
+WEAK_GROUND_DB = 10.0
+"""Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
+
+MOST_SAMPLES = 4000
+"""Per series; of longer ones every second, third, ... sample is taken."""
+
+AS_SET = "as set in flight.yaml"
+FREE_SPACE = "free space"
+
+Antennas = Literal["isotropic", "measured", "installed"]
+Ground = Literal["none", "coherent", "weakened", "power sum"]
+Trees = Literal["none", "p833", "weissberger", "opaque"]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Model:
+    """One combination of what a replay may hold."""
+
+    antennas: Antennas = "isotropic"
+    attitude: Literal["ignored", "level", "logged"] = "ignored"
+    ground: Ground = "none"
+    buildings: bool = False
+    trees: Trees = "none"
+
+    @property
+    def name(self) -> str:
+        """What it holds, in words."""
+        parts = {"isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"]}[self.antennas]
+        parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
+        if self.ground != "none":
+            parts.append(f"ground ({self.ground})")
+        parts += ["buildings"] if self.buildings else []
+        if self.trees != "none":
+            parts.append("opaque trees" if self.trees == "opaque" else f"trees ({self.trees})")
+        return FREE_SPACE if not parts else " + ".join(parts)
+
+    def settings(self, max_depth: int) -> dict[str, dict[str, Any]]:
+        """The keys of flight.yaml that make it, ``max_depth`` that of the flight file."""
+        depth = 0 if self.ground == "none" else max(max_depth, 1) if self.buildings else 1
+        rt: dict[str, Any] = {
+            "max_depth": depth,
+            "attitude": self.attitude,
+            "reflection_loss_db": WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
+        }
+        if self.trees in ("p833", "weissberger"):
+            rt["foliage_model"] = self.trees
+        return {
+            "rt": rt,
+            "rss": {"field": "power" if self.ground == "power sum" else "coherent"},
+            "site": {"without_buildings": not self.buildings},
+        }
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlightLadder:
+    """The scored ladder; ``models`` are in the order of its rungs (None: the settings of the flight file)."""
+
+    ladder: Ladder
+    models: tuple[Model | None, ...]
+    names: tuple[tuple[str, str], ...]
+
+    @property
+    def recommended(self) -> Model | None:
+        """The recommended model; None where it is that of the flight file, or none."""
+        chosen = self.ladder.recommended
+        return None if chosen is None else self.models[chosen]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Series:
+    """One series, thinned: ``rows`` (m,) of its samples, their poses, and which of its replayed poses they are."""
+
+    replayed: Replayed
+    levels: Levels
+    rows: Any
+    picked: Any
+    step: int
+    time_s: FloatArray
+
+
+def flight_ladder(data: FlightData, replays: FlightReplay, progress: Progress = silent) -> FlightLadder | None:
+    """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
+    if not data.rss or data.settings.rt.engine != "image":
+        return None
+    progress("ladder of models")
+    return _Climber(data, [_thin(data, i, r) for i, r in enumerate(replays.rss)]).climb()
+
+
+def _thin(data: FlightData, index: int, replayed: Replayed) -> _Series:
+    levels = levels_of(data.rss[index], replayed, data.settings.rss)
+    wanted = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
+    step = max(1, -(-len(wanted) // MOST_SAMPLES))
+    rows = wanted[::step]
+    pose_of = np.cumsum(replayed.valid) - 1
+    seconds = (data.rss[index].time - data.rss[0].time[:1]) / np.timedelta64(1, "s")
+    return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
+
+
+class _Climber:
+    """Evaluates models on the series of a flight, each search of paths once."""
+
+    def __init__(self, data: FlightData, series: Sequence[_Series]) -> None:
+        self._data, self._series = data, series
+        self._measured = [s.levels.measured_db[s.rows] for s in series]
+        self._traced: dict[tuple[int, bool], tuple[Replay, float]] = {}
+
+    def climb(self) -> FlightLadder:
+        """All stages."""
+        rungs: list[Rung] = []
+        models: list[Model | None] = []
+        best = Model()
+        for stage in (self._antennas, self._ground, self._buildings, self._trees):
+            for model in stage(best):
+                if model not in models:
+                    models.append(model)
+                    rungs.append(self._rung(model))
+            scored = self._scored(rungs)
+            if scored.best is not None:
+                best = models[scored.best] or best
+        models.append(None)
+        rungs.append(self._as_set())
+        names = tuple((s.tower, s.channel) for s in self._data.rss)
+        return FlightLadder(ladder=self._scored(rungs), models=tuple(models), names=names)
+
+    def _scored(self, rungs: Sequence[Rung]) -> Ladder:
+        return climb(
+            self._measured, [s.time_s for s in self._series], rungs, replicates=self._data.settings.rss.bootstrap
+        )
+
+    # the stages: what may be added to the best model so far
+
+    def _antennas(self, _best: Model) -> list[Model]:
+        patterns = [p for s in self._series for a in _arrays(s.replayed.link) for p in a.patterns]
+        found = [Model()]
+        if all(p.name == "iso" for p in patterns):
+            return found
+        found.append(Model(antennas="measured"))
+        tracks = [s.replayed.track for s in self._series]
+        if all(t is not None for t in tracks):
+            known = np.concatenate([t.attitude_known for t in tracks if t is not None])
+            found.append(Model(antennas="measured", attitude="level"))
+            if known.any():
+                found.append(Model(antennas="measured", attitude="logged"))
+        if any(isinstance(p, InstalledPattern) for p in patterns):
+            found += [dataclasses.replace(m, antennas="installed") for m in found[1:]]
+        return found
+
+    def _ground(self, best: Model) -> list[Model]:
+        kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
+        return [dataclasses.replace(best, ground=kind) for kind in kinds]
+
+    def _buildings(self, best: Model) -> list[Model]:
+        if not self._data.site.buildings:
+            return []
+        return [dataclasses.replace(best, buildings=True)]
+
+    def _trees(self, best: Model) -> list[Model]:
+        if not len(self._data.site.trees):
+            return []
+        kinds: tuple[Trees, ...] = ("p833", "weissberger", "opaque")
+        return [dataclasses.replace(best, trees=kind) for kind in kinds]
+
+    # levels
+
+    def _as_set(self) -> Rung:
+        levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
+        return Rung(model=AS_SET, level_db=levels, seconds=sum(s.replayed.replay.seconds for s in self._series))
+
+    def _rung(self, model: Model) -> Rung:
+        found = [self._level(i, model) for i in range(len(self._series))]
+        return Rung(model=model.name, level_db=tuple(f[0] for f in found), seconds=sum(f[1] for f in found))
+
+    def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
+        """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
+        series, rt = self._series[index], self._data.settings.rt
+        traced, search_s = self._paths(index, model.buildings)
+        begin = time.perf_counter()
+        poses, link = self._poses(series, model.attitude), _link(series.replayed.link, model.antennas)
+        paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
+        wanted = rt.model_copy(update=model.settings(rt.max_depth)["rt"])
+        loss = path_loss(self._data.site.trees, wanted, link.carrier_hz)
+        sources = np.array([self._data.site.towers[name].position_m for name in traced.towers])
+        loss_db = None if loss is None else loss(paths, sources, poses.position_m)
+        fields = channel_matrices(paths, traced.faces, sources, poses, link, loss_db)
+        power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
+        level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
+        return level, series.step * (search_s + time.perf_counter() - begin)
+
+    def _paths(self, index: int, buildings: bool) -> tuple[Replay, float]:
+        if (index, buildings) not in self._traced:
+            begin = time.perf_counter()
+            site: Site = self._data.site if buildings else dataclasses.replace(self._data.site, buildings=())
+            depth = max(self._data.settings.rt.max_depth, 1) if buildings else 1
+            series = self._series[index]
+            found = replay(site, series.replayed.link, self._poses(series, "ignored"), max_depth=depth, cache_dir="")
+            self._traced[index, buildings] = found, time.perf_counter() - begin
+        return self._traced[index, buildings]
+
+    def _poses(self, series: _Series, attitude: str) -> Poses:
+        whole, track = series.replayed.poses, series.replayed.track
+        turn = whole.rotation if track is None else attitude_rotation(track, attitude)[series.replayed.valid]
+        return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
+
+
+def _arrays(link: Link) -> list[Any]:
+    return [*link.tower_arrays.values(), link.uav_array]
+
+
+def _link(link: Link, antennas: Antennas) -> Link:
+    def pattern(p: Any) -> Any:
+        if antennas == "isotropic":
+            return Isotropic()
+        return p.base if antennas == "measured" and isinstance(p, InstalledPattern) else p
+
+    def other(array: Any) -> Any:
+        return dataclasses.replace(array, patterns=tuple(pattern(p) for p in array.patterns))
+
+    return dataclasses.replace(
+        link, tower_arrays={name: other(a) for name, a in link.tower_arrays.items()}, uav_array=other(link.uav_array)
+    )
+
+
+def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> dict[str, Any]:
+    """flight.yaml as nested mappings with the settings of a model; None leaves it as it is.
+
+    Parameters
+    ----------
+    settings : mapping
+        The keys that the flight file states.
+    model : Model or None
+        See :attr:`FlightLadder.recommended`.
+    """
+    result = {key: dict(value) if isinstance(value, Mapping) else value for key, value in settings.items()}
+    if model is None:
+        return result
+    changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
+    for section, change in changes.items():
+        result[section] = {**result.get(section, {}), **change}
+    if model.trees not in ("p833", "weissberger"):
+        result["rt"].pop("foliage_model", None)
+    if model.antennas != "installed":
+        link = dict(result.get("link", {}))
+        for name in [key for key in ("rss",) if key in link]:
+            link[name] = _antennas_as(link[name], model.antennas)
+        if "channels" in link:
+            link["channels"] = {name: _antennas_as(one, model.antennas) for name, one in link["channels"].items()}
+        if link:
+            result["link"] = link
+    return result
+
+
+def _antennas_as(value: Any, antennas: Antennas) -> Any:
+    """Nested link settings with isotropic antennas, or with measured ones without added gain."""
+    if isinstance(value, Mapping):
+        out = {}
+        for key, item in value.items():
+            if key in ("antenna", "antennas"):
+                several = [dict(one) for one in item] if isinstance(item, list) else [dict(item)]
+                changed = [
+                    {"model": "iso"}
+                    if antennas == "isotropic"
+                    else {k: v for k, v in one.items() if k != "installed_db"}
+                    for one in several
+                ]
+                out[key] = changed if isinstance(item, list) else changed[0]
+            else:
+                out[key] = _antennas_as(item, antennas)
+        return out
+    return value
+
+
+def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: str) -> str:
+    """The flight file ``name`` with the settings of the recommended model, as text.
+
+    Raises
+    ------
+    UsageError
+        If no ladder was climbed: no RSS, or rays of another engine than the image method.
+    """
+    if ladder is None or ladder.ladder.recommended is None:
+        raise UsageError(
+            "no model can be recommended for this flight",
+            expected="RSS with known poses, replayed by the image engine (rt.engine: image)",
+        )
+    stated = settings.model_dump(mode="json", exclude_unset=True)
+    changed = recommended_settings(stated, ladder.recommended)
+    chosen = ladder.ladder.rungs[ladder.ladder.recommended].model
+    rmse = ladder.ladder.rmse_db[ladder.ladder.recommended]
+    head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on stretches left out).\n"
+    text = head + yaml.safe_dump(changed, sort_keys=False, allow_unicode=True, width=120)
+    parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
+    return text

@@ -1,0 +1,86 @@
+"""Ladder of models on planted truths."""
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.ladder import Rung, climb, held_out_error_db, ladder_rows, stretches_of
+
+
+def wave(n, seed, sd=1.0):
+    """Noise that remembers some 10 samples."""
+    white = np.random.default_rng(seed).normal(size=n + 50)
+    kernel = np.exp(-np.arange(50) / 10.0)
+    return sd * np.convolve(white, kernel / np.sqrt((kernel**2).sum()), "valid")[:n]
+
+
+def planted(n=2000):
+    truth = wave(n, 1, 6.0) - 80.0
+    measured = truth + 12.0 + wave(n, 2, 2.0)
+    return truth, measured
+
+
+def rung(name, level):
+    return Rung(model=name, level_db=(level,), seconds=1.0)
+
+
+def test_truth_is_best_and_recommended_over_what_adds_nothing():
+    truth, measured = planted()
+    flat = np.full(len(truth), -80.0)
+    useless = truth + wave(len(truth), 8, 0.3)
+    ladder = climb([measured], [np.arange(2000.0)], [rung("flat", flat), rung("truth", truth), rung("more", useless)])
+    assert ladder.rungs[ladder.recommended].model == "truth"
+    assert ladder.rmse_db[1] == pytest.approx(2.0, abs=0.3)
+    rows = ladder_rows(ladder, [("LW1", "A")])
+    assert [r.recommended for r in rows] == [False, True, False]
+    low, high = rows[0].difference_to_best_ci95_db
+    assert 0.0 < low < rows[0].difference_to_best_db < high
+
+
+def test_a_worse_model_is_never_recommended_for_being_simple():
+    truth, measured = planted()
+    worse = truth + wave(len(truth), 5, 3.0)
+    ladder = climb([measured], [np.arange(2000.0)], [rung("worse", worse), rung("truth", truth)])
+    assert ladder.recommended == ladder.best == 1
+
+
+def test_offset_of_a_stretch_comes_from_the_others_only():
+    measured, level = np.arange(80.0), np.zeros(80)
+    keep = np.ones(80, dtype=bool)
+    error = held_out_error_db(measured, level, keep)
+    changed = measured.copy()
+    changed[:10] += 100.0  # the first stretch
+    again = held_out_error_db(changed, level, keep)
+    np.testing.assert_allclose(again[:10] - error[:10], 100.0)
+    assert stretches_of(80).tolist() == np.repeat(np.arange(8), 10).tolist()
+    assert held_out_error_db(measured, level + 33.0, keep) == pytest.approx(error)
+
+
+def test_models_are_scored_on_the_samples_that_all_have():
+    truth, measured = planted()
+    holes = truth.copy()
+    holes[100:200] = np.nan
+    deaf = np.full(len(truth), np.nan)
+    deaf[:50] = -80.0
+    ladder = climb([measured], [np.arange(2000.0)], [rung("truth", truth), rung("holes", holes), rung("deaf", deaf)])
+    rows = ladder_rows(ladder, [("LW1", "A")])
+    assert [r.n for r in rows] == [1900, 1900, 0]  # a model without levels does not take the samples of the others
+    assert not np.isfinite(rows[2].rmse_heldout_db)
+    assert ladder.best == 0
+
+
+def test_two_channels_share_one_recommendation():
+    truth, measured = planted()
+    flat = np.full(len(truth), -80.0)
+    rungs = [
+        Rung(model="flat", level_db=(flat, flat), seconds=1.0),
+        Rung(model="truth", level_db=(truth, truth), seconds=2.0),
+    ]
+    ladder = climb([measured, measured - 20.0], [np.arange(2000.0)] * 2, rungs)
+    rows = ladder_rows(ladder, [("LW1", "A"), ("LW1", "B")])
+    assert [(r.channel, r.model) for r in rows if r.recommended] == [("A", "truth"), ("B", "truth")]
+
+
+def test_nothing_measured_recommends_nothing():
+    ladder = climb([np.full(10, np.nan)], [np.arange(10.0)], [rung("flat", np.zeros(10))])
+    assert ladder.recommended is None
+    assert ladder_rows(ladder, [("LW1", "A")])[0].n == 0

@@ -1,0 +1,110 @@
+"""The ladder of models on a flight whose truth is planted, from logs to page and recommended flight file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.flight_run import run_flight
+from aerpaw_cmp.jobs.ladder import Model, recommended_settings
+
+LW1 = (35.72750947, -78.69595819)
+ORIGIN = "2025-06-01T14:00:00Z"
+
+
+def flight(folder: Path) -> Path:
+    """Eastwards past LW1 at 40 m; the levels are free space plus noise, the flight file asks for coherent ground."""
+    t = np.arange(0.0, 121.0)
+    east = -500.0 + 8.0 * t
+    rows = "\n".join(f"{a:g},{LW1[0] + 5e-4:.9f},{LW1[1] + b / 90_314.0:.9f},40" for a, b in zip(t, east, strict=True))
+    (folder / "track.csv").write_text("s,phi,lam,h\n" + rows + "\n", encoding="utf-8")
+    at = np.arange(0.0, 120.0, 0.2)
+    range_m = np.sqrt((-500.0 + 8.0 * at) ** 2 + 55.0**2 + 30.0**2)
+    level = -30.0 - 20.0 * np.log10(range_m) + np.random.default_rng(1).normal(size=len(at))
+    rows = "\n".join(f"{a:.1f},{b:.4f}" for a, b in zip(at, level, strict=True))
+    (folder / "rss.csv").write_text("t,level\n" + rows + "\n", encoding="utf-8")
+    path = folder / "flight.yaml"
+    path.write_text(
+        f"""
+flight: planted
+site: {{file: lake_wheeler, without_buildings: true}}
+logs:
+  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{ORIGIN}",
+     columns: {{time: s, latitude_deg: phi, longitude_deg: lam, altitude_m: h}}}}
+  - {{path: rss.csv, reader: generic_csv, kind: rss, node: LW1, channel: A, time_origin: "{ORIGIN}",
+     columns: {{time: t, rss_db: level}}}}
+rt: {{max_depth: 1, audit_links: 0}}
+rss: {{lag: "off", bootstrap: 100, span_db: [-100, 100]}}
+report: {{speed_table: false}}
+""",
+        encoding="utf-8",
+    )
+    return path
+
+
+def report(path: Path, capsys: pytest.CaptureFixture[str], *more: str) -> dict[str, Any]:
+    assert main(["report", str(path), "-o", str(path.parent / "out"), "--json", *more]) == 0
+    metrics: dict[str, Any] = json.loads(capsys.readouterr().out)
+    return metrics
+
+
+def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flight(tmp_path)
+    better = tmp_path / "better.yaml"
+    rows = {row["model"]: row for row in report(path, capsys, "--recommend", str(better))["ladder"]}
+    assert [name for name, row in rows.items() if row["recommended"]] == ["free space"]
+    assert rows["free space"]["rmse_heldout_db"] == pytest.approx(1.0, abs=0.1)
+    as_set = rows["as set in flight.yaml"]
+    assert as_set["rmse_heldout_db"] == pytest.approx(rows["ground (coherent)"]["rmse_heldout_db"], abs=1e-6)
+    assert as_set["difference_to_best_db"] > 0.2
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "WORSE than free space" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
+    assert "Models from the simplest to the richest" in page
+
+    settings = load_flight(better)
+    again = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True).result
+    assert again.rss[0].score.rmse_db == pytest.approx(1.0, abs=0.1)
+    as_set = {r.model: r for r in again.ladder}["as set in flight.yaml"]
+    assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
+
+
+def test_recommended_file_must_stand_beside_its_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path = flight(tmp_path)
+    other = tmp_path / "other"
+    other.mkdir()
+    assert main(["report", str(path), "-o", str(tmp_path / "out"), "--recommend", str(other / "b.yaml")]) == 2
+    assert "beside the flight file" in capsys.readouterr().err
+    assert main(["report", str(path), "-o", str(tmp_path / "out"), "--recommend", str(path), "--force"]) == 2
+
+
+@pytest.mark.parametrize(
+    "model",
+    [
+        Model(),
+        Model(antennas="measured", attitude="logged", ground="weakened", trees="weissberger"),
+        Model(antennas="installed", attitude="level", ground="power sum", buildings=True, trees="opaque"),
+    ],
+)
+def test_every_model_is_a_flight_file(model: Model, tmp_path: Path) -> None:
+    stated = load_flight(flight(tmp_path)).model_dump(mode="json", exclude_unset=True)
+    antenna = {"model": "gain_grid", "file": "a.mat", "variable": "g", "installed_db": [1.0, 2.0]}
+    stated["link"] = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": antenna}, "uav": {"antenna": antenna}}}
+    (tmp_path / "b.yaml").write_text(yaml.safe_dump(recommended_settings(stated, model)), encoding="utf-8")
+    found = load_flight(tmp_path / "b.yaml")
+    uav = found.link.rss.uav.antenna
+    assert (uav.model, len(uav.installed_db)) == {
+        "isotropic": ("iso", 0), "measured": ("gain_grid", 0), "installed": ("gain_grid", 2)
+    }[model.antennas]  # fmt: skip
+    assert found.site.without_buildings is not model.buildings
+    assert found.rt.attitude == model.attitude
+    assert (found.rt.max_depth > 0) is (model.ground != "none")
+    assert (found.rss.field == "power") is (model.ground == "power sum")
+    assert (found.rt.foliage == "none") is (model.trees == "none")

@@ -543,7 +543,7 @@ def site_import(
 @site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
 def site_show(
     site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
+    out: Out = None,
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -185,21 +185,10 @@ def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
 
 def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
     """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
-    roots = [path.parent] if logs_root is None else [path.parent, logs_root]
-    named = [root / text for text in _texts(settings.model_dump()) for root in roots if text and "\0" not in text]
-    return [path, *(file for file in dict.fromkeys(named) if os.path.isfile(file))]  # noqa: PTH113  never raises
+    from .manifest import named_files
 
-
-def _texts(value: Any) -> Iterator[str]:
-    """Every text in nested settings."""
-    if isinstance(value, (str, Path)):
-        yield str(value)
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _texts(item)
-    elif isinstance(value, (list, tuple)):
-        for item in value:
-            yield from _texts(item)
+    roots = [path.parent] if logs_root is None else [logs_root, path.parent]
+    return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
 def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
@@ -358,7 +347,7 @@ def run_site_import(
 
 def run_site_show(
     site: str | None,
-    out: Path,
+    out: Path | None = None,
     *,
     flight: Path | None = None,
     logs_root: Path | None = None,
@@ -402,6 +391,8 @@ def run_site_show(
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         inputs += input_files(settings, flight, logs_root)
     track, paths = None, ()
+    if out is None:
+        out = Path("reports") / f"site-{Path(site or (settings.site.file if settings else 'lake_wheeler')).stem}"
     with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")

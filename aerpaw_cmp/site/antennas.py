@@ -269,6 +269,12 @@ def read_pattern_text(
     return pattern
 
 
+_FREQUENCY = re.compile(
+    r"\s*frequency\s*=\s*([-+]?\d{1,20}(?:\.\d{0,20})?(?:e[-+]?\d{1,2})?)\s*\(\s*([kMG]?)Hz\s*\)",
+    re.IGNORECASE | re.ASCII,
+)
+
+
 def _read_rows(path: Path) -> _Rows:
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -280,7 +286,7 @@ def _read_rows(path: Path) -> _Rows:
     values: list[list[float]] = []
     started = False
     for number, line in enumerate(text.splitlines(), start=1):
-        if frequency := re.match(r"\s*frequency\s*=\s*([-+.\deE]+)\s*\(\s*([kMG]?)Hz\s*\)", line, re.IGNORECASE):
+        if frequency := _FREQUENCY.match(line):
             scale = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9}[frequency.group(2).upper()]
             rows.frequency_hz = float(frequency.group(1)) * scale
         elif line.lower().lstrip().startswith("phi"):

@@ -117,3 +117,9 @@ def test_mutilated_gain_grids_give_one_message(tmp_path: Path, place: float, spo
     path.write_bytes(content[:at] if truncate else content[:at] + spoil + content[at + len(spoil) :])
     with contextlib.suppress(AerpawCmpError):
         read_gain_grid(path, "g")
+
+
+def test_a_frequency_that_is_no_number_is_no_frequency(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_bytes(PATTERN.replace(b"3300", b"330-9223372036854775809"))
+    with contextlib.suppress(AerpawCmpError):
+        assert read_pattern_text(tmp_path / "p.txt") is not None

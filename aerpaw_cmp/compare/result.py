@@ -115,7 +115,7 @@ class RssFurther:
 
     A field without a default is always written; one whose default is None only where the flight has it.
     ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
-    the replay is better or worse on the same samples; ``same_footing`` is by simulation and window; ``trimmed``,
+    the replay is better or worse on the same samples; ``averaged`` is by simulation and window; ``trimmed``,
     ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
@@ -130,7 +130,7 @@ class RssFurther:
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
-    same_footing: Mapping[str, Mapping[str, Fit]]
+    averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
     repeatability: Mapping[str, Repeated]

@@ -27,6 +27,7 @@ from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare.offset import Pooling, pooled_offsets
+from ..compare.rank import repeat_rank
 from ..compare.result import FlightResult, RankResult, RssResult
 from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
@@ -37,6 +38,7 @@ from ..report.campaign_data import (
     Failure,
     FlownTrack,
     PooledOffset,
+    RankPairing,
     RankRow,
     RankTransfer,
     Repeat,
@@ -136,6 +138,17 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
+    flown: tuple[RankFlown, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankFlown:
+    """Reported ranks (n,), NaN where none, and where: ``position_m`` (n, 3)."""
+
+    flight: str
+    tower: str
+    position_m: FloatArray
+    rank: FloatArray
 
 
 @lru_cache(maxsize=2)
@@ -182,6 +195,11 @@ def run_task(task: Task) -> Outcome:
         rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
+        flown=tuple(
+            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            for one in found.result.rank
+            if task.reference
+        ),
     )
 
 
@@ -211,7 +229,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         rmse_ci95_db=score.rmse_ci95_db,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.memory.n_effective,
+        n_effective=score.intervals.autocorrelation.n_effective,
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
@@ -246,6 +264,7 @@ def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
             total_variation=fit.total_variation,
             total_variation_ci95=fit.total_variation_ci95,
             wasserstein=fit.wasserstein,
+            commonest_agreement=found.further.commonest.agreement,
         )
         for k, fit in score.simulated.items()
     ]
@@ -429,6 +448,28 @@ def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
     )
 
 
+def rank_repeats(flown: Sequence[RankFlown], radius_m: float) -> list[RankPairing]:
+    """Every pair of flights that reported ranks to one tower at the same places."""
+    out = []
+    for first, second in combinations(flown, 2):
+        if first.tower != second.tower or first.flight == second.flight:
+            continue
+        found = repeat_rank(first.position_m, first.rank, second.position_m, second.rank, radius_m=radius_m)
+        if found.n:
+            out.append(
+                RankPairing(
+                    tower=first.tower,
+                    first=first.flight,
+                    second=second.flight,
+                    n=found.n,
+                    agreement=found.agreement,
+                    kappa=found.kappa,
+                    kappa_ci95=found.kappa_ci95,
+                )
+            )
+    return out
+
+
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
     """K chosen on the other flights, for every flight that has others with the same tower and K."""
     out = []
@@ -532,6 +573,7 @@ def run(
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),
+        rank_repeats=tuple(rank_repeats([f for o in outcomes for f in o.flown], campaign.repeatability.radius_m)),
         held_out=tuple(folds),
         held_out_failure=trouble,
         radius_m=campaign.repeatability.radius_m,
@@ -548,8 +590,8 @@ def _held_out(
 ) -> list[Any]:
     """Fit under one setting on the flights that gave RSS under it."""
     label = settings.setting or tasks[0].setting if tasks else ""
-    heard = {row.flight for row in rows if row.setting == label}
-    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in heard}
+    with_rss = {row.flight for row in rows if row.setting == label}
+    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in with_rss}
     return fit_all(
         flights,
         settings.fit,

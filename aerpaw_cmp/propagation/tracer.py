@@ -506,12 +506,12 @@ def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: st
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
-    heard = np.isfinite(level_dbm)
+    above_floor = np.isfinite(level_dbm)
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=np.where(heard[:, :, None, None], fields.h, 0.0),
-        has_path=has_path & heard,
+        h=np.where(above_floor[:, :, None, None], fields.h, 0.0),
+        has_path=has_path & above_floor,
         paths=paths,
         faces=scene.faces,
         seconds=0.0,

@@ -243,7 +243,9 @@ class RankResult:
         NaN: no CSI.
     sinr_db : (n,), optional
     sigma : (n, min(n_rx, n_tx))
-        Singular values of the simulated channels, falling.
+        Singular values of the simulated channels, falling, relative to a scale of each channel.
+    level_dbm : (n,)
+        Simulated level, NaN without a path.
     rank : mapping of float to (n,) int
         Simulated, per K; 0: no path.
     foliage_rank : mapping of str to mapping of float to (n,) int
@@ -259,6 +261,7 @@ class RankResult:
     measured: FloatArray
     sinr_db: FloatArray | None
     sigma: FloatArray
+    level_dbm: FloatArray
     rank: Mapping[float, IntArray]
     foliage_rank: Mapping[str, Mapping[float, IntArray]]
     score: RankComparison

@@ -420,6 +420,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         measured=series.rank[rows],
         sinr_db=sinr_db,
         sigma=sigma,
+        level_dbm=replayed.replay.rss_dbm[kept, 0],
         rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
         foliage_rank=paired,
         score=score,

@@ -286,6 +286,10 @@ def rank_panel(result: RankResult) -> record.RankPanel:
             **{name: value for name, value in score.as_dict().items() if name not in PANEL_RANK},
             **json_safe(fields_of(result.further)),
         },
+        values={
+            "level_dbm": result.level_dbm,
+            **{f"sigma{i + 2}_over_sigma1_db": ratio_db[:, i] for i in range(ratio_db.shape[1])},
+        },
         per_sample={
             f"rank_{name.replace(' ', '_')}_k{k:g}": rank.astype(np.float64)
             for name, per_k in result.foliage_rank.items()

@@ -380,7 +380,7 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
     """Logged velocities (east, north, up); where missing or never moving, differences of position over 4 s.
 
-    Over shorter times the differences are those of the position's noise: at 10 Hz a hover then has a speed, and a course.
+    Over shorter times the differences are those of the position's noise: at 10 Hz a hover then has a speed.
     """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)

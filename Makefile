@@ -39,7 +39,7 @@ $(LLVM): $(READY) tools/setup_llvm.py aerpaw_cmp/machine/llvm.py
 	@touch $@
 
 report: $(READY) $(LLVM)
-	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT)
+	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
 test: setup

@@ -6,7 +6,7 @@ This is the one place where an exception becomes a message and an exit code:
 0     done
 1     the job ran, but a stated check failed
 2     wrong usage or configuration
-3     an input could not be read
+3     an input could not be read, or an output not written
 70    a fault of the program itself (``--debug`` shows where)
 130   interrupted
 141   whoever read the output has gone (``aerpaw-cmp ... | head``)
@@ -44,7 +44,8 @@ def help_text() -> str:
             "  --version   The version.",
             "  --debug     Show the traceback of a failure (also AERPAW_CMP_DEBUG=1).",
             "",
-            "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration, 3 unreadable input.",
+            "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration,",
+            "3 an input cannot be read or an output not written.",
         ]
     )
 

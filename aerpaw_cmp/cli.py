@@ -519,6 +519,9 @@ def bench(
     _table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
+    if result["report"]:
+        seconds = {name.removeprefix("seconds_"): value for name, value in result["report"].items()}
+        print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
 
 
 @site_app.command("import", help="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")
@@ -540,7 +543,7 @@ def site_import(
 @site_app.command("show", help="Plan view, 3-D picture and a standalone page of a site.")
 def site_show(
     site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the pictures.")] = Path("reports/site"),
+    out: Out = None,
     flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
     logs_root: LogsRoot = None,
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import contextlib
+import glob
 import os
 import tempfile
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -32,7 +34,9 @@ def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
     OSError
         If the folder is missing, full or not writable.
     """
-    handle, name = tempfile.mkstemp(dir=target.parent, prefix=f".{target.name[:40]}.", suffix=".part")
+    prefix = f".{target.name[:40]}."
+    _clear_old_parts(target.parent, prefix)
+    handle, name = tempfile.mkstemp(dir=target.parent, prefix=prefix, suffix=".part")
     os.close(handle)
     part = Path(name)
     try:
@@ -46,6 +50,14 @@ def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
                 sync(target.parent)
     finally:
         part.unlink(missing_ok=True)
+
+
+def _clear_old_parts(folder: Path, prefix: str) -> None:
+    """Remove what a run killed more than an hour ago left of the same file."""
+    for part in folder.glob(f"{glob.escape(prefix)}*.part"):
+        with contextlib.suppress(OSError):
+            if time.time() - part.stat().st_mtime > 3600:
+                part.unlink()
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

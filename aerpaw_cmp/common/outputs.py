@@ -492,6 +492,8 @@ class OutputSet:
                 _make_folders(self.folder, self._made)
                 self._place = _Place(self.folder / self._listing, self.named, folder=False)
                 self._recover()
+                for name in (*self._names, self._listing):
+                    beside(self.folder / name, "new").unlink(missing_ok=True)  # of a run killed before its journal
                 self._remember(_listed(self.folder / self._listing))
                 self._refuse()
             except BaseException:
@@ -536,7 +538,9 @@ class OutputSet:
     def write(self, contents: Mapping[str, bytes], listing: Mapping[str, Any]) -> list[Path]:
         """Write the set; gives its paths, the list last. ``listing`` gets the key ``files``."""
         digests = {name: hashlib.sha256(content).hexdigest() for name, content in contents.items()}
-        others = {name: file_digest(self.folder / name) for name in self._known if self._own(name)}
+        others = {
+            name: file_digest(self.folder / name) for name in self._known if name != self._listing and self._own(name)
+        }
         text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
         everything = {**contents, self._listing: text.encode("utf-8")}
         with told(self.named):
@@ -579,10 +583,11 @@ class OutputSet:
             for name, digest in new.items()
         )
         if whole:
-            (self.folder / self._listing).unlink(missing_ok=True)
-            for name, digest in old.items():
+            for name in (self._listing, *old):
                 file = self.folder / name
-                if file.is_file() and file_digest(file) == digest and new.get(name) != digest:
+                found = file_digest(file) if file.is_file() else None
+                replaced = name == self._listing or found == old.get(name)
+                if found is not None and replaced and found != new.get(name):
                     file.unlink()
             for name in sorted(new, key=lambda name: name == self._listing):
                 if self._new(name).exists():
@@ -643,7 +648,7 @@ class _Place:
                 else:
                     os.ftruncate(self.descriptor, 0)
             except BaseException:
-                os.close(self.descriptor)
+                self.leave()
                 raise
 
     def _claim(self, folder: bool) -> int:

@@ -313,7 +313,8 @@ class RtSettings(Settings):
 
     engine: Literal["image", "sionna"] = "image"
     max_depth: Annotated[int, Field(ge=0, le=3)] = 2
-    samples: Annotated[int, Field(ge=1, le=100_000_000)] = 1_000_000
+    samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
+    """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
     batch: Annotated[int, Field(ge=1, le=100)] = 50
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""

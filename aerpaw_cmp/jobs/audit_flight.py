@@ -43,6 +43,8 @@ ATTITUDE_TOLERANCE_RAD = 1e-6
 REFERENCE_LINKS_AT_MOST = 64
 """Of all series together, at least three each: some 0.1 s apiece."""
 
+TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
+
 NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
     "positions of towers, footprints and trees, and the track's positions",
@@ -61,7 +63,7 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
         paths=sum(len(r.replay.paths) for r in replays),
         settings={
             "max_depth": rt.max_depth,
-            "samples": rt.samples,
+            "samples": max(r.replay.samples for r in replays) or rt.samples if replays else rt.samples,
             "attitude": rt.attitude,
             "foliage": rt.foliage,
             **_crown_settings(rt, replays),
@@ -123,9 +125,15 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         rank_disagreement={k: sum(p.rank_disagreement[k] * p.links for p in parts) / links for k in ks},
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
-        note="The time of the engine is its share for the audited links; that of the reference includes its start-up.",
+        note=" ".join([TIMES, *_rays(parts)]),
         fields=dataclasses.replace(found, not_covered=(*found.not_covered, *NOT_COVERED)),
     )
+
+
+def _rays(parts: Sequence[Audit]) -> list[str]:
+    """How many rays PathSolver shot, and why, in the words of the series that needed most."""
+    most = max(parts, key=lambda p: p.samples)
+    return [f"Rays were raised until two pilots agreed: {most.samples_reason}."] if most.samples_reason else []
 
 
 # --- what the settings say -------------------------------------------------------------------------------------------

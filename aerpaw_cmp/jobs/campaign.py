@@ -29,6 +29,7 @@ from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare.offset import Pooling, pooled_offsets
+from ..compare.rank import repeat_rank
 from ..compare.result import FlightResult, RankResult, RssResult
 from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
@@ -39,6 +40,7 @@ from ..report.campaign_data import (
     Failure,
     FlownTrack,
     PooledOffset,
+    RankPairing,
     RankRow,
     RankTransfer,
     Repeat,
@@ -139,6 +141,17 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
+    flown: tuple[RankFlown, ...] = ()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankFlown:
+    """Reported ranks (n,), NaN where none, and where: ``position_m`` (n, 3)."""
+
+    flight: str
+    tower: str
+    position_m: FloatArray
+    rank: FloatArray
 
 
 @lru_cache(maxsize=2)
@@ -185,6 +198,11 @@ def run_task(task: Task) -> Outcome:
         rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
+        flown=tuple(
+            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            for one in found.result.rank
+            if task.reference
+        ),
     )
 
 
@@ -249,6 +267,7 @@ def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
             total_variation=fit.total_variation,
             total_variation_ci95=fit.total_variation_ci95,
             wasserstein=fit.wasserstein,
+            commonest_agreement=found.further.commonest.agreement,
         )
         for k, fit in score.simulated.items()
     ]
@@ -513,6 +532,28 @@ def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
     )
 
 
+def rank_repeats(flown: Sequence[RankFlown], radius_m: float) -> list[RankPairing]:
+    """Every pair of flights that reported ranks to one tower at the same places."""
+    out = []
+    for first, second in combinations(flown, 2):
+        if first.tower != second.tower or first.flight == second.flight:
+            continue
+        found = repeat_rank(first.position_m, first.rank, second.position_m, second.rank, radius_m=radius_m)
+        if found.n:
+            out.append(
+                RankPairing(
+                    tower=first.tower,
+                    first=first.flight,
+                    second=second.flight,
+                    n=found.n,
+                    agreement=found.agreement,
+                    kappa=found.kappa,
+                    kappa_ci95=found.kappa_ci95,
+                )
+            )
+    return out
+
+
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
     """K chosen on the other flights, for every flight that has others with the same tower and K."""
     out = []
@@ -619,6 +660,7 @@ def run(
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),
+        rank_repeats=tuple(rank_repeats([f for o in outcomes for f in o.flown], campaign.repeatability.radius_m)),
         held_out=tuple(folds),
         held_out_failure=trouble,
         radius_m=campaign.repeatability.radius_m,

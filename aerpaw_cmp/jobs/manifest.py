@@ -38,7 +38,7 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
     found = {flight.resolve(): _entry(flight.name, flight, "flight file")}
-    for key, text, place in _files(content, roots):
+    for key, text, place in named_files(content, roots):
         if key != "site.file":
             found.setdefault(place.resolve(), _entry(text, place, key))
     for entry, place in _site_inputs(settings, flight.parent):
@@ -62,11 +62,11 @@ def _site_inputs(settings: FlightFile, folder: Path) -> Iterator[tuple[InputFile
             if file.is_file():
                 yield _entry(f"aerpaw_cmp/site/data/{packaged}", file, "site file (packaged)"), file
         return
-    for key, text, place in _files(model.model_dump(), [path.parent]):
+    for key, text, place in named_files(model.model_dump(), [path.parent]):
         yield _entry(text, place, f"site: {key}"), place
 
 
-def _files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
+def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
     """Dotted key, text and place of every value that names a file."""
     for key, text in _texts(content, ""):
         for root in roots:

@@ -25,7 +25,135 @@ def median_seconds(action: Callable[[], Any], repeats: int = 5) -> float:
     return statistics.median(times)
 
 
-def ingest_vs_pandas(lines: int = LINES) -> dict[str, Any]:
+def path_search_ratios(
+    poses: int = 1000, samples: tuple[int, ...] = (1_000, 10_000, 100_000, 1_000_000)
+) -> dict[str, Any]:
+    """Path search of the image engine against PathSolver with ``samples`` (increasing), and at equal error.
+
+    Returns
+    -------
+    dict
+        ``at`` maps samples to the numbers of :func:`~aerpaw_cmp.propagation.bench.path_search`; ``equal_error`` is the
+        entry of the fewest samples with which PathSolver finds as many of the paths as with the most: more samples
+        than that buy it nothing, so a ratio to more of them flatters us.
+    """
+    from ..propagation.bench import path_search
+
+    most = path_search(poses, samples[-1])
+    at = {samples[-1]: most}
+    for count in samples[:-1]:
+        at[count] = path_search(poses, count, repeats=3)
+        if at[count]["extra_paths"] <= most["extra_paths"]:
+            break
+    enough = min(n for n, found in at.items() if found["extra_paths"] <= most["extra_paths"])
+    return {"at": {f"{n:.0e}": found for n, found in sorted(at.items())}, "equal_error": at[enough]}
+
+
+def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, Any] | None:
+    """Prediction at 2556 targets with one set of weights for all fields on our side and PyKrige's compiled back end.
+
+    Both have the same neighbours and the same exponential variogram. PyKrige has no several fields: one run is timed,
+    which for ``ratio`` counts as many times as there are fields; ``ratio_one_field`` gives us one field, too.
+    """
+    try:
+        from pykrige.ok import OrdinaryKriging as Peer
+    except ImportError:
+        return None
+    from ..maps.grid import Grid
+    from ..maps.kriging import OrdinaryKriging
+
+    generator = np.random.default_rng(2)
+    grid = Grid.over_area((-540.0, 540.0, -1065.0, 1065.0))
+    points = grid.points_m + generator.uniform(-5, 5, (len(grid), 2))
+    targets = points + generator.uniform(5, 10, points.shape)
+    values = generator.integers(1, 5, (len(grid), fields)).astype(np.float64)
+
+    def correlation(distance: Any) -> Any:
+        return 0.9 * np.exp(-3.0 * distance / 900.0)
+
+    def ours(count: int) -> float:
+        model = OrdinaryKriging(correlation, neighbours=neighbours, radius_m=np.inf).fit(points, values[:, :count])
+        return median_seconds(lambda: model.predict(targets), 3)
+
+    def peer() -> Any:
+        model = Peer(*points.T, values[:, 0], "exponential", {"psill": 0.9, "range": 900.0, "nugget": 0.1})
+        return model.execute("points", *targets.T, backend="C", n_closest_points=neighbours)
+
+    theirs, one, every = median_seconds(peer, 3), ours(1), ours(fields)
+    return {
+        "ratio": fields * theirs / every,
+        "ratio_one_field": theirs / one,
+        "seconds_pykrige_one_field": theirs,
+        "seconds_ours_one_field": one,
+        "seconds_ours_all_fields": every,
+        "fields": fields,
+    }
+
+
+def report_cold_and_warm() -> dict[str, float]:
+    """Wall time of a report as a process: the first with empty caches, and the next; and of the imports it is made of.
+
+    The flight is simulated: one tower, two channels, rank, five minutes. Cold: no compiled kernel, no path, no font and
+    no speed table is kept from an earlier run (XDG_CACHE_HOME, MPLCONFIGDIR and AERPAW_CMP_CACHE are empty folders).
+    """
+    import os
+    import subprocess
+    import sys
+    import tempfile
+    from pathlib import Path
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        flight = folder / "flight.yaml"
+        flight.write_text(_FLIGHT)
+        subprocess.run([sys.executable, "-m", "aerpaw_cmp", "simulate", str(flight)], check=True, capture_output=True)
+        kept = {key: str(folder / key) for key in ("XDG_CACHE_HOME", "MPLCONFIGDIR", "AERPAW_CMP_CACHE")}
+
+        def seconds(*command: str) -> float:
+            start = time.perf_counter()
+            subprocess.run([sys.executable, *command], check=True, capture_output=True, env={**os.environ, **kept})
+            return time.perf_counter() - start
+
+        def report(out: str) -> float:
+            return seconds("-m", "aerpaw_cmp", "report", str(flight), "-o", str(folder / out))
+
+        cold, warm = report("cold"), report("warm")
+        imports = seconds("-c", "import sionna.rt, matplotlib.pyplot, pandas")
+    return {"seconds_cold": cold, "seconds_warm": warm, "seconds_imports": imports}
+
+
+_FLIGHT = """\
+flight:
+  name: bench
+  synthetic: true
+  plan:
+    start: 2025-06-01 10:00:00
+    speed_mps: 8
+    rss_interval_s: 0.1
+    waypoints:
+      - {east_m: -40, north_m: 10, height_m: 40}
+      - {east_m: -300, north_m: 70, height_m: 40}
+      - {east_m: -200, north_m: 400, height_m: 60}
+      - {east_m: 180, north_m: 250, height_m: 60}
+      - {east_m: 300, north_m: -240, height_m: 40}
+      - {east_m: -40, north_m: 10, height_m: 30}
+site: lake_wheeler
+timezone: America/New_York
+logs:
+  - {path: vehicleOut.txt, reader: vehicle_out}
+  - {path: USRP1_power_log.txt, reader: sounder_log, node: LW1, channel: USRP1}
+  - {path: USRP2_power_log.txt, reader: sounder_log, node: LW1, channel: USRP2}
+  - {path: modem_ri.csv, reader: quectel_ri, node: LW1}
+rank: {tower: LW1}
+"""
+
+
+def ingest_at_sizes(sizes: tuple[int, ...] = (LINES, 1_000_000, 5_000_000)) -> dict[int, dict[str, Any]]:
+    """:func:`ingest_vs_pandas` for logs of several sizes: a flight, a day, a week."""
+    return {lines: ingest_vs_pandas(lines, 5 if lines < 100_000 else 1) for lines in sizes}
+
+
+def ingest_vs_pandas(lines: int = LINES, repeats: int = 5) -> dict[str, Any]:
     """Reading a synthetic power log, against ``pandas.read_csv(engine="c")`` on the same bytes.
 
     Ours gives UTC times, levels, flags and the account of every line; pandas columns of text and numbers.
@@ -40,8 +168,8 @@ def ingest_vs_pandas(lines: int = LINES) -> dict[str, Any]:
     times = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(lines) * np.timedelta64(32_760_000, "ns")
     data = format_power_log(times, generator.normal(-40, 12, lines), zone)
     reader, options = by_name("sounder_log"), ReadOptions(timezone=zone)
-    ours = median_seconds(lambda: reader.read(data, options))
-    theirs = median_seconds(lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"))
+    ours = median_seconds(lambda: reader.read(data, options), repeats)
+    theirs = median_seconds(lambda: pd.read_csv(io.BytesIO(data), engine="c", header=None, sep=r"\s+"), repeats)
     return {"ratio": theirs / ours, "seconds_ours": ours, "seconds_pandas": theirs, "lines": lines}
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
@@ -185,21 +185,10 @@ def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
 
 def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
     """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
-    roots = [path.parent] if logs_root is None else [path.parent, logs_root]
-    named = [root / text for text in _texts(settings.model_dump()) for root in roots if text and "\0" not in text]
-    return [path, *(file for file in dict.fromkeys(named) if os.path.isfile(file))]  # noqa: PTH113  never raises
+    from .manifest import named_files
 
-
-def _texts(value: Any) -> Iterator[str]:
-    """Every text in nested settings."""
-    if isinstance(value, (str, Path)):
-        yield str(value)
-    elif isinstance(value, dict):
-        for item in value.values():
-            yield from _texts(item)
-    elif isinstance(value, (list, tuple)):
-        for item in value:
-            yield from _texts(item)
+    roots = [path.parent] if logs_root is None else [logs_root, path.parent]
+    return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
 def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
@@ -289,28 +278,44 @@ def run_bench(
     Returns
     -------
     dict
-        ``conditions``, ``replay.rows``, ``ratios`` and ``details``.
+        ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
     """
-    from ..propagation.bench import path_search, random_scene, speed_against_error
-    from .peer_ratios import ingest_vs_pandas, kriging_vs_pykrige
+    from ..propagation.bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    found: dict[str, Any] = {}
-    if ratios:
-        progress("path search against PathSolver at 1e6 samples")
-        found["path_search_image_vs_sionna_1e6"] = path_search(1000, 1_000_000)
-        progress("Kriging against PyKrige")
-        found["kriging_vs_pykrige"] = kriging_vs_pykrige()
-        progress("ingest against pandas")
-        found["ingest_vs_pandas"] = ingest_vs_pandas()
+    found = _against_peers(progress) if ratios else {}
     return {
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None},
+        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None and "ratio" in value},
+        "report": found.get("report"),
         "details": found,
     }
+
+
+def _against_peers(progress: Progress) -> dict[str, Any]:
+    """How many times faster than each peer; at equal error and with the same work on both sides first."""
+    from . import peer_ratios as peers
+
+    progress("path search against PathSolver, at equal error and at 1e6 samples")
+    searches = peers.path_search_ratios()
+    progress("Kriging against PyKrige")
+    shared = peers.kriging_shared_weights()
+    found: dict[str, Any] = {
+        "path_search_image_vs_sionna_equal_error": searches["equal_error"],
+        "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
+        "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
+        "kriging_vs_pykrige_c_27_fields": shared,
+        "kriging_vs_pykrige": peers.kriging_vs_pykrige(),
+    }
+    progress("ingest against pandas")
+    for lines, value in peers.ingest_at_sizes().items():
+        found["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
+    progress("a report, cold and warm")
+    found["report"] = peers.report_cold_and_warm()
+    return found
 
 
 def run_site_import(
@@ -342,7 +347,7 @@ def run_site_import(
 
 def run_site_show(
     site: str | None,
-    out: Path,
+    out: Path | None = None,
     *,
     flight: Path | None = None,
     logs_root: Path | None = None,
@@ -386,6 +391,8 @@ def run_site_show(
             settings = settings.model_copy(update={"site": settings.site.model_copy(update={"file": file})})
         inputs += input_files(settings, flight, logs_root)
     track, paths = None, ()
+    if out is None:
+        out = Path("reports") / f"site-{Path(site or (settings.site.file if settings else 'lake_wheeler')).stem}"
     with OutputFolder(out, job="site show", inputs=inputs, force=force) as output:
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")

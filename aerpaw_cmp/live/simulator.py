@@ -449,11 +449,11 @@ class ModemSimulator:
         link = self.settings.link
         if link is not None:
             link.parent.mkdir(parents=True, exist_ok=True)
-            if link.is_symlink():
+            if link.is_symlink() and str(link.readlink()).startswith("/dev/"):  # of an earlier run
                 link.unlink()
-            elif link.exists():
+            elif link.exists() or link.is_symlink():
                 os.close(master)
-                raise UsageError("the name is taken by something that is not a link", expected="a new name", path=link)
+                raise UsageError("the name is taken, and by no link to a port", expected="a new name", path=link)
             link.symlink_to(node)
         return node
 

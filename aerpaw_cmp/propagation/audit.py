@@ -16,6 +16,7 @@ from .crowns import Crowns
 from .field_audit import REFERENCE_LINKS, Expected, against_reference, against_sionna, impossible, spread_over_paths
 from .image import planes_of
 from .paths import PathSet, joined
+from .samples import Samples
 from .tracer import Engine, Loss, Replay
 from .tracer import replay as run_replay
 
@@ -65,6 +66,10 @@ class Audit:
     seconds, reference_seconds : float
         Time of the replay (all its links) and of the reference on the checked links; a reference whose paths came
         from the cache counts with the time its search once took.
+    samples : int
+        Rays per tower that PathSolver shot, in the replay or the reference.
+    samples_reason : str
+        Why so many.
     field : FieldAudit or None
         Of the fields, where one was asked for.
     """
@@ -75,6 +80,8 @@ class Audit:
     difference: Difference
     seconds: float
     reference_seconds: float
+    samples: int = 0
+    samples_reason: str = ""
     field: FieldAudit | None = None
 
     @property
@@ -126,7 +133,7 @@ def audit(
     reference: Engine | None = None,
     links: int | None = 200,
     max_depth: int = 2,
-    samples: int = 1_000_000,
+    samples: Samples = "auto",
     batch: int = 50,
     loss: Loss | None = None,
     crowns: Crowns | None = None,
@@ -178,6 +185,7 @@ def audit(
         crowns=crowns,
         cache_dir=cache_dir,
     )
+    rays = checked.samples or (FIELD_SAMPLES if samples == "auto" else samples)
     field = None
     if expected is not None:
         few_kinds = spread_over_paths(replay, chosen, reference_links)
@@ -187,7 +195,7 @@ def audit(
         field += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         field += against_sionna(
             site, link, poses, replay, chosen, expected,
-            max_depth=max_depth, samples=min(samples, FIELD_SAMPLES), batch=batch, complete=complete,
+            max_depth=max_depth, samples=min(rays, FIELD_SAMPLES), batch=batch, complete=complete,
         )  # fmt: skip
     return Audit(
         field=field,
@@ -196,6 +204,8 @@ def audit(
         links=len(chosen) * len(replay.towers),
         difference=compare(replay, checked, chosen, ks),
         seconds=replay.seconds,
+        samples=max(checked.samples, replay.samples),
+        samples_reason=checked.samples_reason or replay.samples_reason,
         reference_seconds=checked.seconds + (checked.search_seconds if checked.from_cache else 0.0),
     )
 

@@ -20,7 +20,7 @@ from ..common.units import FloatArray
 from .paths import PathSet
 from .scene import Scene, Settings
 
-LAYOUT = 3
+LAYOUT = 4
 """Raised whenever the entries or the search change."""
 
 _SEAL = b"AERPAWCP"

@@ -184,7 +184,8 @@ class _OneLink:
         keys = set()
         phantom = doubtful = missing = 0
         ground = self.reference.site.towers[self.replay.towers[self.tower]].ground_m
-        nowhere = self.target[2] < min(ground, 0.0) or math.dist(self.target, self.reference.source) < 0.01
+        gap = math.dist(self.target, self.reference.source)
+        nowhere = self.target[2] < min(ground, 0.0) or not 0.01 <= gap <= 1e5
         for path in self.mine:
             sequence = self.sequence(path)
             keys.add(None if sequence is None else _key(sequence))

@@ -12,6 +12,7 @@ from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
 from .crowns import Crowns
+from .samples import Samples
 from .tracer import Engine, Loss, Replay, replay
 
 
@@ -24,7 +25,7 @@ def trace(
     *,
     loss: Loss | None = None,
     crowns: Crowns | None = None,
-    samples: int = 1_000_000,
+    samples: Samples = "auto",
 ) -> Replay:
     """Paths, channel matrices and received power of poses at a site.
 
@@ -45,8 +46,8 @@ def trace(
         Further loss per path [dB], such as foliage.
     crowns : Crowns, optional
         Tree crowns that reflect.
-    samples : int
-        ``sionna`` only: rays per tower.
+    samples : int or "auto"
+        ``sionna`` only: rays per tower; "auto" raises the number until two pilots agree.
 
     Returns
     -------

@@ -22,6 +22,7 @@ from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .paths import Faces, PathSet
 from .relevance import Relevance
+from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
 
 Engine = Literal["sionna", "image"]
@@ -55,6 +56,10 @@ class Replay:
         Order of the tower axis.
     from_cache : bool
         Nothing was searched.
+    samples : int
+        Rays per tower; 0 for an engine without rays.
+    samples_reason : str
+        Why so many, where the number was found by pilots.
     """
 
     rss_dbm: FloatArray
@@ -69,6 +74,8 @@ class Replay:
     towers: tuple[str, ...]
     left_out: list[str] = field(default_factory=list)
     from_cache: bool = False
+    samples: int = 0
+    samples_reason: str = ""
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -119,7 +126,7 @@ def replay(
     engine: Engine = "image",
     *,
     max_depth: int = 2,
-    samples: int = 1_000_000,
+    samples: Samples = "auto",
     batch: int = 50,
     loss: Loss | None = None,
     crowns: Crowns | None = None,
@@ -141,8 +148,11 @@ def replay(
         Exhaustive image method, or Sionna's PathSolver as path finder.
     max_depth : int
         Largest number of reflections, 0 to 3.
-    samples, batch : int
-        ``sionna`` only: rays per tower, poses per call.
+    samples : int or "auto"
+        ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
+        (:mod:`aerpaw_cmp.propagation.samples`).
+    batch : int
+        ``sionna`` only: poses per call.
     loss : callable, optional
         Further loss per path [dB], such as foliage.
     crowns : Crowns, optional
@@ -177,13 +187,17 @@ def replay(
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
-    settings = Settings(engine, max_depth, samples, batch, variant)
+    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant)
+    choice = None
     if relevance_db is not None:
         paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
         left_out += idle
         search_seconds, from_cache = time.perf_counter() - started, False
     else:
         cache = _cache(engine, cache_dir)
+        if engine == "sionna" and samples == "auto":
+            choice = _choose_samples(scene, link, poses, settings, cache)
+            settings = replace(settings, samples=choice.samples)
         paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
         left_out += cache.told if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
@@ -199,7 +213,21 @@ def replay(
         search_seconds=search_seconds,
         left_out=left_out,
         from_cache=from_cache,
+        samples=settings.samples if engine == "sionna" else 0,
+        samples_reason=choice.reason if choice else "",
     )
+
+
+def _choose_samples(scene: Scene, link: Link, poses: Poses, settings: Settings, cache: PathCache | None) -> Choice:
+    """Rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths."""
+    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), settings.batch)
+    part = replace(scene, excluded=scene.excluded[:, some])
+    few = Poses(poses.position_m[some], poses.rotation[some])
+
+    def pilot(samples: int) -> PathSet:
+        return _search_or_read(part, link, few, replace(settings, samples=samples), cache, None)[0]
+
+    return enough_samples(pilot, scene.faces, len(some))
 
 
 REACH_M = 100_000.0

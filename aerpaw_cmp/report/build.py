@@ -128,7 +128,9 @@ def rss_panel(result: RssResult) -> record.RssPanel:
         geometry=result.geometry,
         line_of_sight=result.line_of_sight == 1.0,
         worst=_spans(result.time, result.spans),
-        variants=tuple(_variant(name, model) for name, model in result.variants.items()),
+        variants=tuple(
+            _variant(name, model, result.further.compared_with.get(name)) for name, model in result.variants.items()
+        ),
         extra=json_safe(fields_of(result.further)),
         per_sample={
             f"simulated_{name.replace(' ', '_')}_dbm": result.variants[name].level_dbm
@@ -151,8 +153,10 @@ def _baseline(name: str, model: ModelLevel, paired: PairedDifference | None) -> 
     )
 
 
-def _variant(name: str, model: ModelLevel) -> record.Variant:
-    return record.Variant(name=name, offset_db=model.offset_db, rmse_db=model.rmse_db, rmse_ci95_db=model.rmse_ci95_db)
+def _variant(name: str, model: ModelLevel, paired: PairedDifference | None) -> record.Variant:
+    return record.Variant(
+        name=name, offset_db=model.offset_db, rmse_db=model.rmse_db, rmse_ci95_db=model.rmse_ci95_db, paired=paired
+    )
 
 
 def _spans(time: AnyArray, spans: Sequence[rss.ErrorSpan]) -> tuple[record.ErrorSpan, ...]:

@@ -104,6 +104,24 @@ class RankRow:
     wasserstein: float
     best_k: float
     best_k_ci95: Interval | None
+    commonest_agreement: float = float("nan")
+    """Agreement of always saying the commonest rank: what a model has to beat."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankPairing:
+    """Reported ranks of two flights at the same places: no model can be expected to agree better.
+
+    ``kappa`` and ``agreement`` are those of the ``n`` pairs (:func:`~aerpaw_cmp.compare.rank.repeat_rank`).
+    """
+
+    tower: str
+    first: str
+    second: str
+    n: int
+    agreement: float
+    kappa: float
+    kappa_ci95: Interval | None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -260,6 +278,7 @@ class CampaignData:
     failures: tuple[Failure, ...] = ()
     pooled: tuple[PooledOffset, ...] = ()
     repeats: tuple[Repeat, ...] = ()
+    rank_repeats: tuple[RankPairing, ...] = ()
     held_out: tuple[HeldOutFold, ...] = ()
     held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()

@@ -73,6 +73,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "heading_within_deg": data.heading_within_deg,
             "cell_m": data.cell_m,
             "pairs": _entries(data.repeats),
+            "rank_pairs": _entries(data.rank_repeats),
         },
         "held_out": {
             "failure": data.held_out_failure or None,

@@ -106,7 +106,7 @@ class Baseline:
 class Variant:
     """Another way to simulate the same panel, as a row of one table: iso arrays, measured patterns, with trees ...
 
-    ``fitted`` names what was fitted, and on which flight.
+    ``fitted`` names what was fitted, and on which flight; ``paired`` compares the report's own model with this one.
     """
 
     name: str
@@ -114,6 +114,7 @@ class Variant:
     rmse_db: float
     rmse_ci95_db: Interval | None = None
     fitted: str = "offset, on this flight"
+    paired: PairedDifference | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -49,3 +49,14 @@ def test_rights_follow_the_umask(tmp_path: Path) -> None:
 def test_a_missing_folder_is_an_oserror(tmp_path: Path) -> None:
     with pytest.raises(OSError, match="No such file"), whole(tmp_path / "none" / "a") as part:
         part.write_bytes(b"")
+
+
+def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None:
+    old, new, other = (tmp_path / name for name in (".a.x1.part", ".a.x2.part", ".b.x3.part"))
+    for part in (old, new, other):
+        part.write_text("half")
+    os.utime(old, (0, 0))
+    os.utime(other, (0, 0))
+    with whole(tmp_path / "a") as part:
+        part.write_text("whole")
+    assert {p.name for p in tmp_path.iterdir()} == {"a", new.name, other.name}

@@ -13,6 +13,7 @@ from aerpaw_cmp.compare.rank import (
     capacity_rank,
     channel_rank,
     cohen_kappa,
+    commonest_rank,
     compare_rank,
     compare_ranks,
     condition_number_rank,
@@ -21,6 +22,7 @@ from aerpaw_cmp.compare.rank import (
     histogram_test,
     k_curve,
     k_grid,
+    repeat_rank,
     shift_test,
     singular_values,
     stale_reports,
@@ -319,3 +321,28 @@ def test_as_dict_has_the_stable_names():
     import json
 
     json.dumps(found, allow_nan=False)
+
+
+def test_the_commonest_rank_is_the_forecast_that_needs_no_model():
+    found = commonest_rank([2.0] * 70 + [1.0] * 20 + [3.0] * 10 + [np.nan] * 5)
+    assert (found.rank, found.agreement) == (2, 0.7)
+    assert commonest_rank([np.nan]).rank == 0
+
+
+def test_repeat_kappa_of_two_passes():
+    rng = np.random.default_rng(3)
+    here = np.column_stack([np.linspace(0, 900, 900), np.zeros((900, 2))])
+    rank = rng.integers(1, 5, 900).astype(float)
+    there = here[::-1] + rng.normal(0, 0.1, here.shape)
+    same = repeat_rank(here, rank, there, rank[::-1])
+    assert same.n == pytest.approx(900, abs=20)
+    assert same.kappa > 0.99
+    assert repeat_rank(here, rank, there, rng.permutation(rank)).kappa == pytest.approx(0.0, abs=0.1)
+    half = np.where(rng.random(900) < 0.5, rank[::-1], rng.permutation(rank))
+    found = repeat_rank(here, rank, there, half)
+    assert found.kappa_ci95[0] < 0.5 < found.kappa_ci95[1]
+    nowhere = repeat_rank(here, rank, there + 50.0, rank)
+    assert nowhere.n == 0
+    assert np.isnan(nowhere.kappa)
+    north, south = np.zeros(900), np.full(900, 180.0)
+    assert repeat_rank(here, rank, there, rank, heading_deg=north, other_heading_deg=south).n == 0

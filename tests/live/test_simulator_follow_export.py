@@ -113,9 +113,14 @@ def test_simulator_cleans_up(tmp_path):
 def test_simulator_never_removes_a_file_in_place_of_its_link(tmp_path):
     path = tmp_path / "precious"
     path.write_text("x")
-    with pytest.raises(UsageError, match="not a link"):
+    with pytest.raises(UsageError, match="no link to a port"):
         ModemSimulator(ModemSimSettings(link=path))
     assert path.read_text() == "x"
+    name = tmp_path / "name"
+    name.symlink_to(path)
+    with pytest.raises(UsageError, match="no link to a port"):
+        ModemSimulator(ModemSimSettings(link=name))
+    assert name.is_symlink()
 
 
 # telemetry ---------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.propagation import channel, field_audit
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.channel import mean_pair_power, rss_dbm
@@ -77,6 +78,39 @@ def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
     assert report.reference == "image"
     assert report.missing_paths > 0
     assert report.extra_paths == 0
+
+
+def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, monkeypatch):
+    """Power, phase and both slants of each path; a fault of 0.1 dB or 0.011 rad in the reflections is seen."""
+    site, poses = lone
+    link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
+    few = scenes.poses(poses.position_m[:BATCH], poses.rotation[:BATCH])
+    expected = field_audit.Expected.of(link)
+    known = {}
+    ask = sionna.own_coefficients
+    monkeypatch.setattr(sionna, "own_coefficients", lambda *a, **k: known.setdefault(0, known.get(0) or ask(*a, **k)))
+
+    def audited():
+        rows, settings = np.arange(BATCH), {"max_depth": 2, "samples": SAMPLES, "batch": BATCH}
+        return field_audit.against_sionna(site, link, few, replay(site, link, few), rows, expected, **settings)
+
+    clean = audited()
+    assert clean.failures == ()
+    assert clean.paths > 50
+    assert clean.power_max_db < 0.03
+    assert clean.phase_max_rad < 3e-3
+    reflect = channel._reflect
+    for factor in (-0.1, 10 ** (0.1 / 20), np.exp(0.011j)):
+        monkeypatch.setattr(channel, "_reflect", lambda *a, factor=factor: factor * reflect(*a))
+        assert audited().failures
+
+
+def test_rays_chosen_by_pilots_find_every_path(sionna, scenes, lone):
+    site, poses = lone
+    traced = replay(site, scenes.link(site), poses, "sionna", batch=BATCH, cache_dir="")
+    assert scenes.keys(traced.paths) == scenes.keys(replay(site, scenes.link(site), poses).paths)
+    assert traced.samples in (40_000, 160_000, 640_000)
+    assert "rays a tower found the same" in traced.samples_reason
 
 
 def test_paths_over_crowns_join_those_that_sionna_finds(sionna, scenes, lone):

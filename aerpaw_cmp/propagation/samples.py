@@ -1,0 +1,85 @@
+"""How many rays PathSolver needs here: raised until two pilots agree.
+
+PathSolver finds a wall of solid angle W with the chance ``1 - exp(-N W / 4 pi)``, so what a scene needs depends on its
+smallest and farthest walls. Pilots on a batch of poses spread over the flight, each with four times the rays of the one
+before, end when two find the same paths; the larger number of the two is taken. A wall that both miss and that other
+poses see can still be lost: the audit by the image engine says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from ..common.units import IntArray
+from .image import planes_of
+from .paths import Faces, PathSet
+
+Samples = int | Literal["auto"]
+
+FIRST = 10_000
+"""Rays per tower of the first pilot."""
+
+FACTOR = 4
+
+MOST = 2_560_000
+"""Rays per tower at which pilots end in any case."""
+
+
+@dataclass(frozen=True, slots=True)
+class Choice:
+    """Rays per tower and why; ``paths`` are those of the last pilot.
+
+    Parameters
+    ----------
+    samples : int
+    reason : str
+    paths : PathSet
+    """
+
+    samples: int
+    reason: str
+    paths: PathSet
+
+
+def enough_samples(pilot: Callable[[int], PathSet], faces: Faces, poses: int) -> Choice:
+    """The number of rays at which two pilots agree.
+
+    Parameters
+    ----------
+    pilot : callable
+        ``pilot(samples)`` gives the paths of the pilot's poses.
+    faces : Faces
+    poses : int
+        Of the pilot, for the words.
+
+    Returns
+    -------
+    Choice
+    """
+    plane = np.append(planes_of(faces), -1)
+    samples = FIRST
+    before = pilot(samples)
+    while samples < MOST:
+        samples *= FACTOR
+        paths = pilot(samples)
+        if _keys(paths, plane) == _keys(before, plane):
+            words = f"{samples // FACTOR:,} and {samples:,} rays a tower found the same {len(paths)} paths"
+            return Choice(samples, f"{words} at {poses} poses".replace(",", " "), paths)
+        before = paths
+    words = f"{samples:,} rays a tower still found other paths than {samples // FACTOR:,} at {poses} poses"
+    return Choice(samples, words.replace(",", " "), before)
+
+
+def _keys(paths: PathSet, plane: IntArray) -> set[tuple[int, ...]]:
+    return {tuple(row) for row in np.column_stack([paths.pose, paths.tower, plane[paths.faces]]).tolist()}
+
+
+def spread(known: IntArray, count: int) -> IntArray:
+    """At most ``count`` of some poses, evenly spread."""
+    if len(known) <= count:
+        return known
+    return np.asarray(known[np.linspace(0, len(known) - 1, count).round().astype(np.int64)])

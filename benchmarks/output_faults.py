@@ -1,0 +1,517 @@
+"""Kill, fill and break the disk under every command that writes: is what stands under a final name whole?
+
+Six commands (ingest, site import, simulate, report, campaign, map), on jobs made small: eight seconds of flight, a map
+of a few cells, two figures per page. Each run is a fork of this process, so that imports are paid for once; the
+numbers and pictures of report, campaign and map are those of the first run, everything that is written is made anew. A
+library in C (output_faults.c, built here, by LD_PRELOAD) counts the calls that change the disk below the output folder
+(open to write, write, rename, link, unlink, mkdir, rmdir, chmod, fsync, ftruncate) and acts at the n-th:
+
+- ``kill``: SIGKILL before the call, or after it, or with half of a write done; four kills of five are such, spread
+  evenly over all calls of the run. The fifth is SIGKILL at a random moment of the whole command.
+- ``full``: ENOSPC at the n-th call and at every later one that takes space, for every n.
+- ``broken``: EIO at the n-th call alone, for every n. ``read-only``: EROFS from the first.
+- ``removed``: the folder above the output is removed at the n-th call, for ten n.
+- ``limit``: a real limit on the size of files (RLIMIT_FSIZE), and a real full tmpfs where one can be mounted.
+
+Two variants of each job follow each other into one target that also holds a file of somebody else. After each fault:
+inputs and the foreign file have their bytes; the target is whole (its own SHA-256 list), of one variant (files that
+two clean runs write alike are compared), and there if it was there before; an error is exit code 3 with one message
+that names the output, and leaves no other file. What a kill left is cleared by the next run.
+
+In the end the first job is tried with a planted fault, writing in place as the tool once did: the checks must fail.
+"""
+
+from __future__ import annotations
+
+import argparse
+import collections
+import contextlib
+import ctypes
+import errno
+import hashlib
+import json
+import os
+import random
+import resource
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+HERE = Path(__file__).resolve().parent
+SAMPLE = HERE.parent / "sample_logs"
+VARIANTS = ("a", "b")
+NOTHING, BEFORE, AFTER, FAIL, COMMAND = range(5)
+ERRORS = {"full": (errno.ENOSPC, 1), "broken": (errno.EIO, 0), "read-only": (errno.EROFS, 1)}
+FOREIGN = "somebody.txt"
+
+
+@dataclass(frozen=True, slots=True)
+class Job:
+    """A command of two variants; the target is added by ``-o``."""
+
+    name: str
+    kind: str
+    """file, folder or set."""
+    commands: dict[str, list[str]]
+
+
+@dataclass(slots=True)
+class Found:
+    """Counts of one job."""
+
+    calls: int = 0
+    seconds: float = 0.0
+    done: collections.Counter[str] = field(default_factory=collections.Counter)
+    violations: list[str] = field(default_factory=list)
+
+
+# --- the small jobs -----------------------------------------------------------------------------------------------
+
+
+def make_inputs(folder: Path) -> dict[str, Job]:
+    """Inputs of both variants below ``folder``, and the commands on them."""
+    import yaml
+
+    from aerpaw_cmp.__main__ import main
+
+    plan = yaml.safe_load((SAMPLE / "flight.yaml").read_text(encoding="utf-8"))
+    plan["flight"]["plan"] |= {
+        "waypoints": [{"east_m": -40, "north_m": 10, "height_m": 40}, {"east_m": 40, "north_m": 10, "height_m": 40}],
+        "bad_lines": 0, "clock_shift_s": {}, "telemetry_interval_s": 0.2,
+    }  # fmt: skip
+    plan["logs"] = [log for log in plan["logs"] if "USRP" not in log["path"] or log["path"].startswith("LW1/USRP1")]
+    plan |= {"rt": {"engine": "image", "max_depth": 1, "audit_links": 0}, "rss": {"lag": "off", "bootstrap": 20}}
+    commands: dict[str, dict[str, list[str]]] = collections.defaultdict(dict)
+    for seed, variant in enumerate(VARIANTS):
+        place = folder / variant
+        place.mkdir(parents=True)
+        plan["flight"]["plan"]["seed"] = seed
+        plan["flight"]["plan"]["speed_mps"] = 9.0 + seed
+        flight = place / "flight.yaml"
+        flight.write_text(yaml.safe_dump(plan), encoding="utf-8")
+        if main(["simulate", str(flight)]):
+            raise SystemExit("the small flight could not be simulated")
+        (place / "campaign.yaml").write_text(f"campaign: {variant}\nflights: [flight.yaml]\n", encoding="utf-8")
+        (place / "map.json").write_text(json.dumps(_buildings(20 + seed)), encoding="utf-8")
+        site = place / "site.yaml"
+        if main(["site", "import", str(place / "map.json"), "-o", str(site)]):
+            raise SystemExit("the small map could not be imported")
+        small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
+        commands["ingest"][variant] = ["ingest", str(place), "--timezone", "America/New_York"]
+        commands["site import"][variant] = ["site", "import", str(place / "map.json")]
+        commands["simulate"][variant] = ["simulate", str(flight)]
+        commands["report"][variant] = ["report", str(flight)]
+        commands["campaign"][variant] = ["campaign", str(place / "campaign.yaml")]
+        carrier = ["--carrier-ghz", str(3.4 + seed / 10)]
+        commands["map"][variant] = ["map", str(site), *small, *carrier, "--max-depth", "0", "--no-study"]
+    kinds = {"ingest": "file", "site import": "file", "simulate": "set"}
+    return {name: Job(name, kinds.get(name, "folder"), by) for name, by in commands.items()}
+
+
+def _buildings(count: int) -> dict[str, Any]:
+    square = ((0, 0), (0, 1), (1, 1), (1, 0), (0, 0))
+    corners = [
+        [[-78.7 + (2 * i + a) * 1e-4, 35.727 + b * 1e-4] for a, b in square] for i in range(count)
+    ]  # fmt: skip
+    return {
+        "type": "FeatureCollection",
+        "features": [
+            {"type": "Feature", "properties": {"building": "yes"}, "geometry": {"type": "Polygon", "coordinates": [c]}}
+            for c in corners
+        ],
+    }
+
+
+_variant = ["a"]
+"""Of the run that goes on."""
+
+
+def compute_once(jobs: dict[str, Job], folder: Path) -> None:
+    """Numbers and pictures are those of the first run of a variant, and two pictures per page are enough.
+
+    What is tried here is the writing; reading, checking, pages, tables and exports are made anew in every run.
+    """
+    from typer import main as typer_main
+
+    from aerpaw_cmp.__main__ import main
+    from aerpaw_cmp.jobs import campaign, coverage_map, run
+    from aerpaw_cmp.maps import export
+    from aerpaw_cmp.report import campaign_figures, canvas, figures, maps_figures
+
+    for room in (figures, campaign_figures, maps_figures):
+        plates: Callable[..., Any] = room.plates
+        room.plates = lambda data, _plates=plates: list(_plates(data))[:2]  # type: ignore[attr-defined]
+    for room, name in ((run, "_replayed_and_compared"), (campaign, "run"), (coverage_map, "make_maps")):
+        setattr(room, name, _remembered(getattr(room, name), lambda *_, **__: ""))
+    canvas.render = _remembered(canvas.render, lambda plate, *_, **__: str(plate.name))
+    export._legend = _remembered(export._legend, lambda layer, *_, **__: str(layer.name))
+    typer_main.get_command = _remembered(typer_main.get_command, lambda *_, **__: "")  # the options of all commands
+    for job in jobs.values():
+        for variant in VARIANTS if job.kind == "folder" else ():
+            _variant[0] = variant
+            if main([*job.commands[variant], "-o", str(folder / job.name / variant)]):
+                raise SystemExit(f"the small {job.name} failed")
+
+
+def _remembered(function: Callable[..., Any], name: Callable[..., str]) -> Callable[..., Any]:
+    known: dict[tuple[str, str], Any] = {}
+
+    def answer(*arguments: Any, **keys: Any) -> Any:
+        key = (_variant[0], name(*arguments))
+        if key not in known:
+            known[key] = function(*arguments, **keys)
+        return known[key]
+
+    return answer
+
+
+# --- one run --------------------------------------------------------------------------------------------------------
+
+
+class Runs:
+    """Runs of one job as forks of this process.
+
+    Parameters
+    ----------
+    job : Job
+    root : Path
+        The output is ``root/reports/NAME``; faults act below ``root``.
+    shim : ctypes.CDLL
+    """
+
+    def __init__(self, job: Job, root: Path, shim: ctypes.CDLL) -> None:
+        self.job, self.root, self.shim = job, root, shim
+        self.folder = root / "reports"
+        self.target = self.folder / {"ingest": "flight.h5", "site import": "site.yaml"}.get(job.name, "result")
+        self.stable: dict[str, dict[str, str]] = {}
+        self.pipe: int | None = None
+
+    def start(
+        self, variant: str, fault: tuple[int, int, int, int, str] = (0, NOTHING, 0, 0, ""), limit: int | None = None
+    ) -> int:
+        """Begin a run; gives its process id. ``fault`` is (at, kind, error, sticky, command)."""
+        from aerpaw_cmp.__main__ import main
+
+        self.folder.mkdir(parents=True, exist_ok=True)
+        if self.pipe is not None:
+            os.close(self.pipe)
+        self.pipe, said = os.pipe()  # no file: the limit on their size would hold for it, too
+        child = os.fork()
+        if child:
+            os.close(said)
+            return child
+        code = 70
+        _variant[0] = variant
+        try:
+            sys.stdout = sys.stderr = os.fdopen(os.dup(said), "w", encoding="utf-8")
+            if limit is not None:
+                resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
+            at, kind, error, sticky, command = fault
+            self.shim.fault_arm(os.fsencode(self.root), at, kind, error, sticky, command.encode())
+            code = main([*self.job.commands[variant], "-o", str(self.target)])
+            sys.stdout.flush()
+            sys.stderr.flush()
+            os.write(said, f"\ncalls {self.shim.fault_count()}\n".encode())
+        except BaseException as error:
+            os.write(said, f"{type(error).__name__}: {error}\n".encode())
+        finally:
+            os._exit(code)
+
+    def clean(self, variant: str) -> int:
+        """A run without a fault, which must succeed; gives its number of calls."""
+        code = os.waitstatus_to_exitcode(os.waitpid(self.start(variant), 0)[1])
+        if code:
+            raise SystemExit(f"{self.job.name} without a fault: exit {code}: {self.said()}")
+        return int(self.said().rsplit("calls ", 1)[1])
+
+    def said(self) -> str:
+        """What the last run printed; asked once."""
+        assert self.pipe is not None
+        with os.fdopen(self.pipe, "rb") as stream:
+            self.pipe = None
+            return stream.read().decode("utf-8", errors="replace")
+
+    # --- what is there
+
+    def content(self) -> dict[str, str]:
+        """SHA-256 of the results by name, the foreign file left out."""
+        if self.target.is_file():
+            return {"": _digest(self.target)}
+        files = (p for p in self.target.rglob("*") if p.is_file() and ".aerpaw-" not in p.name)
+        return {p.relative_to(self.target).as_posix(): _digest(p) for p in files if p.name != FOREIGN}
+
+    def litter(self) -> list[str]:
+        """Everything below the root that is neither target nor in it, and hidden places in it."""
+        names = [p for p in self.root.rglob("*") if p not in (self.folder, self.target)]
+        return sorted(
+            str(p.relative_to(self.root)) for p in names if self.target not in p.parents or ".aerpaw-" in p.name
+        )
+
+    def learn(self) -> None:
+        """Which files two clean runs of a variant write alike: they tell the variants apart."""
+        for variant in VARIANTS:
+            seen = []
+            for number in range(2):
+                time.sleep(1.1 * number)  # pages and numbers name the second of their run
+                self.reset()
+                self.clean(variant)
+                seen.append(self.content())
+            self.stable[variant] = {name: one for name, one in seen[0].items() if seen[1].get(name) == one}
+        both = self.stable[VARIANTS[0]].items() & self.stable[VARIANTS[1]].items()
+        for name, _ in both:
+            for variant in VARIANTS:
+                del self.stable[variant][name]
+        if not all(self.stable.values()):
+            raise SystemExit(f"{self.job.name}: nothing tells the variants apart")
+
+    def reset(self) -> None:
+        """No output; for folders, a foreign file in the target."""
+        shutil.rmtree(self.root, ignore_errors=True)
+        self.folder.mkdir(parents=True)
+
+    def plant_foreign(self) -> None:
+        """A file of somebody else in an output folder."""
+        if self.target.is_dir() and not (self.target / FOREIGN).exists():
+            (self.target / FOREIGN).write_text("mine")
+
+    def wrong(self, before: bool) -> str | None:
+        """What is not whole or not of one run, or None."""
+        found = self.content()
+        if not os.path.lexists(self.target) or not found:
+            lost = before and self.job.kind != "set"
+            return "the output that was there is gone" if lost else None
+        variants = [
+            v for v in VARIANTS if all(found[n] == d for n, d in self.stable[v].items() if n in found)
+        ]  # fmt: skip
+        if not variants:
+            return "files of two runs"
+        return {"file": self._wrong_file, "folder": self._wrong_folder, "set": self._wrong_set}[self.job.kind](found)
+
+    def _wrong_file(self, _found: dict[str, str]) -> str | None:
+        from aerpaw_cmp.common.outputs import is_sealed
+        from aerpaw_cmp.logs.flight_file import is_flight_file
+
+        whole = is_flight_file if self.job.name == "ingest" else is_sealed
+        return None if whole(self.target) else "the file is not whole"
+
+    def _wrong_folder(self, found: dict[str, str]) -> str | None:
+        from aerpaw_cmp.common.outputs import SUMS, read_sums
+
+        sums = read_sums(self.target)
+        if sums is None:
+            return "the folder has no list"
+        if sums != {name: digest for name, digest in found.items() if name != SUMS}:
+            return "the folder is not what its list says"
+        foreign = self.target / FOREIGN
+        return None if not foreign.exists() or foreign.read_text() == "mine" else "the foreign file was changed"
+
+    def _wrong_set(self, found: dict[str, str]) -> str | None:
+        listing = self.target / "truth.json"
+        if not listing.exists():
+            return None  # an unfinished set says so by having no list
+        files = json.loads(listing.read_text(encoding="utf-8"))["files"]
+        return None if all(found.get(n) == d for n, d in files.items()) else "the set is not what its list says"
+
+
+def _digest(path: Path) -> str:
+    return hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _tree(folder: Path) -> dict[str, str]:
+    return {str(p): _digest(p) for p in sorted(folder.rglob("*")) if p.is_file()}
+
+
+# --- the faults -----------------------------------------------------------------------------------------------------
+
+
+def try_job(job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, chance: random.Random) -> Found:
+    """All faults of one job."""
+    runs, found = Runs(job, work / "root", shim), Found()
+    original = _tree(inputs)
+    runs.learn()
+    runs.reset()
+    runs.clean("a")
+    start = time.perf_counter()
+    found.calls = runs.clean("b")
+    found.seconds = time.perf_counter() - start
+
+    def check(what: str, before: bool, foreign: bool) -> None:
+        found.done[what.split()[0]] += 1
+        wrong = runs.wrong(before)
+        if wrong is None and foreign and not (runs.target / FOREIGN).exists():
+            wrong = "the foreign file is gone"
+        if wrong is None and _tree(inputs) != original:
+            wrong = "an input was changed"
+        if wrong is not None:
+            found.violations.append(f"{job.name}: {what}: {wrong}")
+            runs.reset()
+
+    for number in range(kills):
+        if number % 25 == 0:
+            _next_run_clears(runs, found, absent=number % 50 == 0)
+        before, foreign = os.path.lexists(runs.target), (runs.target / FOREIGN).exists()
+        variant = VARIANTS[number % 2]
+        if number % 5 < 4:
+            at, kind = 1 + number * found.calls // kills, (BEFORE, AFTER)[number // 2 % 2]
+            child, what = runs.start(variant, (at, kind, 0, 0, "")), f"kill {kind} at call {at}"
+        else:
+            moment = chance.uniform(0.0, found.seconds)
+            child, what = runs.start(variant), f"kill after {moment:.4f} s"
+            time.sleep(moment)
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(child, signal.SIGKILL)
+        code = os.waitstatus_to_exitcode(os.waitpid(child, 0)[1])
+        found.done["killed"] += code == -signal.SIGKILL
+        check(what, before, foreign)
+
+    _next_run_clears(runs, found, absent=False)
+    for what, variant, fault, limit in _errors(runs, found.calls):
+        if not os.path.lexists(runs.target):
+            _next_run_clears(runs, found, absent=False)
+        runs.plant_foreign()
+        before, foreign = os.path.lexists(runs.target), (runs.target / FOREIGN).exists()
+        code = os.waitstatus_to_exitcode(os.waitpid(runs.start(variant, fault, limit), 0)[1])
+        removed = what.startswith("removed")
+        check(what, before and not removed, foreign and not removed)
+        said = [line for line in runs.said().splitlines() if line.startswith("aerpaw-cmp: ")]
+        told = code == 0 or (code == 3 and len(said) == 1 and str(runs.folder) in said[0])
+        if not told:
+            found.violations.append(f"{job.name}: {what}: exit {code}, said {said}")
+        if rest := runs.litter():
+            journal = any(name.endswith("aerpaw-journal") for name in rest)  # which the next run finishes
+            if code and not journal:
+                found.violations.append(f"{job.name}: {what}: left {rest}")
+            found.done["left for the next run"] += 1
+            _next_run_clears(runs, found, absent=False)
+        found.done["told"] += code == 3
+    _next_run_clears(runs, found, absent=False)
+    return found
+
+
+def _next_run_clears(runs: Runs, found: Found, *, absent: bool) -> None:
+    """A clean run after faults succeeds and leaves the target and nothing else; then perhaps nothing is there."""
+    runs.clean("a")
+    if rest := runs.litter():
+        found.violations.append(f"{runs.job.name}: after a clean run there is {rest}")
+        runs.reset()
+    if absent:
+        runs.reset()
+    runs.plant_foreign()
+
+
+def _errors(runs: Runs, calls: int) -> Iterator[tuple[str, str, tuple[int, int, int, int, str], int | None]]:
+    """Errors of the disk: name, variant, fault, limit on the size of files."""
+    number = 0
+    for name, (error, sticky) in ERRORS.items():
+        for at in range(1, 2 if name == "read-only" else calls + 1):
+            number += 1
+            yield f"{name} from call {at}", VARIANTS[number % 2], (at, FAIL, error, sticky, ""), None
+    for at in sorted({1 + i * (calls - 1) // 9 for i in range(10)}):
+        command = f"rm -rf {runs.folder}"
+        yield f"removed at call {at}", VARIANTS[at % 2], (at, COMMAND, 0, 0, command), None
+    runs.folder.mkdir(parents=True, exist_ok=True)
+    for limit in (0, 1, 512, 4096, 20_480):
+        yield f"limit of {limit} bytes", VARIANTS[limit % 2], (0, NOTHING, 0, 0, ""), limit
+
+
+def try_full_tmpfs(job: Job, work: Path, shim: ctypes.CDLL) -> str:
+    """A tmpfs of 300 kB with 30 kB left: a real full disk."""
+    runs = Runs(job, work / "tmpfs" / "root", shim)
+    disk = work / "tmpfs"
+    disk.mkdir(exist_ok=True)
+    if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", disk], check=False).returncode:
+        return "not tried: no right to mount"
+    try:
+        runs.folder.mkdir(parents=True)
+        (disk / "filler").write_bytes(bytes(270_000))
+        code = os.waitstatus_to_exitcode(os.waitpid(runs.start("a"), 0)[1])
+        return f"exit {code}, left {runs.litter()}, wrote {sorted(runs.content())[:1]}"
+    finally:
+        subprocess.run(["umount", disk], check=True)
+
+
+def plant() -> None:
+    """Write in place and in order, as the tool once did: the checks must see it."""
+    from aerpaw_cmp.common import outputs
+
+    @contextlib.contextmanager
+    def in_place(self: outputs.OutputFolder) -> Iterator[Path]:
+        self.target.mkdir(parents=True, exist_ok=True)
+        with outputs.told(self.named):
+            yield self.target
+            names = [p for p in self.target.rglob("*") if p.is_file() and p.name not in (outputs.SUMS, FOREIGN)]
+            rows = "".join(f"{_digest(p)}  {p.relative_to(self.target).as_posix()}\n" for p in sorted(names))
+            (self.target / outputs.SUMS).write_text(f"# aerpaw-cmp: planted\n{rows}")
+
+    def straight(self: outputs.OutputFile, content: bytes) -> None:
+        with outputs.told(self.named):
+            self.target.write_bytes(content)
+
+    outputs.OutputFolder.filling = in_place  # type: ignore[method-assign]
+    outputs.OutputFile.write = straight  # type: ignore[method-assign]
+
+
+# --- all of it ------------------------------------------------------------------------------------------------------
+
+
+def build_shim(folder: Path) -> Path:
+    """The library of faults, compiled."""
+    library = folder / "output_faults.so"
+    command = [os.environ.get("CC", "cc"), "-shared", "-fPIC", "-O1", "-o", library, HERE / "output_faults.c", "-ldl"]
+    subprocess.run(command, check=True)
+    return library
+
+
+def main() -> int:
+    """Run, count, print one JSON object."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--kills", type=int, default=200, help="per command")
+    parser.add_argument("--jobs", nargs="*", help="some of the commands")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--preloaded", type=Path, help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.preloaded is None:
+        with tempfile.TemporaryDirectory(prefix="output_faults_") as folder:
+            library = build_shim(Path(folder))
+            command = [sys.executable, __file__, *sys.argv[1:], "--preloaded", folder]
+            return subprocess.run(command, env={**os.environ, "LD_PRELOAD": str(library)}, check=False).returncode
+    work = arguments.preloaded
+    shim = ctypes.CDLL(str(work / "output_faults.so"))
+    os.environ.pop("LD_PRELOAD", None)
+    os.environ.setdefault("XDG_CACHE_HOME", str(work / "cache"))
+    inputs = work / "inputs"
+    with Path(os.devnull).open("w") as quiet, contextlib.redirect_stdout(quiet), contextlib.redirect_stderr(quiet):
+        jobs = make_inputs(inputs)
+        jobs = {name: job for name, job in jobs.items() if not arguments.jobs or name in arguments.jobs}
+        compute_once(jobs, work / "first")
+    chance, total, everything = random.Random(arguments.seed), collections.Counter[str](), {}
+    violations: list[str] = []
+    for name, job in jobs.items():
+        found = try_job(job, inputs, work, shim, arguments.kills, chance)
+        everything[name] = {
+            "calls": found.calls, "seconds_of_a_run": round(found.seconds, 3), **found.done,
+            "violations": len(found.violations),
+        }  # fmt: skip
+        if job.name in ("ingest", "report"):
+            everything[name]["full_tmpfs"] = try_full_tmpfs(job, work, shim)
+        print(name, json.dumps(everything[name]), file=sys.stderr, flush=True)
+        total += found.done
+        violations += found.violations
+    plant()
+    planted = try_job(next(iter(jobs.values())), inputs, work, shim, 20, chance)
+    conditions = {"kills_per_command": arguments.kills, "seed": arguments.seed, "python": sys.version.split()[0]}
+    result = {**conditions, "jobs": everything, "total": total, "violations": violations[:20], "n": len(violations)}
+    result["planted_fault"] = {"tried": sum(planted.done.values()), "violations": len(planted.violations)}
+    print(json.dumps(result, indent=1))
+    return 1 if violations or not planted.violations else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

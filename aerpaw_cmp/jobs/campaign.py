@@ -7,6 +7,7 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 from __future__ import annotations
 
 import dataclasses
+import sys
 import tempfile
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -28,6 +29,7 @@ from ..common.stages import Progress, silent
 from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
+from ..compare import rank, result, rss, statistics
 from ..compare.offset import Pooling, pooled_offsets
 from ..compare.rank import repeat_rank
 from ..compare.result import FlightResult, RankResult, RssResult
@@ -35,6 +37,7 @@ from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Positive, RssSettings, Settings, load_flight
+from ..report import campaign_data
 from ..report.campaign_data import (
     CampaignData,
     Failure,
@@ -49,7 +52,7 @@ from ..report.campaign_data import (
 )
 from .campaign_fit import fit_all
 from .flight_run import run_flight
-from .outcomes import OutcomeStore, task_key
+from .outcomes import OutcomeStore, records_of, task_key
 
 Stage = Callable[[str], Any]
 
@@ -355,7 +358,7 @@ def _kept(tasks: Sequence[Task], keep: Path) -> tuple[OutcomeStore, dict[int, st
             settings = overridden(load_flight(task.path), task.overrides)
             more = (task.flight, task.setting, task.reference)
             keys[number] = task_key(settings, task.path, task.logs_root, *more)
-    return OutcomeStore(keep, (Outcome, RssRow, RankRow, FlownTrack)), keys
+    return OutcomeStore(keep, records_of(sys.modules[__name__], campaign_data, rank, result, rss, statistics)), keys
 
 
 def _collect(pool: Executor, tasks: Sequence[Task], todo: Sequence[int], done: Callable[[int, Outcome], None]) -> None:

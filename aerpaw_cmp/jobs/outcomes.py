@@ -8,10 +8,11 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -33,8 +34,8 @@ class OutcomeStore:
     ----------
     folder : Path
         Made when the first entry is saved.
-    types : tuple of type
-        Frozen dataclasses that an entry may hold; nothing else is ever built from a file.
+    types : iterable of type
+        Frozen dataclasses that an entry may hold (:func:`records_of`); nothing else is ever built from a file.
 
     Attributes
     ----------
@@ -42,7 +43,7 @@ class OutcomeStore:
         Damaged entries that were not used.
     """
 
-    def __init__(self, folder: Path, types: tuple[type, ...]) -> None:
+    def __init__(self, folder: Path, types: Iterable[type]) -> None:
         self.folder = folder
         self._types = {kind.__name__: kind for kind in types}
         self.told: list[str] = []
@@ -61,6 +62,10 @@ class OutcomeStore:
         with np.load(io.BytesIO(entry), allow_pickle=False) as arrays:
             return self._decode(json.loads(str(arrays["content"])), arrays)
 
+    def _knows(self, value: Any) -> bool:
+        """Whether :meth:`load` could give a record back."""
+        return self._types.get(type(value).__name__) is type(value)
+
     def save(self, key: str, outcome: Any) -> None:
         """Write an entry whole or not at all; a folder that cannot be written costs the entry, not the run."""
         arrays: dict[str, Any] = {}
@@ -77,6 +82,8 @@ class OutcomeStore:
 
     def _encode(self, value: Any, arrays: dict[str, Any]) -> Any:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
+            if not self._knows(value):
+                raise TypeError(f"{type(value).__name__} is no record that an outcome may hold")
             fields = {f.name: self._encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
             return {"is": type(value).__name__, "of": fields}
         if isinstance(value, np.ndarray):
@@ -102,6 +109,16 @@ class OutcomeStore:
         if kind == "dict":
             return {self._decode(k, arrays): self._decode(v, arrays) for k, v in content}
         return self._types[kind](**{name: self._decode(item, arrays) for name, item in content.items()})
+
+
+def records_of(*modules: ModuleType) -> set[type]:
+    """The dataclasses that some modules define."""
+    return {
+        kind
+        for module in modules
+        for kind in vars(module).values()
+        if isinstance(kind, type) and dataclasses.is_dataclass(kind) and kind.__module__ == module.__name__
+    }
 
 
 def task_key(settings: FlightFile, flight: Path, logs_root: Path | None, *more: object) -> str:

@@ -56,6 +56,23 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     assert "damaged" in store.told[0]
 
 
+def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path) -> None:
+    """One task of the sample flight, through the store and back: the same numbers, the same nested records."""
+    quick = {"rss.lag": "off", "rss.bootstrap": 10, "rank.bootstrap": 10}
+    settings = load_flight(flight)
+    known = {
+        key: value for key, value in quick.items() if hasattr(getattr(settings, key.split(".")[0]), key.split(".")[1])
+    }
+    task = campaign.Task(flight, "f", "as written", known, None)
+    (first,) = campaign.run_tasks([task], 1, None, lambda *_: None, tmp_path)
+    assert first.failure is None
+    store, keys = campaign._kept([task], tmp_path)
+    again = store.load(keys[0])
+    assert repr(again.rank) == repr(first.rank)
+    assert [row.rmse_db for row in again.rss] == [row.rmse_db for row in first.rss]
+    assert np.array_equal(again.rss[0].measured_db, first.rss[0].measured_db, equal_nan=True)
+
+
 def test_a_key_is_of_everything_that_matters(flight: Path) -> None:
     settings = load_flight(flight)
     key = task_key(settings, flight, None, "x")

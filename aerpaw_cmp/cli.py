@@ -644,6 +644,11 @@ def campaign(
     logs_root: LogsRoot = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that share the flights and settings.")] = 1,
     cluster: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler, in place of processes.")] = None,  # noqa: UP045
+    keep: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder of the outcomes of single tasks; a rerun computes only what is missing there."),
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Keep no outcomes and take none.")] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
@@ -654,7 +659,14 @@ def campaign(
     from .jobs import run
 
     outcome = run.run_campaign(
-        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, force=force, progress=_say
+        campaign_yaml,
+        out=out,
+        logs_root=logs_root,
+        workers=workers,
+        cluster=cluster,
+        keep=None if fresh else keep or run.outcomes_folder(),
+        force=force,
+        progress=_say,
     )
     if as_json:
         _print_json(outcome.metrics)

@@ -581,6 +581,11 @@ class CampaignOutcome:
     nothing_done: bool
 
 
+def outcomes_folder() -> Path:
+    """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
+
+
 def run_campaign(
     path: Path,
     *,
@@ -588,6 +593,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    keep: Path | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
@@ -605,6 +611,8 @@ def run_campaign(
         Processes.
     cluster : str, optional
         Address of a Dask scheduler, in place of processes.
+    keep : Path, optional
+        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
     force : bool
         Write into a folder that holds files of others.
     progress : Progress
@@ -635,6 +643,7 @@ def run_campaign(
             logs_root=logs_root,
             workers=workers,
             cluster=cluster,
+            keep=keep,
             stage=stages,
             progress=progress,
         )

@@ -637,6 +637,36 @@ def map_(
             print(path)
 
 
+@app.command(help=COMMANDS["calibrate"])
+def calibrate(
+    calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn antennas and ground from several flights."""
+    from .jobs import run
+
+    outcome = run.run_calibrate(calibration_yaml, out=out, logs_root=logs_root, force=force, progress=_say)
+    if as_json:
+        _print_json(outcome.metrics)
+        return
+    m = outcome.metrics
+    rows = []
+    for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
+        means = [sum(s[key] for s in scores) / len(scores) if scores else None
+                 for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
+        rows.append([name.replace("_", " "), *(_number(v, "{:.2f}") for v in means), str(len(scores))])
+    _table(
+        ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"], rows, "Scores on what was left out, means"
+    )
+    for text in [*m["words"], *m["warnings"]]:
+        print(text)
+    print(outcome.file)
+    print(outcome.folder / "calibration.html")
+
+
 @app.command(help=COMMANDS["campaign"])
 def campaign(
     campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],

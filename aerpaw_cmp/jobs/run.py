@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -454,7 +455,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     from ..compare.rank import channel_rank
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
-    from ..live.follow import TelemetryFollower
+    from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
     from .replay import replay_poses
@@ -470,10 +471,8 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     )
     k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
 
-    def predict(utc_ns: int) -> int | None:
-        follower.poll()
-        sample = follower.at(utc_ns)
-        if sample is None or not np.isfinite(sample.latitude_deg):
+    def rank_at(sample: TelemetrySample) -> int | None:
+        if not np.isfinite(sample.latitude_deg):
             return None
         east, north = site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
         up = max(sample.altitude_m + site.datum.takeoff_ground_m, 0.5)
@@ -487,7 +486,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
         rank = int(channel_rank(found.h[0, 0], k))
         return rank or None
 
-    return predict
+    return predict_along(follower, rank_at)
 
 
 @dataclass(frozen=True, slots=True)
@@ -583,6 +582,11 @@ class CampaignOutcome:
     nothing_done: bool
 
 
+def outcomes_folder() -> Path:
+    """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
+
+
 def run_campaign(
     path: Path,
     *,
@@ -590,6 +594,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    keep: Path | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
@@ -607,6 +612,8 @@ def run_campaign(
         Processes.
     cluster : str, optional
         Address of a Dask scheduler, in place of processes.
+    keep : Path, optional
+        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
     force : bool
         Write into a folder that holds files of others.
     progress : Progress
@@ -637,6 +644,7 @@ def run_campaign(
             logs_root=logs_root,
             workers=workers,
             cluster=cluster,
+            keep=keep,
             stage=stages,
             progress=progress,
         )
@@ -648,3 +656,87 @@ def run_campaign(
         failed.append(f"held-out fit: {data.held_out_failure}")
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateOutcome:
+    """What ``aerpaw-cmp calibrate`` made: the settings file, its folder, metrics.json as a dict."""
+
+    file: Path
+    folder: Path
+    metrics: dict[str, Any]
+
+
+def run_calibrate(
+    path: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> CalibrateOutcome:
+    """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    from ..flight.settings import load_flight
+    from ..report.calibration_html import calibration_metrics
+    from .calibrate import calibrate, load_calibration
+    from .calibration_files import MARK, write_files
+
+    settings = load_calibration(path)
+    target = out or Path(f"{settings.calibration}.calibrated.yaml")
+    if target.suffix.lower() not in (".yaml", ".yml"):
+        raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
+    inputs = input_files(settings, path, logs_root)
+    for name in settings.flights:
+        inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
+
+    def own(file: Path) -> bool:
+        return file.read_bytes().startswith(MARK.encode())
+
+    folder = target.with_suffix("")
+    stages = Stages(progress)
+    with (
+        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
+    ):
+        ranked, has_rss = _calibrated_rank(settings, path, logs_root, stages)
+        if not has_rss and ranked is not None:
+            text, metrics = MARK + "\n", {**_RANK_ALONE, "calibration": settings.calibration}
+            with output.filling() as place:
+                metrics |= {"rank": ranked.metrics(), "warnings": list(ranked.warnings), "flights": settings.flights}
+                (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+                (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        else:
+            found = calibrate(path, logs_root=logs_root, stages=stages)
+            if ranked is not None:
+                found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
+            with output.filling() as place:
+                record, text = write_files(found, place, folder.name, stages.seconds)
+                if ranked is not None:
+                    (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+            metrics = calibration_metrics(record)
+        if ranked is not None:
+            text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
+        file.write(text.encode())
+    return CalibrateOutcome(target, folder, metrics)
+
+
+_RANK_ALONE: dict[str, Any] = {"scores": {}, "controls": {}, "words": [], "antennas": []}
+"""What a calibration of flights without RSS has instead of antennas."""
+
+
+def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, bool]:
+    """The receiver, where calibration.yaml asks for one, and whether there is RSS to learn antennas from."""
+    if settings.rank is None:
+        return None, True
+    from .calibrate import read_flights
+    from .calibrate_rank import fit_rank
+
+    with stages("rank"):
+        flights = read_flights(settings, path.parent, logs_root)
+        return fit_rank(flights, settings.rank), any(data.rss for data in flights)

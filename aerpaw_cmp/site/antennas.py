@@ -383,6 +383,13 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
+    if len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000:  # no grid; and a table of them might not fit
+        raise InputError(
+            f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
+            expected="a grid over the sphere: every phi with every theta",
+            cause="angles with other digits in each row, or a file that was cut off",
+            path=path,
+        )
     seen = np.zeros((len(phi), len(theta)), dtype=np.int64)
     np.add.at(seen, (at_phi, at_theta), 1)
     if (seen == 0).any() or (seen > 1).any():

@@ -17,7 +17,8 @@ from ..compare.rank import RankFit
 from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, LogSettings
+from ..logs.ingest import IngestedFile
 from . import data as record
 from .export import merge
 

@@ -331,8 +331,10 @@ def _tree(folder: Path) -> dict[str, str]:
 # --- the faults -----------------------------------------------------------------------------------------------------
 
 
-def try_job(job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, chance: random.Random) -> Found:
-    """All faults of one job."""
+def try_job(
+    job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, chance: random.Random, *, errors: bool = True
+) -> Found:
+    """All faults of one job; without ``errors`` kills only."""
     runs, found = Runs(job, work / "root", shim), Found()
     original = _tree(inputs)
     runs.learn()
@@ -372,7 +374,7 @@ def try_job(job: Job, inputs: Path, work: Path, shim: ctypes.CDLL, kills: int, c
         check(what, before, foreign)
 
     _next_run_clears(runs, found, absent=False)
-    for what, variant, fault, limit in _errors(runs, found.calls):
+    for what, variant, fault, limit in _errors(runs, found.calls) if errors else ():
         if not os.path.lexists(runs.target):
             _next_run_clears(runs, found, absent=False)
         runs.plant_foreign()
@@ -505,7 +507,7 @@ def main() -> int:
         total += found.done
         violations += found.violations
     plant()
-    planted = try_job(next(iter(jobs.values())), inputs, work, shim, 20, chance)
+    planted = try_job(next(iter(jobs.values())), inputs, work, shim, 14, chance, errors=False)
     conditions = {"kills_per_command": arguments.kills, "seed": arguments.seed, "python": sys.version.split()[0]}
     result = {**conditions, "jobs": everything, "total": total, "violations": violations[:20], "n": len(violations)}
     result["planted_fault"] = {"tried": sum(planted.done.values()), "violations": len(planted.violations)}

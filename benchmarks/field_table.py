@@ -67,7 +67,7 @@ def rss_rows(name: str, root: Path, replicates: int) -> tuple[dict[str, Any], di
             "offset_db": panel.offset_db,
             "rmse_db": panel.rmse_db,
             "rmse_ci95_db": panel.rmse_ci95_db,
-            "rmse_mean_4s_db": extra["same_footing"]["coherent"]["4 s"]["rmse_db"],
+            "rmse_mean_4s_db": extra["averaged"]["coherent"]["4 s"]["rmse_db"],
             "correlation": panel.correlation,
             "correlation_ci95": panel.correlation_ci95,
             "baselines": {

@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray, IntArray
 from .rank import MAX_RANK, cohen_kappa, total_variation
-from .statistics import NO_INTERVAL, REPLICATES, SEED, Interval, bootstrap_means, interval, memory, plain
+from .statistics import NO_INTERVAL, REPLICATES, SEED, Interval, autocorrelation, bootstrap_means, interval, plain
 
 LEAST_PROBABILITY = 1e-6
 """What a rank counts in the log score that a forecast held impossible."""
@@ -167,7 +167,7 @@ def score_forecast(
     one, two = one_hot(rank, ranks), one_hot(choice, ranks)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
     columns = np.column_stack([rank == choice, log, log - log_constant, one, two, p]).astype(np.float64)
-    known = max((memory(c) for c in columns[:, :3].T), key=lambda m: m.block_length)
+    known = max((autocorrelation(c) for c in columns[:, :3].T), key=lambda m: m.block_length)
     drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
     mean = columns.mean(axis=0)
     share, expected = mean[3 : 3 + ranks], mean[3 + 2 * ranks :]

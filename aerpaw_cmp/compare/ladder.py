@@ -155,6 +155,15 @@ def held_out_error_db(
 ) -> FloatArray:
     """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
 
+    Parameters
+    ----------
+    measured_db, level_db : (n,)
+        Levels in time order [dB].
+    keep : (n,) bool
+        Samples that count.
+    blocks : int
+        Stretches of equal length.
+
     Examples
     --------
     >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), blocks=2).tolist()

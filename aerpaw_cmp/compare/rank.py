@@ -19,9 +19,9 @@ from .statistics import (
     REPLICATES,
     SEED,
     Interval,
+    autocorrelation,
     bootstrap_means,
     interval,
-    memory,
     plain,
     same_places,
     share_interval,
@@ -292,7 +292,7 @@ def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int 
     n = len(one)
     if n < 8 or np.ptp(one) == 0 or np.ptp(two) == 0:
         return float("nan")
-    near = minimum_shift or max(memory(one).block_length, memory(two).block_length)
+    near = minimum_shift or max(autocorrelation(one).block_length, autocorrelation(two).block_length)
     near = int(np.clip(near, 1, n // 4))
     matches = np.zeros(n)
     for rank in np.intersect1d(one, two):
@@ -327,7 +327,7 @@ def histogram_test(
     if not len(one):
         return float("nan")
     difference = _indicators(one) - _indicators(two)
-    length = max(memory(one).block_length, memory(two).block_length, 1)
+    length = max(autocorrelation(one).block_length, autocorrelation(two).block_length, 1)
     sums = np.add.reduceat(difference, np.arange(0, len(one), length), axis=0)
     signs = np.random.default_rng(seed).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
@@ -418,7 +418,7 @@ def k_curve(
         )
     ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
     equal = (ranks == ri[:, None]).astype(np.float64)
-    known = memory(equal.mean(axis=1))
+    known = autocorrelation(equal.mean(axis=1))
     length = known.block_length
     agree = equal.mean(axis=0)
     drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
@@ -756,7 +756,7 @@ def compare_rank(
     if sinr_db is not None:
         rules["capacity"] = capacity_rank(matrix, sinr_db)
         report["sinr_db"] = sinr_db
-    known = memory(ri[np.isfinite(ri)])
+    known = autocorrelation(ri[np.isfinite(ri)])
     time = np.arange(len(ri)) if time_s is None else time_s
     return RankComparison(
         n=int(np.isfinite(ri).sum()),
@@ -774,9 +774,9 @@ def compare_rank(
 def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    found, whole = [], memory(rank)
+    found, whole = [], autocorrelation(rank)
     for bar in _indicators(rank).T:
-        known = memory(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
+        known = autocorrelation(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
         drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates, seed=seed)
         found.append(share_interval(float(bar.mean()), float(drawn.std()), known))
     return found
@@ -896,15 +896,15 @@ def repeat_rank(
         Bootstrap.
     """
     one, two = _ranks(rank), _ranks(other_rank)
-    heard, other_heard = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
+    known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
     here, there = same_places(
-        np.asarray(position_m)[heard],
-        np.asarray(other_position_m)[other_heard],
+        np.asarray(position_m)[known],
+        np.asarray(other_position_m)[other_known],
         radius_m=radius_m,
-        heading_deg=None if heading_deg is None else heading_deg[heard],
-        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+        heading_deg=None if heading_deg is None else heading_deg[known],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
     )
-    first, second = one[heard[here]], two[other_heard[there]]
+    first, second = one[known[here]], two[other_known[there]]
     if not len(first):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     agree, kappa = agreement(first, second), cohen_kappa(first, second)
@@ -923,7 +923,7 @@ def _pair_intervals(
     columns = np.column_stack([equal, one, two])
     found: list[Interval] = []
     for influence, statistic, bounds in _pair_statistics(equal, one, two):
-        known = memory(influence)
+        known = autocorrelation(influence)
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
         value = values[len(found)]
         found.append(

@@ -22,7 +22,7 @@ from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .forecast import constant_forecast, log_losses, one_hot
 from .rank import MAX_RANK, cohen_kappa, k_grid
-from .statistics import REPLICATES, SEED, bootstrap_means, interval, memory, plain
+from .statistics import REPLICATES, SEED, autocorrelation, bootstrap_means, interval, plain
 
 FLOOR_DB = -40.0
 """Ratios of singular values below this are as good as zero to any receiver."""
@@ -478,7 +478,7 @@ def _left_out_losses(x: FloatArray, rank: IntArray, groups: IntArray, penalty: f
 def _not_worse(difference: FloatArray, replicates: int, seed: int) -> bool:
     if np.abs(difference).max() < 1e-9:  # the same channel by another name
         return True
-    known = memory(difference)
+    known = autocorrelation(difference)
     mean = float(difference.mean())
     drawn = bootstrap_means(difference[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
     low, _ = interval(mean, drawn, known)

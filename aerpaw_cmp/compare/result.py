@@ -115,7 +115,7 @@ class RssFurther:
 
     A field without a default is always written; one whose default is None only where the flight has it.
     ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
-    the replay is better or worse on the same samples; ``same_footing`` is by simulation and window; ``trimmed``,
+    the replay is better or worse on the same samples; ``averaged`` is by simulation and window; ``trimmed``,
     ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
@@ -130,7 +130,7 @@ class RssFurther:
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]
     compared_with: Mapping[str, PairedDifference]
-    same_footing: Mapping[str, Mapping[str, Fit]]
+    averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
     repeatability: Mapping[str, Repeated]
@@ -243,7 +243,9 @@ class RankResult:
         NaN: no CSI.
     sinr_db : (n,), optional
     sigma : (n, min(n_rx, n_tx))
-        Singular values of the simulated channels, falling.
+        Singular values of the simulated channels, falling, relative to a scale of each channel.
+    level_dbm : (n,)
+        Simulated level, NaN without a path.
     rank : mapping of float to (n,) int
         Simulated, per K; 0: no path.
     foliage_rank : mapping of str to mapping of float to (n,) int
@@ -259,6 +261,7 @@ class RankResult:
     measured: FloatArray
     sinr_db: FloatArray | None
     sigma: FloatArray
+    level_dbm: FloatArray
     rank: Mapping[float, IntArray]
     foliage_rank: Mapping[str, Mapping[float, IntArray]]
     score: RankComparison

@@ -22,9 +22,9 @@ from .statistics import (
     SEED,
     ErrorIntervals,
     Interval,
+    autocorrelation,
     correlation,
     error_intervals,
-    memory,
     plain,
 )
 
@@ -117,8 +117,8 @@ class RssComparison:
             "rmse_ci95_db": self.intervals.rmse_db,
             "offset_ci95_db": self.intervals.offset_db,
             "correlation_ci95": self.intervals.correlation,
-            "n_effective": self.intervals.memory.n_effective,
-            "block_length": self.intervals.memory.block_length,
+            "n_effective": self.intervals.autocorrelation.n_effective,
+            "block_length": self.intervals.autocorrelation.block_length,
             "identifiable_db": self.identifiable_db,
             "lag_s": self.lag_s,
             "trimmed": {"offset_db": self.trimmed.offset_db, "rmse_db": self.trimmed.rmse_db, "n": self.trimmed.n},
@@ -158,7 +158,7 @@ def compare_rss(
     time_s : array_like, (n,)
         Instants: seconds or datetime64. Samples are put into this order; instants that are not numbers come last.
     measured_db : array_like, (n,)
-        dBm or dB re full scale; NaN where the receiver heard nothing.
+        dBm or dB re full scale; NaN without a received signal.
     simulated_db : array_like, (n,)
         NaN where there is no path.
     baselines : mapping of str to array_like, (n,), optional
@@ -237,7 +237,7 @@ def _rmse_interval(measured: FloatArray, simulated: FloatArray, replicates: int,
     return error_intervals(measured[ok], simulated[ok], replicates=replicates, seed=seed).rmse_db
 
 
-# --- the same footing: averages over the same window ---------------------------------------------------------------
+# --- both sides averaged over the same window ----------------------------------------------------------------------
 
 
 def local_mean_db(time_s: ArrayLike, level_db: ArrayLike, window_s: float) -> FloatArray:
@@ -330,7 +330,7 @@ def _window_sums(values: FloatArray, first: Any, last: Any) -> FloatArray:
     return total
 
 
-def same_footing(
+def averaged_fits(
     time_s: ArrayLike,
     measured_db: ArrayLike,
     simulations: Mapping[str, ArrayLike],
@@ -370,7 +370,7 @@ def same_footing(
     return result
 
 
-def same_place(
+def path_averaged_fits(
     position_m: FloatArray,
     measured_db: ArrayLike,
     simulations: Mapping[str, ArrayLike],
@@ -379,7 +379,7 @@ def same_place(
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
 ) -> dict[str, dict[float, OffsetFit]]:
-    """As :func:`same_footing`, with both sides averaged over stretches of path: ``result[name][length]``.
+    """As :func:`averaged_fits`, with both sides averaged over stretches of path: ``result[name][length]``.
 
     Parameters
     ----------
@@ -532,7 +532,7 @@ def bin_residual(residual_db: ArrayLike, quantity: ArrayLike, edges: ArrayLike |
         mean = np.bincount(where, weights=r, minlength=bins) / n
         centred = r - mean[where]
         variance = np.bincount(where, weights=centred**2, minlength=bins) / n
-        known = memory(r)
+        known = autocorrelation(r)
         share = known.n_effective / max(known.n, 1)
         reach = 1.96 * np.sqrt(variance / np.maximum(n * share - 1.0, 0.0))
     reach = np.where(np.isfinite(reach), reach, np.nan)

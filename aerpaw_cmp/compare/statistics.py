@@ -33,7 +33,7 @@ FEWEST_INDEPENDENT = 10.0
 """Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it."""
 
 _UNSURE_OF_SPREAD = 6.0
-"""As :attr:`Memory.unsure`, for an RMSE or a correlation: squares are skewed."""
+"""As :attr:`Autocorrelation.unsure`, for an RMSE or a correlation: squares are skewed."""
 
 _FEWEST_OF_PAIR = 5.0
 """The errors of two models must each be worth this many independent samples before they are compared."""
@@ -65,7 +65,7 @@ def plain(value: Any) -> Any:
 
 
 @dataclass(frozen=True, slots=True)
-class Memory:
+class Autocorrelation:
     """How long a sequence remembers.
 
     Parameters
@@ -164,7 +164,7 @@ def _exponential(covariance: FloatArray, n: int) -> tuple[float, float]:
     return float(covariance[0] + 2.0 * kept / (1.0 - decay)), float(kept / (1.0 - decay) ** 2)
 
 
-def memory(values: ArrayLike) -> Memory:
+def autocorrelation(values: ArrayLike) -> Autocorrelation:
     """Block length and effective sample size of a sequence.
 
     Parameters
@@ -174,7 +174,7 @@ def memory(values: ArrayLike) -> Memory:
 
     Returns
     -------
-    Memory
+    Autocorrelation
         A constant sequence and fewer than eight samples give blocks of one.
 
     Notes
@@ -193,13 +193,13 @@ def memory(values: ArrayLike) -> Memory:
 
     Examples
     --------
-    >>> memory([1.0, 1.0, 1.0]).block_length
+    >>> autocorrelation([1.0, 1.0, 1.0]).block_length
     1
     """
     x = np.asarray(values, dtype=np.float64)
     n = len(x)
     if n < 8 or np.ptp(x) == 0.0:
-        return Memory(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
+        return Autocorrelation(n, 1 if n else 0, float(n) if n > 1 else float("nan"), 1.0)
     lags = max(2, n // 2)
     seen = autocovariance(x, lags) * n / (n - np.arange(lags + 1))
     hidden, long_run, reach = 0.0, float(seen[0]), 0.0
@@ -211,7 +211,7 @@ def memory(values: ArrayLike) -> Memory:
         by_window = (by_window - width * hidden) / (1.0 - width / n) if width < 0.8 * n else np.inf
         long_run, reach = max(by_window, by_decay), max(window_reach, decay_reach)
         if long_run >= n * covariance[0]:
-            return Memory(n, max(1, n // 5), 1.0, 2.0)
+            return Autocorrelation(n, max(1, n // 5), 1.0, 2.0)
         if long_run <= 0.0:  # oscillating: the mean is known at least as well as from independent samples
             long_run = float(seen[0])
         if abs(long_run / n - hidden) < 1e-3 * seen[0]:
@@ -221,7 +221,7 @@ def memory(values: ArrayLike) -> Memory:
     length = _LONGER * (1.5 * slope**2 * n) ** (1.0 / 3.0)
     block = int(np.clip(np.ceil(length), 1, max(1, n // 5)))
     factor = 1.0 / (1.0 - min(0.5, slope / block))
-    return Memory(n, block, float(np.clip(n * (seen[0] + hidden) / long_run, 1.0, n)), factor)
+    return Autocorrelation(n, block, float(np.clip(n * (seen[0] + hidden) / long_run, 1.0, n)), factor)
 
 
 def bootstrap_means(
@@ -289,7 +289,7 @@ def _spread(replicates: FloatArray) -> float:
 def interval(
     estimate: float,
     replicates: FloatArray,
-    known: Memory,
+    known: Autocorrelation,
     *,
     bounds: tuple[float, float] = (-np.inf, np.inf),
     forward: Callable[[FloatArray], FloatArray] | None = None,
@@ -303,7 +303,7 @@ def interval(
         The statistic on the data.
     replicates : (r,)
         The statistic on the resamples; NaN replicates are left out.
-    known : Memory
+    known : Autocorrelation
         Of the sequence that was resampled.
     bounds : (low, high)
         The statistic's range.
@@ -345,14 +345,14 @@ class ErrorIntervals:
     offset_db, rmse_db, correlation : (low, high)
         NaN ("none given") where the samples are worth fewer than :data:`FEWEST_INDEPENDENT` independent ones, or
         where the statistic does not exist.
-    memory : Memory
+    autocorrelation : Autocorrelation
         Of the residual.
     """
 
     offset_db: Interval
     rmse_db: Interval
     correlation: Interval
-    memory: Memory
+    autocorrelation: Autocorrelation
 
 
 def error_intervals(
@@ -366,19 +366,19 @@ def error_intervals(
         Pairs in time order, without NaN [dB].
     """
     if not len(measured_db):
-        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, memory(measured_db))
+        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, autocorrelation(measured_db))
     difference = simulated_db - measured_db
-    known = memory(difference)
+    known = autocorrelation(difference)
     d = difference - difference.mean()
     s = simulated_db - simulated_db.mean()
     squared, crossed, spread = d * d, d * s, float(s @ s) / len(s)
 
-    def drawn(columns: list[FloatArray], of: Memory) -> FloatArray:
+    def drawn(columns: list[FloatArray], of: Autocorrelation) -> FloatArray:
         return bootstrap_means(np.column_stack(columns), of.block_length, replicates=replicates, seed=seed)
 
-    of_squares = _of_spread(known, memory(squared))
+    of_squares = _of_spread(known, autocorrelation(squared))
     mean, square = drawn([d, squared], of_squares).T
-    of_correlation = _of_spread(known, memory(_correlation_influence(spread, crossed, squared)))
+    of_correlation = _of_spread(known, autocorrelation(_correlation_influence(spread, crossed, squared)))
     again, with_residual, residual = drawn([d, crossed, squared], of_correlation).T
     return ErrorIntervals(
         interval(float(difference.mean()), drawn([d], known)[:, 0] + difference.mean(), known),
@@ -401,9 +401,9 @@ def error_intervals(
     )
 
 
-def _of_spread(residual: Memory, influence: Memory) -> Memory:
-    """Memory for a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
-    return Memory(
+def _of_spread(residual: Autocorrelation, influence: Autocorrelation) -> Autocorrelation:
+    """Of a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
+    return Autocorrelation(
         residual.n,
         max(residual.block_length, influence.block_length),
         min(residual.n_effective, influence.n_effective),
@@ -549,8 +549,8 @@ def paired_difference(
     if free_offset:
         one, two = one - one.mean(), two - two.mean()
     loss = one * one - two * two
-    known = memory(loss)
-    if np.ptp(loss) > 0 and min(memory(one).n_effective, memory(two).n_effective) < _FEWEST_OF_PAIR:
+    known = autocorrelation(loss)
+    if np.ptp(loss) > 0 and min(autocorrelation(one).n_effective, autocorrelation(two).n_effective) < _FEWEST_OF_PAIR:
         known = dataclasses.replace(known, n_effective=1.0)
     columns = np.column_stack([loss, one, two])
     drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
@@ -599,7 +599,7 @@ def _paired_verdict(low: float, high: float) -> Literal["better", "worse", "no d
     return "better" if high < 0 else "worse" if low > 0 else "no difference shown"
 
 
-def share_interval(share: float, spread: float, known: Memory) -> Interval:
+def share_interval(share: float, spread: float, known: Autocorrelation) -> Interval:
     """95 % interval of a share (a histogram bar): Wilson's, with as many samples as the spread is worth.
 
     Parameters
@@ -608,7 +608,7 @@ def share_interval(share: float, spread: float, known: Memory) -> Interval:
         0 to 1.
     spread : float
         Bootstrap standard deviation of the share.
-    known : Memory
+    known : Autocorrelation
         Of the sequence.
 
     Notes
@@ -719,16 +719,16 @@ def repeatability(
     heading_within_deg : float
         Within this.
     """
-    heard, other_heard = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
+    known, other_known = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
     here, there = same_places(
-        position_m[heard],
-        other_position_m[other_heard],
+        position_m[known],
+        other_position_m[other_known],
         radius_m=radius_m,
-        heading_deg=None if heading_deg is None else heading_deg[heard],
-        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_heard],
+        heading_deg=None if heading_deg is None else heading_deg[known],
+        other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
         heading_within_deg=heading_within_deg,
     )
-    here, there = heard[here], other_heard[there]
+    here, there = known[here], other_known[there]
     if not len(here):
         return Repeatability(float("nan"), float("nan"), 0, NO_INTERVAL)
     difference = other_level_db[there] - level_db[here]

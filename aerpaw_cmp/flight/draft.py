@@ -78,10 +78,60 @@ def draft(
     parts += [f"  # left out: {remark}\n" for remark in entries.out]
     parts += [LINK] if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
+    parts += _settings(entries)
     text = "".join(parts)
     parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
     asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     return text, asked + [f"left out: {remark}" for remark in entries.out]
+
+
+MINIMUM_HEIGHT_M = 5.0
+"""Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level."""
+
+FLOWN_ABOVE_M = 15.0
+"""A flight that never got higher has no part that is better than its start."""
+
+
+def _settings(entries: _Entries) -> list[str]:
+    """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
+    if entries.flown is None:
+        return []
+    frame, lines = entries.flown[0].frame, []
+    if "rank" in entries.kinds:
+        lines.append("# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n")
+    elif _has_attitude(frame):
+        lines.append("rt: {attitude: logged}\n")
+    else:
+        lines.append("rt: {attitude: level}  # no attitude in the telemetry: the nose points along the track?\n")
+    if float(np.nanmax(frame["altitude_m"].to_numpy(np.float64), initial=-np.inf)) > FLOWN_ABOVE_M:
+        low = f"{{minimum_height_m: {MINIMUM_HEIGHT_M:g}}}"
+        lines += [
+            f"{kind}: {low}  # without take-off and landing\n" for kind in ("rss", "rank") if kind in entries.kinds
+        ]
+    return lines
+
+
+def _has_attitude(frame: Any) -> bool:
+    """Whether most telemetry rows know how the aircraft is turned."""
+    names = ["roll_deg", "pitch_deg", "yaw_deg"]
+    return set(names) <= set(frame.columns) and bool(frame[names].notna().all(axis=1).mean() > 0.5)
+
+
+CLIPPED_SHARE = 0.01
+
+
+def receiver_floor_db(levels: Sequence[Stream]) -> float | None:
+    """The level [dB] below which the receivers of a log hear nothing; None where none shows.
+
+    A receiver at its floor writes its least level again and again: at least one sample in a hundred, and at least ten.
+    """
+    floors = []
+    for stream in levels:
+        level = stream.frame["rss_db"].to_numpy(np.float64)
+        level = level[np.isfinite(level)]
+        if len(level) and np.sum(level == level.min()) >= max(10.0, CLIPPED_SHARE * len(level)) and np.ptp(level) > 0:
+            floors.append(float(level.min()))
+    return max(floors) if floors else None
 
 
 @dataclass
@@ -140,6 +190,9 @@ class _Entries:
             entry["time_origin"] = self.time_origin
         if refused:
             entry["skip"] = sorted(refused)
+        if (floor := receiver_floor_db([s for s in kept if s.kind == "rss"])) is not None:
+            entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
+            asked += f" floor of the receiver at {floor:.1f} dB?" if asked else f"  # receiver floor {floor:.1f} dB?"
         if any(is_ratio(s) for s in kept):
             asked += " a ratio to the noise as a level?" if asked else "  # a ratio to the noise as a level?"
         self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"

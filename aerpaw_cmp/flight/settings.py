@@ -331,6 +331,8 @@ class RtSettings(Settings):
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None
+    visibility: Literal["centre", "pairs"] = "centre"
+    """``pairs``: each element pair has its own paths (engine image); ``centre``: those of the array centres."""
     audit_links: Annotated[int, Field(ge=0)] = 200
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""

@@ -229,7 +229,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         rmse_ci95_db=score.rmse_ci95_db,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.memory.n_effective,
+        n_effective=score.intervals.autocorrelation.n_effective,
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
@@ -590,8 +590,8 @@ def _held_out(
 ) -> list[Any]:
     """Fit under one setting on the flights that gave RSS under it."""
     label = settings.setting or tasks[0].setting if tasks else ""
-    heard = {row.flight for row in rows if row.setting == label}
-    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in heard}
+    with_rss = {row.flight for row in rows if row.setting == label}
+    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in with_rss}
     return fit_all(
         flights,
         settings.fit,

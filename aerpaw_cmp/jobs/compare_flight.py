@@ -46,11 +46,11 @@ from .what_if import (
 FOLIAGE_RUNS = ("without trees", "trees in leaf", "trees out of leaf")
 """Runs of ``rt.paired_foliage``; each is a column of rss.csv and, per K, of rank.csv."""
 
-FOOTING_WINDOWS_S = (0.0, 1.0, 4.0)
+AVERAGING_WINDOWS_S = (0.0, 1.0, 4.0)
 """Both sides are averaged over these windows to see how much of the error is fading."""
 
-FOOTING_WAVELENGTHS = 40
-FOOTING_LENGTH_M = 20.0
+AVERAGING_WAVELENGTHS = 40
+AVERAGING_LENGTH_M = 20.0
 """And over stretches of path, each of which counts once, however long the UAV hovered there."""
 
 PASSES_WITHIN_M = 3.0
@@ -121,7 +121,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         further=RssFurther(
             n_measured_out=score.n_measured_out,
             n_simulated_out=score.n_simulated_out,
-            block_length=score.intervals.memory.block_length,
+            block_length=score.intervals.autocorrelation.block_length,
             identifiable_db=score.identifiable_db,
             trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
             n_too_low=int((replayed.valid & ~levels.posed).sum()),
@@ -130,7 +130,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             clock=None if clock is None else clock.found,
             baseline_rmse_ci95_db=score.baseline_intervals,
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
-            same_footing=_same_footing(series, replayed, levels, position, settings),
+            averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
             expected_offset=_expected(data, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
@@ -186,7 +186,7 @@ def _variants(settings: RssSettings, levels: Levels, alternatives: Mapping[str, 
     return out
 
 
-def _same_footing(
+def _averaged(
     series: RssSeries, replayed: Replayed, levels: Levels, position_m: FloatArray, settings: RssSettings
 ) -> dict[str, dict[str, Fit]]:
     """Both sides averaged alike, over windows of time and stretches of path, per simulation."""
@@ -194,15 +194,15 @@ def _same_footing(
         "coherent": replayed.spread(replayed.replay.rss_dbm[:, 0]),
         "power_sum": replayed.spread(replayed.replay.rss_power_dbm[:, 0]),
     }
-    over_time = rss.same_footing(
-        series.time, levels.measured_db, simulations, windows_s=FOOTING_WINDOWS_S, step_db=settings.step_db,
+    over_time = rss.averaged_fits(
+        series.time, levels.measured_db, simulations, windows_s=AVERAGING_WINDOWS_S, step_db=settings.step_db,
         span_db=settings.span_db,
     )  # fmt: skip
     lengths = {
-        FOOTING_WAVELENGTHS * wavelength_m(series.link.carrier_hz): f"{FOOTING_WAVELENGTHS} wavelengths of path",
-        FOOTING_LENGTH_M: f"{FOOTING_LENGTH_M:g} m of path",
+        AVERAGING_WAVELENGTHS * wavelength_m(series.link.carrier_hz): f"{AVERAGING_WAVELENGTHS} wavelengths of path",
+        AVERAGING_LENGTH_M: f"{AVERAGING_LENGTH_M:g} m of path",
     }
-    over_path = rss.same_place(
+    over_path = rss.path_averaged_fits(
         position_m, levels.measured_db, simulations, lengths_m=tuple(lengths), step_db=settings.step_db,
         span_db=settings.span_db,
     )  # fmt: skip
@@ -237,7 +237,7 @@ def _censored(settings: RssSettings, levels: Levels) -> Censored | None:
     fit = offsets.censored_offset(
         measured,
         simulated,
-        # the weakest level itself was heard: it is no "below"
+        # the weakest level itself is a measurement: it is no "below"
         measured_floor_db=floors[0] - 1e-9,
         simulated_floor_db=floors[1] - 1e-9,
         step_db=settings.step_db,
@@ -420,6 +420,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         measured=series.rank[rows],
         sinr_db=sinr_db,
         sigma=sigma,
+        level_dbm=replayed.replay.rss_dbm[kept, 0],
         rank={k: ranks.rank_from_singular_values(sigma, k) for k in score.simulated},
         foliage_rank=paired,
         score=score,

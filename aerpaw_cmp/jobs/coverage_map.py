@@ -44,7 +44,7 @@ from ..maps.job import (
     layers_of,
     map_job,
 )
-from ..maps.study import HonestStudy, Study, honest_study, rank_fields, rank_study
+from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
 from ..propagation.channel import channel_matrices, rss_dbm
@@ -270,7 +270,7 @@ class MapOutcome:
     settings: MapSettings
     maps: dict[str, MapResult] = field(default_factory=dict)
     studies: dict[str, Study] = field(default_factory=dict)
-    honest: HonestStudy | None = None
+    held_out: HeldOutStudy | None = None
     peers: dict[str, dict[str, Score]] = field(default_factory=dict)
     learning: dict[str, FloatArray] = field(default_factory=dict)
     correlations: dict[str, BinnedCorrelation] = field(default_factory=dict)
@@ -328,12 +328,12 @@ def study_maps(outcome: MapOutcome, stages: Stages) -> None:
         }
     if outcome.trajectory_m is None:
         outcome.trajectory_m, outcome.trajectory_name = tower_round(outcome.site)
-    with stages("honest tests"):
+    with stages("held-out tests"):
         fit, line = outcome.studies["missing"].fit, outcome.trajectory_m
-        outcome.honest = honest_study(
+        outcome.held_out = held_out_study(
             result.grid, heights, rank, fit, trajectory_m=line, block_m=s.block_m, neighbours=s.neighbours, seed=s.seed
         )
-        sizes = outcome.honest.learning_sizes
+        sizes = outcome.held_out.learning_sizes
         for name, peer in wide_peers(result, s.neighbours).items():
             outcome.peers.setdefault("blocks", {})[name] = blocked(peer, result.grid.points_m, rank, s.block_m)
             outcome.peers.setdefault("flight", {})[name] = along_trajectory(peer, result.grid, rank, line)
@@ -500,20 +500,20 @@ def _correlation_panels(outcome: MapOutcome) -> Iterator[page.Correlation]:
 
 
 def _errors(outcome: MapOutcome) -> Iterator[page.MapError]:
-    if not outcome.studies or outcome.honest is None:
+    if not outcome.studies or outcome.held_out is None:
         return
     heights, _ = rank_fields(outcome.shown)
-    honest = outcome.honest
+    held_out = outcome.held_out
     tables: dict[str, dict[str, Score]] = {
         "leave one out": dict(outcome.studies["missing"].scores),
         "leave one out, Z as rank 0": dict(outcome.studies["zero"].scores),
         "leave one out, Z as rank 0, random samples": _local(outcome.studies["random"].scores),
-        f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": honest.blocked, **outcome.peers["blocks"]},
-        "altitude left out": {"Kriging, 3-D": honest.altitude_held_out, **outcome.peers["altitude"]},
+        f"blocks of {outcome.settings.block_m:g} m left out": {"Kriging": held_out.blocked, **outcome.peers["blocks"]},
+        "altitude left out": {"Kriging, 3-D": held_out.altitude_held_out, **outcome.peers["altitude"]},
     }
-    if honest.trajectory is not None:
+    if held_out.trajectory is not None:
         name = f"trained along {outcome.trajectory_name}"
-        tables[name] = {"Kriging": honest.trajectory, **outcome.peers["flight"]}
+        tables[name] = {"Kriging": held_out.trajectory, **outcome.peers["flight"]}
     for evaluation, scores in tables.items():
         for method, score in scores.items():
             for row, height in enumerate(heights):
@@ -530,10 +530,10 @@ def _local(scores: Mapping[str, Score]) -> dict[str, Score]:
 
 
 def _learning(outcome: MapOutcome) -> Iterator[page.LearningCurve]:
-    if outcome.honest is None or not outcome.honest.learning_sizes:
+    if outcome.held_out is None or not outcome.held_out.learning_sizes:
         return
-    sizes = np.array(outcome.honest.learning_sizes)
-    for name, mae in {"Kriging": outcome.honest.learning_mae, **outcome.learning}.items():
+    sizes = np.array(outcome.held_out.learning_sizes)
+    for name, mae in {"Kriging": outcome.held_out.learning_mae, **outcome.learning}.items():
         mean = np.array([_mean(row) for row in mae.reshape(len(sizes), -1)])
         yield page.LearningCurve(method=f"{name}, mean over heights and K", samples=sizes, mae=mean)
 
@@ -589,8 +589,8 @@ def _metrics(outcome: MapOutcome) -> dict[str, Any]:
             "intervals": _interval_metrics(study.intervals),
             "intervals_paper_v2": _interval_metrics(study.intervals_paper),
         }
-    if outcome.honest is not None:
-        result["vertical_scale"] = outcome.honest.vertical_scale
+    if outcome.held_out is not None:
+        result["vertical_scale"] = outcome.held_out.vertical_scale
         result["trajectory"] = outcome.trajectory_name
     clear = outcome.maps.get("none")
     for mode, maps in outcome.ordered():

@@ -122,7 +122,7 @@ class Flight:
 
     @cached_property
     def rss(self) -> pd.DataFrame:
-        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``; NaN where nothing was heard."""
+        """Measured levels: ``time tower channel unit measured_db east_m north_m up_m``; NaN without a signal."""
         frames = []
         for series in self.data.rss:
             position = np.full((len(series.time), 3), np.nan)

@@ -245,6 +245,7 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
         rss_power_dbm=whole.rss_power_dbm[start:stop],
         h=whole.h[start:stop],
         has_path=whole.has_path[start:stop],
+        pairs_differ=None if whole.pairs_differ is None else whole.pairs_differ[start:stop],
         paths=dataclasses.replace(paths.select(chosen), pose=paths.pose[chosen] - start),
         seconds=whole.seconds * share,
         search_seconds=whole.search_seconds * share,
@@ -323,6 +324,7 @@ def replay_poses(
         crowns=reflecting_crowns(site.trees, rt),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        visibility=rt.visibility if engine == "image" else "centre",
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
     )

@@ -454,7 +454,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     from ..compare.rank import channel_rank
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
-    from ..live.follow import TelemetryFollower
+    from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
     from .replay import replay_poses
@@ -470,10 +470,8 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
     )
     k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
 
-    def predict(utc_ns: int) -> int | None:
-        follower.poll()
-        sample = follower.at(utc_ns)
-        if sample is None or not np.isfinite(sample.latitude_deg):
+    def rank_at(sample: TelemetrySample) -> int | None:
+        if not np.isfinite(sample.latitude_deg):
             return None
         east, north = site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
         up = max(sample.altitude_m + site.datum.takeoff_ground_m, 0.5)
@@ -487,7 +485,7 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
         rank = int(channel_rank(found.h[0, 0], k))
         return rank or None
 
-    return predict
+    return predict_along(follower, rank_at)
 
 
 @dataclass(frozen=True, slots=True)

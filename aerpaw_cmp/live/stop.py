@@ -28,11 +28,6 @@ class Stop:
         """Readable once asked."""
         return self._read
 
-    def hush(self) -> None:
-        """Forget the wake-up, not the request."""
-        with contextlib.suppress(OSError):
-            os.read(self._read, 64)
-
     def close(self) -> None:
         """Close the pipe."""
         os.close(self._read)

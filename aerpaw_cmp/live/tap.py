@@ -27,8 +27,8 @@ from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_po
 from .predict import Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
+from .status_notifier import StatusNotifier
 from .stop import Stop
-from .teller import Teller
 from .writer import LogWriter
 
 __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_status", "run_tap"]
@@ -70,7 +70,7 @@ class Tap:
         clock: Clock | None = None,
     ) -> None:
         self._settings = settings
-        self._teller = None if on_status is None else Teller(on_status)
+        self._notifier = None if on_status is None else StatusNotifier(on_status)
         self._stop = stop
         self._clock = clock or Clock()
         self._worker = None if predict is None else PredictionWorker(predict)
@@ -132,8 +132,8 @@ class Tap:
     def _close_helpers(self) -> None:
         if self._worker is not None:
             self._worker.close()
-        if self._teller is not None:
-            self._teller.close()
+        if self._notifier is not None:
+            self._notifier.close()
 
     def _first_connection(self) -> None:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
@@ -216,8 +216,8 @@ class Tap:
             self._log.close()
             for text in self._log.messages():
                 self._say(text)
-        if self._teller is not None:
-            self._teller.close()
+        if self._notifier is not None:
+            self._notifier.close()
         return TapSummary(
             reason=record["reason"],
             exit_code=1 if self._stop.reason == "no_csi" or self._log.lost else 0,
@@ -630,7 +630,7 @@ class Tap:
         self._show(self._redactor.clean(text))
 
     def _show(self, message: str) -> None:
-        if self._teller is None:
+        if self._notifier is None:
             return
         now = self._clock.mono_ns()
         while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
@@ -653,7 +653,7 @@ class Tap:
             alarm=self._alarm,
             message=message,
         )
-        self._teller.tell(status)
+        self._notifier.notify(status)
 
     def _record(self, record: Record) -> None:
         if self._log_open:

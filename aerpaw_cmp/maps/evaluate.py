@@ -239,9 +239,9 @@ class IntervalCoverage:
     level : (levels,)
         Nominal probability of the interval.
     observed : (levels,)
-        Share of values inside; equal to ``level`` for an honest variance and normal errors.
+        Share of values inside; equal to ``level`` for a calibrated variance and normal errors.
     standardised_variance : float
-        Mean of error^2 / variance: 1 for an honest variance, above 1 when it is too small.
+        Mean of error^2 / variance: 1 for a calibrated variance, above 1 when it is too small.
     n : int
         Values with an estimate and a variance above 0.
     """

@@ -177,7 +177,7 @@ def _curve(correlation: BinnedCorrelation) -> BiExponential:
 
 
 @dataclass(frozen=True, slots=True)
-class HonestStudy:
+class HeldOutStudy:
     """Kriging where no near neighbour gives the answer away. Scores have the shape (altitudes, K).
 
     Parameters
@@ -204,7 +204,7 @@ class HonestStudy:
     learning_mae: FloatArray
 
 
-def honest_study(
+def held_out_study(
     grid: Grid,
     altitudes_m: Sequence[float],
     values: FloatArray,
@@ -215,7 +215,7 @@ def honest_study(
     learning_sizes: Sequence[int] = (25, 50, 100, 200, 400, 800, 1600),
     neighbours: int = 20,
     seed: int = 0,
-) -> HonestStudy:
+) -> HeldOutStudy:
     """Evaluate Kriging with gaps: every sample may be far, so the radius does not bind (``outside="nearest"``).
 
     What is held out is the values; the correlation curve is the one given, of the whole map.
@@ -244,7 +244,7 @@ def honest_study(
     scale = fit_vertical_scale(in_space, across) if varies else 1.0
     space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
     sizes = tuple(size for size in learning_sizes if size < len(grid))
-    return HonestStudy(
+    return HeldOutStudy(
         blocked(wide, points, values, block_m),
         altitude_held_out(space, points, altitudes_m, values),
         scale,

@@ -13,7 +13,15 @@ from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Link, Poses
 from .crowns import Crowns
-from .field_audit import REFERENCE_LINKS, Expected, against_reference, against_sionna, impossible, spread_over_paths
+from .field_audit import (
+    REFERENCE_LINKS,
+    Expected,
+    against_reference,
+    against_sionna,
+    impossible,
+    per_pair,
+    spread_over_paths,
+)
 from .image import planes_of
 from .paths import PathSet, joined
 from .samples import Samples
@@ -192,6 +200,7 @@ def audit(
         field = against_reference(
             site, poses, replay, few_kinds, expected, ks=ks, max_depth=max_depth, complete=complete
         )
+        field += per_pair(site, link, poses, replay, chosen, ks=ks, max_depth=max_depth, loss=loss, crowns=crowns)
         field += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         field += against_sionna(
             site, link, poses, replay, chosen, expected,

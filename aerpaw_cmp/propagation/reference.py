@@ -86,6 +86,7 @@ class ExpectedLink:
     uav_transmits: bool
     towers: dict[str, ExpectedArray]
     uav: ExpectedArray
+    noise_floor_dbm: float = -math.inf
 
 
 @dataclass(frozen=True, slots=True)

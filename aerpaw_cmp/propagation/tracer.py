@@ -15,7 +15,7 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray
 from ..site.site import Site
 from . import image
-from .arrays import Link, Poses
+from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import channel_matrices, mean_pair_power, rss_dbm
 from .crowns import Crowns
@@ -26,6 +26,7 @@ from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
 
 Engine = Literal["sionna", "image"]
+Visibility = Literal["centre", "pairs"]
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 """``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
 
@@ -60,6 +61,8 @@ class Replay:
         Rays per tower; 0 for an engine without rays.
     samples_reason : str
         Why so many, where the number was found by pilots.
+    pairs_differ : (poses, towers) bool, optional
+        Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
     """
 
     rss_dbm: FloatArray
@@ -76,6 +79,7 @@ class Replay:
     from_cache: bool = False
     samples: int = 0
     samples_reason: str = ""
+    pairs_differ: BoolArray | None = None
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -133,6 +137,7 @@ def replay(
     cache_dir: str | Path | None = None,
     relevance_db: float | None = None,
     drop_small_faces: bool = False,
+    visibility: Visibility = "centre",
     variant: str | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
@@ -166,6 +171,9 @@ def replay(
         (:mod:`aerpaw_cmp.propagation.relevance`).
     drop_small_faces : bool
         Leave out faces smaller than the first Fresnel zone of every link.
+    visibility : {"centre", "pairs"}
+        Whether all element pairs have the paths of the array centres, or each its own (``image`` only; as many
+        searches as a link has element pairs). ``paths`` are those of the centres in any case.
     variant : {"cuda", "llvm"}, optional
         ``sionna`` only.
     progress : callable, optional
@@ -182,6 +190,12 @@ def replay(
     """
     if engine not in ("image", "sionna"):
         raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
+    if visibility == "pairs" and (engine != "image" or relevance_db is not None):
+        raise UsageError(
+            "visibility 'pairs' with " + ("engine 'sionna'" if engine != "image" else "relevance_db"),
+            expected="engine 'image' with every sequence, or visibility 'centre'",
+            cause="each element pair is searched for its own paths",
+        )
     started = time.perf_counter()
     poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
@@ -207,6 +221,9 @@ def replay(
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
     result = _evaluate(scene, link, poses, paths, engine, loss)
+    if visibility == "pairs":
+        small = drop_small_faces
+        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -216,6 +233,72 @@ def replay(
         samples=settings.samples if engine == "sionna" else 0,
         samples_reason=choice.reason if choice else "",
     )
+
+
+PAIRS_DIFFER = 1e-9
+"""Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
+
+
+def _by_pairs(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    centre: Replay,
+    settings: Settings,
+    loss: Loss | None,
+    crowns: Crowns | None,
+    usable: BoolArray | None,
+) -> Replay:
+    """Each element pair with its own paths: every tower element is a source, every UAV element a pose."""
+    names, arrays = list(link.tower_arrays), list(link.tower_arrays.values())
+    ports, uav = len(arrays[0]), link.uav_array
+    singles = {
+        f"{name} {port}": _single(array, port)
+        for name, array in zip(names, arrays, strict=True)
+        for port in range(ports)
+    }
+    h = np.zeros((len(poses), len(names), len(uav), ports), dtype=np.complex128)
+    power = np.zeros((len(poses), len(names)))
+    turn = poses.rotation @ uav.mount
+    scene = Scene.of(site, link, poses)
+    offsets = np.concatenate([array.positions_m @ array.mount.T for array in arrays])
+    several = replace(
+        scene,
+        sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
+        usable=np.repeat(scene.usable if usable is None else usable[:, : len(scene.faces)], ports, axis=0),
+        excluded=np.repeat(scene.excluded, ports, axis=0),
+    )
+    for element in range(len(uav)):
+        spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)
+        one = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
+        paths, _ = _above_terrain(site, several, spots, _search(several, one, spots, settings, None))
+        found = several
+        if crowns is not None:
+            found, bounces = several.with_bounces(site, spots, crowns, settings.max_depth)
+            paths = image.merge([paths, bounces], settings.max_depth, None)
+        loss_db = None if loss is None else loss(paths, found.sources_m, spots.position_m)
+        fields = channel_matrices(paths, found.faces, found.sources_m, spots, one, loss_db)
+        h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), len(names), ports)
+        power += fields.power.reshape(len(poses), len(names), ports).sum(axis=2) / (ports * len(uav))
+    h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
+    level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
+    heard = np.isfinite(level)
+    h = np.where(heard[:, :, None, None], h, 0.0)
+    size = np.sqrt(np.maximum(mean_pair_power(h), mean_pair_power(centre.h)))
+    return replace(
+        centre,
+        rss_dbm=level,
+        rss_power_dbm=rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm),
+        h=h,
+        has_path=heard,
+        pairs_differ=np.abs(h - centre.h).max(axis=(2, 3)) > PAIRS_DIFFER * size,
+    )
+
+
+def _single(array: Array, element: int) -> Array:
+    """One element of an array, in the centre of its own."""
+    pattern = array.patterns[element if len(array.patterns) > 1 else 0]
+    return Array(np.zeros((1, 3)), array.slant_rad[element : element + 1], (pattern,), array.mount)
 
 
 def _choose_samples(scene: Scene, link: Link, poses: Poses, settings: Settings, cache: PathCache | None) -> Choice:
@@ -423,12 +506,12 @@ def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: st
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
-    heard = np.isfinite(level_dbm)
+    above_floor = np.isfinite(level_dbm)
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=np.where(heard[:, :, None, None], fields.h, 0.0),
-        has_path=has_path & heard,
+        h=np.where(above_floor[:, :, None, None], fields.h, 0.0),
+        has_path=has_path & above_floor,
         paths=paths,
         faces=scene.faces,
         seconds=0.0,

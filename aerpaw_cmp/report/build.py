@@ -114,7 +114,7 @@ def rss_panel(result: RssResult) -> record.RssPanel:
         rmse_ci95_db=score.rmse_ci95_db,
         offset_ci95_db=score.intervals.offset_db,
         correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.memory.n_effective,
+        n_effective=score.intervals.autocorrelation.n_effective,
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
@@ -285,6 +285,10 @@ def rank_panel(result: RankResult) -> record.RankPanel:
         extra={
             **{name: value for name, value in score.as_dict().items() if name not in PANEL_RANK},
             **json_safe(fields_of(result.further)),
+        },
+        values={
+            "level_dbm": result.level_dbm,
+            **{f"sigma{i + 2}_over_sigma1_db": ratio_db[:, i] for i in range(ratio_db.shape[1])},
         },
         per_sample={
             f"rank_{name.replace(' ', '_')}_k{k:g}": rank.astype(np.float64)

@@ -334,8 +334,8 @@ def plates(data: CampaignData) -> list[Plate]:
 
 
 def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[Plate]:
-    heard = [row for row in rows if row.n > 0]
-    if not heard:
+    scored = [row for row in rows if row.n > 0]
+    if not scored:
         return []
     return [
         Plate(
@@ -346,7 +346,7 @@ def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dic
             f"Lines: medians of {DISTANCE_BINS} bins of distance; bands: 10 % to 90 %. "
             "Open markers: medians of the simulation at the same samples. Each flight has its own offset.",
             alt=f"Medians of measured and simulated RSS of {link} against distance for each flight",
-            draw=lambda: against_distance(heard, numbers),
+            draw=lambda: against_distance(scored, numbers),
         ),
         Plate(
             name=f"places_{safe_name(link)}",
@@ -356,7 +356,7 @@ def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dic
             "A pattern that "
             "comes back on another flight is an error of the model; one that does not is of that flight.",
             alt=f"Maps of the mean residual of {link}, one per flight",
-            draw=lambda: places(data, heard),
+            draw=lambda: places(data, scored),
         ),
     ]
 

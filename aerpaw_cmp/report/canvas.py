@@ -205,7 +205,20 @@ def write_plates(
     kind: str = "screen",
     progress: Progress = silent,
 ) -> tuple[list[Picture], list[Path]]:
-    """Draw plates one after the other and write each in its formats; gives the pictures and the files."""
+    """Draw plates one after the other and write each in its formats; gives the pictures and the files.
+
+    Parameters
+    ----------
+    plates : sequence of Plate
+    folder : Path
+        Made when missing.
+    formats : sequence of str
+        Of matplotlib, as ``"svg"``, ``"png"``, ``"pdf"``.
+    kind : str
+        Style, as in :func:`render`.
+    progress : Progress
+        Share of the figures that are drawn.
+    """
     drawn, written = [], []
     for number, plate in enumerate(plates):
         progress("figures", number / len(plates))
@@ -338,7 +351,22 @@ def lonely(level: FloatArray) -> BoolArray:
 def draw_out_of_coverage(
     ax: Axes, seconds: FloatArray, mask: BoolArray, label: str, *, height: float = 1.0, hatch: str = "////"
 ) -> None:
-    """Hatched spans, marked Z where there is room, over a share of the height of the axes."""
+    """Hatched spans, marked Z where there is room, over a share of the height of the axes.
+
+    Parameters
+    ----------
+    ax : Axes
+    seconds : (n,)
+        Times of the samples.
+    mask : (n,) bool
+        Samples out of coverage.
+    label : str
+        For the legend.
+    height : float
+        Share of the height of the axes, from below.
+    hatch : str
+        Of matplotlib.
+    """
     if not mask.any():
         return
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
@@ -358,7 +386,18 @@ def draw_out_of_coverage(
 
 
 def draw_waypoints(ax: Axes, data: ReportData, start: np.datetime64, *, names: bool = True) -> None:
-    """Vertical lines at the named moments of the flight."""
+    """Vertical lines at the named moments of the flight.
+
+    Parameters
+    ----------
+    ax : Axes
+        Its x axis is seconds.
+    data : ReportData
+    start : datetime64
+        Where its seconds begin.
+    names : bool
+        Write the labels, too.
+    """
     for number, waypoint in enumerate(data.waypoints):
         at = float((waypoint.time - start) / np.timedelta64(1, "s"))
         ax.axvline(at, color=WAYPOINT, linewidth=0.8, linestyle=(0, (2, 2)), label="waypoint" if number == 0 else None)
@@ -397,7 +436,17 @@ def rank_colour(rank: int) -> Any:
 
 
 def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, names: bool = True) -> None:
-    """Forests, trees, buildings, geofences and towers on a plan (east, north) [m]."""
+    """Forests, trees, buildings, geofences and towers on a plan (east, north) [m].
+
+    Parameters
+    ----------
+    ax : Axes
+    site : Site
+    towers : sequence of str, optional
+        Only these towers; by default all.
+    names : bool
+        Write the names of the towers.
+    """
     from matplotlib.patches import PathPatch
     from matplotlib.path import Path as Outline
 
@@ -464,7 +513,20 @@ def plan_axes(ax: Axes) -> None:
 def frame_around(
     ax: Axes, east: FloatArray, north: FloatArray, *, margin: float = 0.08, least_m: float = 60.0, shape: float = 1.0
 ) -> None:
-    """Limits of a plan around points, with a margin and a least extent [m]; ``shape`` is width over height."""
+    """Limits of a plan around points, with a margin and a least extent [m]; ``shape`` is width over height.
+
+    Parameters
+    ----------
+    ax : Axes
+    east, north : (n,)
+        Points [m]; NaN does not count.
+    margin : float
+        Share of the extent on each side.
+    least_m : float
+        Least width and height.
+    shape : float
+        Width over height of the plan.
+    """
     good = np.isfinite(east) & np.isfinite(north)
     if not good.any():
         return
@@ -498,7 +560,19 @@ def beyond(values: FloatArray, low: float, high: float) -> str:
 
 
 def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "neither") -> Any:
-    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond."""
+    """A colour bar that an SVG holds as one picture, without seams; with arrows where values lie beyond.
+
+    Parameters
+    ----------
+    fig : Figure
+    mappable : ScalarMappable
+        What the colours stand for.
+    ax : Axes or sequence of Axes
+        Beside which it stands.
+    label : str
+    extend : {"neither", "min", "max", "both"}
+        Ends beyond which values lie.
+    """
     bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:
         bar.solids.set_rasterized(True)

@@ -378,7 +378,9 @@ class RankPanel:
     stale: BoolArray | None = None
     extra: Mapping[str, Any] = field(default_factory=dict)
     per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
-    """Further columns (n,) of rank.csv, by name."""
+    """Further columns (n,) of rank.csv, by name: whole numbers."""
+    values: Mapping[str, FloatArray] = field(default_factory=dict)
+    """Further columns (n,) of rank.csv, by name: numbers."""
 
 
 Audit: TypeAlias = AuditResult

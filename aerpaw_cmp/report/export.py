@@ -222,6 +222,8 @@ def rank_frame(panels: Iterable[RankPanel]) -> Any:
             columns[f"simulated_rank_k{k_key(k)}"] = integers(ranks.get(k, np.full(len(panel.time), np.nan)))
         nowhere = np.full(len(panel.time), np.nan)
         columns.update({name: integers(panel.per_sample.get(name, nowhere)) for name in further})
+        # no path: no level, and a ratio of nothing; a vanishing singular value is an empty cell, too
+        columns.update({name: np.where(np.isfinite(v), v, np.nan) for name, v in panel.values.items()})
         frames.append(pd.DataFrame(columns, index=range(len(panel.time))))
     return _stacked(frames, RANK_COLUMNS)
 

@@ -51,7 +51,20 @@ def extent_m(data: MapsData) -> tuple[float, float, float, float]:
 
 
 def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | None = None, **options: Any) -> Any:
-    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers."""
+    """One map: cells as an image, hatched where NaN, with what stands there and the borders of the towers.
+
+    Parameters
+    ----------
+    ax : Axes
+    data : MapsData
+        Site, axes of the grid and borders.
+    values : (rows, columns)
+        Of the cells, from south to north; NaN out of coverage.
+    highlight : str, optional
+        The only tower that counts: no borders are drawn then.
+    options
+        Of :meth:`matplotlib.axes.Axes.imshow`.
+    """
     ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)
     draw_overlay(ax, data.site, highlight)

@@ -41,7 +41,18 @@ if TYPE_CHECKING:
 
 
 def rank_map(ax: Axes, site: Site, east: FloatArray, north: FloatArray, rank: FloatArray, title: str) -> None:
-    """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out."""
+    """Ranks at their positions: colour and marker differ; 0 is Z, NaN is left out.
+
+    Parameters
+    ----------
+    ax : Axes
+    site : Site
+    east, north : (n,)
+        Positions [m].
+    rank : (n,)
+        0 to 4; NaN unknown.
+    title : str
+    """
     draw_site(ax, site)
     for value in (0, *RANKS):
         at = rank == value
@@ -169,7 +180,17 @@ def draw_measured_rank(ax: Axes, seconds: FloatArray, panel: RankPanel) -> None:
 
 
 def draw_singular_values(ax: Axes, seconds: FloatArray, values: FloatArray, panel: RankPanel) -> None:
-    """Singular values relative to the largest, with every threshold K."""
+    """Singular values relative to the largest, with every threshold K.
+
+    Parameters
+    ----------
+    ax : Axes
+    seconds : (n,)
+    values : (n, 3)
+        Second to fourth singular value over the first [dB].
+    panel : RankPanel
+        For its thresholds.
+    """
     for column, (colour, marker) in enumerate((("#111111", "."), ("#0072B2", "."), ("#9AD0F0", "."))):
         ax.plot(
             seconds, values[:, column], linestyle="none", marker=marker, markersize=2, color=colour, rasterized=True,

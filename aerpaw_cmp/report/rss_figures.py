@@ -331,6 +331,14 @@ def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, few
 
     NaN where a bin has fewer than ``fewest`` samples: no line is drawn over what was not flown.
 
+    Parameters
+    ----------
+    quantity, values : (n,)
+        Finite numbers.
+    bins : int
+    fewest : int
+        Samples that a bin needs.
+
     Examples
     --------
     >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])

@@ -78,7 +78,17 @@ def marker_size(samples: int | None) -> float:
 
 
 def pareto_axes(ax: Axes, rows: Sequence[SpeedRow], error: Sequence[float], label: str) -> None:
-    """One plane of seconds against error: a line per setting, markers that grow with the number of samples."""
+    """One plane of seconds against error: a line per setting, markers that grow with the number of samples.
+
+    Parameters
+    ----------
+    ax : Axes
+    rows : sequence of SpeedRow
+    error : sequence of float
+        One per row; NaN is not drawn.
+    label : str
+        Of the error axis.
+    """
     markers, colours = "osD^v<>P", ("#111111", "#56B4E9", "#D55E00", "#009E73", "#CC79A7", "#0072B2")
     families: dict[str, list[int]] = {}
     for index, row in enumerate(rows):

@@ -269,6 +269,12 @@ def read_pattern_text(
     return pattern
 
 
+_FREQUENCY = re.compile(
+    r"\s*frequency\s*=\s*([-+]?\d{1,20}(?:\.\d{0,20})?(?:e[-+]?\d{1,2})?)\s*\(\s*([kMG]?)Hz\s*\)",
+    re.IGNORECASE | re.ASCII,
+)
+
+
 def _read_rows(path: Path) -> _Rows:
     try:
         text = path.read_bytes().decode("utf-8-sig")
@@ -280,7 +286,7 @@ def _read_rows(path: Path) -> _Rows:
     values: list[list[float]] = []
     started = False
     for number, line in enumerate(text.splitlines(), start=1):
-        if frequency := re.match(r"\s*frequency\s*=\s*([-+.\deE]+)\s*\(\s*([kMG]?)Hz\s*\)", line, re.IGNORECASE):
+        if frequency := _FREQUENCY.match(line):
             scale = {"": 1.0, "K": 1e3, "M": 1e6, "G": 1e9}[frequency.group(2).upper()]
             rows.frequency_hz = float(frequency.group(1)) * scale
         elif line.lower().lstrip().startswith("phi"):
@@ -377,6 +383,13 @@ def _as_grid(rows: _Rows, path: Path) -> tuple[bool, FloatArray]:
     key = np.round(rows.values[:, :2], 5)
     phi, at_phi = np.unique(key[:, 0], return_inverse=True)
     theta, at_theta = np.unique(key[:, 1], return_inverse=True)
+    if len(theta) < 3 or len(phi) * len(theta) > 2 * len(key) + 1000:  # no grid; and a table of them might not fit
+        raise InputError(
+            f"{len(key)} rows with {len(phi)} values of phi and {len(theta)} of theta",
+            expected="a grid over the sphere: every phi with every theta",
+            cause="angles with other digits in each row, or a file that was cut off",
+            path=path,
+        )
     seen = np.zeros((len(phi), len(theta)), dtype=np.int64)
     np.add.at(seen, (at_phi, at_theta), 1)
     if (seen == 0).any() or (seen > 1).any():

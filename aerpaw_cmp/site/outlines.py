@@ -17,7 +17,7 @@ from ..common.errors import InputError
 Position = tuple[float, float]
 """Latitude, longitude [deg]."""
 
-BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError)
+BROKEN_ELEMENT = (InputError, TypeError, KeyError, AttributeError, IndexError, ValueError, OverflowError)
 """What reading one element may raise: the element is left out and listed, the others stay."""
 
 
@@ -93,7 +93,7 @@ def lonlat(point: Any, where: str, path: Path) -> Position:
     """A position written longitude first; InputError when it is none."""
     try:
         longitude, latitude = float(point[0]), float(point[1])
-    except (TypeError, ValueError, IndexError, KeyError):
+    except (TypeError, ValueError, IndexError, KeyError, OverflowError):
         raise InputError(f"{where}: the position {str(point)[:40]} is not longitude, latitude", path=path) from None
     if not (math.isfinite(latitude) and math.isfinite(longitude)):
         raise InputError(f"{where}: a coordinate is not a number", path=path)

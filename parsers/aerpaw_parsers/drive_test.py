@@ -19,7 +19,7 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _cells, _pose, _quantities, _rows, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
+from . import _cells, _lines, _pose, _quantities, _rows, _sheet, aadm_snr, nemo_csv, pose_csv, quectel_ri
 
 _PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
 _ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
@@ -160,7 +160,11 @@ def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     ri = sheet.numbers(column)
     flag = rows.flag.copy()
     good = (ri >= 1) & (ri <= 8)
-    values = {"rank": np.where(good & (ri == np.round(ri)), ri, np.nan), "ri_raw": ri}
+    whole = ri == np.round(ri)
+    _lines.add_flag(flag, ri == 0, "no_csi")
+    _lines.add_flag(flag, np.isfinite(ri) & ~good & (ri != 0), "ri_out_of_range")
+    _lines.add_flag(flag, good & ~whole, "rank_is_a_mean")
+    values = {"rank": np.where(good & whole, ri, np.nan), "ri_raw": ri}
     name = re.sub(r"\W+", "_", sheet.plain[column])
     source = "scheduled PDSCH rank" if "pdsch" in name else "CSI report"
     return rows.stream("rank", name, values, where=np.isfinite(ri), flag=flag, ri_base="one", source=source)

@@ -12,15 +12,15 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from aerpaw_cmp.compare.rss import (
+    averaged_fits,
     bin_residual,
     channel_difference,
     compare_rss,
     error_spans,
     link_geometry,
     local_mean_db,
+    path_averaged_fits,
     residual_tables,
-    same_footing,
-    same_place,
     seconds,
     stretch_means_db,
     stretches,
@@ -171,7 +171,7 @@ def test_fading_averages_out_on_the_same_footing():
     time = np.arange(0, 200, 0.1)
     mean = -70 + 8 * np.sin(time / 20)
     rayleigh = 10 * np.log10(rng.exponential(size=len(time)))
-    found = same_footing(time, mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, windows_s=(0.0, 4.0))
+    found = averaged_fits(time, mean + rayleigh, {"local_mean": mean, "other": 0 * mean}, windows_s=(0.0, 4.0))
     assert found["local_mean"][0.0].rmse_db == pytest.approx(5.57, abs=0.4)  # standard deviation of Rayleigh in dB
     assert found["local_mean"][4.0].rmse_db < 1.0
     assert found["other"][4.0].rmse_db > 4.0
@@ -181,7 +181,7 @@ def test_a_stretch_counts_once_however_long_the_hover():
     east = np.concatenate([np.arange(0.0, 100.0, 1.0), np.full(500, 100.0), np.arange(101.0, 201.0, 1.0)])
     position = np.column_stack([east, 0 * east, 0 * east + 40.0])
     level = np.where(east < 100.0, -60.0, np.where(east == 100.0, -50.0, -60.0))
-    found = same_place(position, level, {"flat": np.full(len(east), -60.0)}, lengths_m=(10.0,))["flat"][10.0]
+    found = path_averaged_fits(position, level, {"flat": np.full(len(east), -60.0)}, lengths_m=(10.0,))["flat"][10.0]
     assert found.n == 21
     alone = 10.0  # one stretch of 21 is off by almost 10 dB
     assert found.rmse_db == pytest.approx(alone * np.sqrt(20) / 21, rel=0.02)
@@ -362,5 +362,7 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
             data["timestamp_power"].astype(float), data[channel].astype(float), free_space, span_db=(-100, 100)
         )
         assert 4.5 < found.rmse_db < 7.2
-        assert found.intervals.memory.n_effective < 0.05 * found.n  # 0.26 s apart: neighbours repeat each other
+        assert (
+            found.intervals.autocorrelation.n_effective < 0.05 * found.n
+        )  # 0.26 s apart: neighbours repeat each other
         assert found.correlation > 0.5

@@ -12,7 +12,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import gather, read_logs
-from aerpaw_cmp.flight.draft import draft
+from aerpaw_cmp.flight.draft import draft, receiver_floor_db
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -197,3 +197,44 @@ def test_the_command_does_not_overwrite(logs: Path, capsys: pytest.CaptureFixtur
     assert main(call) == 2
     assert target.read_text() == "mine"
     assert "exists" in capsys.readouterr().err
+
+
+def _telemetry(folder: Path, *, attitude: bool) -> None:
+    turned = ",0.01,-0.02,1.5" if attitude else ",,,"
+    rows = [f"{t},35.7275,-78.696,{min(2.0 * t, 40.0)}{turned}" for t in range(60)]
+    (folder / "pose.csv").write_text("t,lat,lon,alt,roll,pitch,yaw\n" + "\n".join(rows) + "\n", encoding="utf-8")
+
+
+def _levels(folder: Path, floor: float | None) -> None:
+    level = [-60.0 - 0.1 * t for t in range(590)]
+    rows = [f"{t / 10},{max(v, floor) if floor is not None else v}" for t, v in enumerate(level)]
+    (folder / "levels_LW1.csv").write_text("t,rss_dbm\n" + "\n".join(rows) + "\n", encoding="utf-8")
+
+
+@pytest.mark.parametrize("attitude", [True, False])
+def test_attitude_height_and_floor_are_proposed(tmp_path: Path, attitude: bool) -> None:
+    _telemetry(tmp_path, attitude=attitude)
+    _levels(tmp_path, -100.0)
+    origin = "2025-06-01T14:00:00Z"
+    named = {"time": "t", "latitude_deg": "lat", "longitude_deg": "lon", "altitude_m": "alt", "roll_deg": "roll",
+             "pitch_deg": "pitch", "yaw_deg": "yaw"}  # fmt: skip
+    files = [
+        *ingest([tmp_path / "pose.csv"], reader="generic_csv",
+                options=ReadOptions(time_origin=origin, kind="telemetry", columns=named)),
+        *ingest([tmp_path / "levels_LW1.csv"], reader="generic_csv",
+                options=ReadOptions(time_origin=origin, kind="rss", columns={"time": "t", "rss_db": "rss_dbm"})),
+    ]  # fmt: skip
+    text, remarks = draft(files, tmp_path, time_origin=origin)
+    settings = parse_yaml(text, FlightFile)
+    assert settings.rt.attitude == ("logged" if attitude else "level")
+    assert any("no attitude" in remark for remark in remarks) is not attitude
+    assert settings.rss.minimum_height_m == 5.0
+    assert settings.logs[1].floor_db == pytest.approx(-99.99)
+    assert any("-100.0 dB?" in remark for remark in remarks)
+
+
+def test_a_receiver_above_its_floor_shows_none(tmp_path: Path) -> None:
+    _levels(tmp_path, None)
+    (file,) = ingest([tmp_path / "levels_LW1.csv"], reader="generic_csv", options=ReadOptions(
+        time_origin="2025-06-01T14:00:00Z", kind="rss", columns={"time": "t", "rss_db": "rss_dbm"}))  # fmt: skip
+    assert receiver_floor_db([s for s in file.result.streams if s.kind == "rss"]) is None

@@ -445,7 +445,7 @@ def test_same_footing_and_residual_tables_are_in_the_metrics(tmp_path: Path) -> 
     rng = np.random.default_rng(4)
     at = np.arange(0, 60, 0.25)
     (one,) = compared_rss(flight(tmp_path, rss={"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}))
-    footing = one.panel.extra["same_footing"]
+    footing = one.panel.extra["averaged"]
     assert footing["coherent"]["0 s"]["rmse_db"] == pytest.approx(one.panel.rmse_db)
     assert footing["power_sum"]["4 s"]["rmse_db"] < footing["power_sum"]["0 s"]["rmse_db"]
     tables = metrics_beyond_panels(FlightResult(rss=(one.result,)))["rss"]["LW1"]["USRP1"]["residual_by"]
@@ -468,7 +468,7 @@ def test_a_local_mean_averages_both_sides_and_all_models(tmp_path: Path) -> None
     rss = {"USRP1": (at, free_space_db(at) + rng.normal(0, 3, len(at)))}
     (as_logged,) = compared_rss(flight(tmp_path, rss=rss))
     (mean,) = compared_rss(flight(tmp_path, rss=rss, rss_keys=", field: local_mean, window_s: 4"))
-    footing = as_logged.panel.extra["same_footing"]["coherent"]["4 s"]
+    footing = as_logged.panel.extra["averaged"]["coherent"]["4 s"]
     assert mean.panel.rmse_db == pytest.approx(footing["rmse_db"], abs=1e-9)
     two_ray = {b.name: b for b in mean.panel.baselines}["two_ray"]
     assert np.nanstd(np.diff(two_ray.level_dbm)) < np.nanstd(np.diff(as_logged.panel.baselines[1].level_dbm))

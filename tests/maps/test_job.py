@@ -17,7 +17,7 @@ from aerpaw_cmp.maps.job import (
 )
 from aerpaw_cmp.maps.study import (
     altitude_variance,
-    honest_study,
+    held_out_study,
     interpolation_study,
     rank_fields,
     rank_study,
@@ -227,7 +227,7 @@ def test_honest_study_is_harder_than_leave_one_out(result):
     heights, rank = rank_fields(result)
     study = rank_study(result)
     flight = np.column_stack([np.linspace(-300, 300, 400), 50 * np.sin(np.linspace(0, 9, 400))])
-    found = honest_study(
+    found = held_out_study(
         GRID, heights, rank, study.fit, trajectory_m=flight, block_m=200.0, learning_sizes=(20, 100, 9999)
     )
     assert found.learning_sizes == (20, 100)

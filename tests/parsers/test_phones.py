@@ -75,6 +75,14 @@ def test_xcal_semicolons_and_decimal_commas() -> None:
     assert rank.frame["rank"].tolist() == [2.0]
 
 
+@pytest.mark.parametrize(("written", "flag"), [("0", "no_csi"), ("9", "ri_out_of_range"), ("1,5", "rank_is_a_mean")])
+def test_a_rank_that_is_none_says_why(written: str, flag: str) -> None:
+    result = read("drive_test", samples.XCAL.replace(b'"-81,5";"2"', b'"-81,5";"%s"' % written.encode()))
+    (rank,) = (one for one in result.streams if one.kind == "rank")
+    assert rank.frame["rank"].isna().all()
+    assert rank.frame["flag"].tolist() == [flag]
+
+
 def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
     result = read("drive_test", samples.GNETTRACK)
     serving = next(one for one in result.streams if one.attributes.get("pci") == 42)

@@ -138,3 +138,14 @@ def test_no_engine_no_audit(report_data):
     assert export.metrics(dataclasses.replace(report_data, engine=None))["rt"] is None
     bare = dataclasses.replace(report_data, engine=Engine(engine="sionna", links=1, seconds=1.0))
     assert export.metrics(bare)["rt"]["audit"] is None
+
+
+def test_rank_csv_holds_what_a_receiver_decides_by(report_data):
+    """Level and ratios of singular values; empty where there is no path, never infinite."""
+    panel = report_data.rank[0]
+    level, ratio = np.full(len(panel.time), -80.0), np.full(len(panel.time), -12.5)
+    level[1], ratio[2] = np.nan, -np.inf
+    table = export.rank_frame([dataclasses.replace(panel, values={"level_dbm": level, "sigma2_over_sigma1_db": ratio})])
+    assert table["level_dbm"].isna().to_numpy().nonzero()[0].tolist() == [1]
+    assert table["sigma2_over_sigma1_db"].isna().to_numpy().nonzero()[0].tolist() == [2]
+    assert table["sigma2_over_sigma1_db"][0] == -12.5

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.site.antennas import read_gain_grid, read_pattern_text
 from aerpaw_cmp.site.dem import read_dem
@@ -117,3 +117,25 @@ def test_mutilated_gain_grids_give_one_message(tmp_path: Path, place: float, spo
     path.write_bytes(content[:at] if truncate else content[:at] + spoil + content[at + len(spoil) :])
     with contextlib.suppress(AerpawCmpError):
         read_gain_grid(path, "g")
+
+
+def test_a_frequency_that_is_no_number_is_no_frequency(tmp_path: Path) -> None:
+    (tmp_path / "p.txt").write_bytes(PATTERN.replace(b"3300", b"330-9223372036854775809"))
+    with contextlib.suppress(AerpawCmpError):
+        assert read_pattern_text(tmp_path / "p.txt") is not None
+
+
+def test_an_integer_beyond_all_floats_is_no_coordinate(tmp_path: Path) -> None:
+    (tmp_path / "m.json").write_bytes(GEOJSON.replace(b'"coordinates": [-78.696', b'"coordinates": [' + b"1" * 400))
+    found = import_footprints([tmp_path / "m.json"], FRAME)
+    assert len(found.buildings) == 1
+    assert any("feature 2 was left out" in action for action in found.actions)
+
+
+@pytest.mark.parametrize("rows", [1, 9])
+def test_rows_that_are_no_grid_over_the_sphere_are_refused(tmp_path: Path, rows: int) -> None:
+    head, _, _ = PATTERN.partition(b"\n0.0")
+    body = b"".join(b"%.5f\t-3.141593\t-3.0103\t-6.0206\t-6.0206\t0.1\t0.1\n" % (i / 9) for i in range(rows))
+    (tmp_path / "p.txt").write_bytes(head + b"\n" + body)
+    with pytest.raises(InputError, match="every phi with every theta"):
+        read_pattern_text(tmp_path / "p.txt")

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from .session import TapStatus
 
 
-class Teller:
+class StatusNotifier:
     """Calls ``on_status`` in a thread of its own, in order; what a hanging terminal cannot take is let go.
 
     Parameters
@@ -24,7 +24,7 @@ class Teller:
         self._thread = threading.Thread(target=self._run, name="tap-status", daemon=True)
         self._thread.start()
 
-    def tell(self, status: TapStatus) -> None:
+    def notify(self, status: TapStatus) -> None:
         """Pass a status on; a mere line is let go while others wait, a message only when memory is full."""
         if status.message or self._queue.qsize() < 10:
             try:
@@ -33,7 +33,7 @@ class Teller:
                 return
 
     def close(self, timeout_s: float = 2.0) -> None:
-        """Tell what waits, but do not wait for a terminal that hangs."""
+        """Pass on what waits, but do not wait for a terminal that hangs."""
         try:
             self._queue.put_nowait(None)
         except queue.Full:

@@ -637,6 +637,36 @@ def map_(
             print(path)
 
 
+@app.command(help=COMMANDS["calibrate"])
+def calibrate(
+    calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn antennas and ground from several flights."""
+    from .jobs import run
+
+    outcome = run.run_calibrate(calibration_yaml, out=out, logs_root=logs_root, force=force, progress=_say)
+    if as_json:
+        _print_json(outcome.metrics)
+        return
+    m = outcome.metrics
+    rows = []
+    for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
+        means = [sum(s[key] for s in scores) / len(scores) if scores else None
+                 for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
+        rows.append([name.replace("_", " "), *(_number(v, "{:.2f}") for v in means), str(len(scores))])
+    _table(
+        ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"], rows, "Scores on what was left out, means"
+    )
+    for text in [*m["words"], *m["warnings"]]:
+        print(text)
+    print(outcome.file)
+    print(outcome.folder / "calibration.html")
+
+
 @app.command(help=COMMANDS["campaign"])
 def campaign(
     campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
@@ -644,6 +674,11 @@ def campaign(
     logs_root: LogsRoot = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that share the flights and settings.")] = 1,
     cluster: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler, in place of processes.")] = None,  # noqa: UP045
+    keep: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder of the outcomes of single tasks; a rerun computes only what is missing there."),
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Keep no outcomes and take none.")] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
@@ -654,7 +689,14 @@ def campaign(
     from .jobs import run
 
     outcome = run.run_campaign(
-        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, force=force, progress=_say
+        campaign_yaml,
+        out=out,
+        logs_root=logs_root,
+        workers=workers,
+        cluster=cluster,
+        keep=None if fresh else keep or run.outcomes_folder(),
+        force=force,
+        progress=_say,
     )
     if as_json:
         _print_json(outcome.metrics)

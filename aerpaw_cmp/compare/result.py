@@ -136,6 +136,8 @@ class RssFurther:
     repeatability: Mapping[str, Repeated]
     foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]
+    simulated_sd_db: float | None = None
+    """Mean of what learned antennas state."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,6 +190,8 @@ class RssResult:
     spans: tuple[ErrorSpan, ...]
     residual_by: Mapping[str, ResidualBins]
     further: RssFurther
+    simulated_sd_db: FloatArray | None = None
+    """Standard deviation (n,) of the simulated level that learned antennas state [dB]."""
 
     @property
     def name(self) -> str:

@@ -33,7 +33,7 @@ from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.settings import RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
-from .levels import Levels, at_samples, levels_of
+from .levels import Levels, at_samples, gain_sd_db, levels_of
 from .replay import FlightReplay, Replayed, direct_foliage_m
 from .what_if import (
     expected_offset,
@@ -95,6 +95,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     position = _positions(replayed)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
+    stated_sd = gain_sd_db(data.site, series.tower, replayed)
     quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = rss.residual_tables(score.residual_db, quantities)
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
@@ -136,7 +137,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
+            simulated_sd_db=None if stated_sd is None else float(np.nanmean(stated_sd)),
         ),
+        simulated_sd_db=stated_sd,
     )
 
 

@@ -581,6 +581,11 @@ class CampaignOutcome:
     nothing_done: bool
 
 
+def outcomes_folder() -> Path:
+    """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
+
+
 def run_campaign(
     path: Path,
     *,
@@ -588,6 +593,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    keep: Path | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
@@ -605,6 +611,8 @@ def run_campaign(
         Processes.
     cluster : str, optional
         Address of a Dask scheduler, in place of processes.
+    keep : Path, optional
+        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
     force : bool
         Write into a folder that holds files of others.
     progress : Progress
@@ -635,6 +643,7 @@ def run_campaign(
             logs_root=logs_root,
             workers=workers,
             cluster=cluster,
+            keep=keep,
             stage=stages,
             progress=progress,
         )
@@ -646,3 +655,56 @@ def run_campaign(
         failed.append(f"held-out fit: {data.held_out_failure}")
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateOutcome:
+    """What ``aerpaw-cmp calibrate`` made: the settings file, its folder, metrics.json as a dict."""
+
+    file: Path
+    folder: Path
+    metrics: dict[str, Any]
+
+
+def run_calibrate(
+    path: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> CalibrateOutcome:
+    """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    from ..flight.settings import load_flight
+    from ..report.calibration_html import calibration_metrics
+    from .calibrate import calibrate, load_calibration
+    from .calibration_files import MARK, write_files
+
+    settings = load_calibration(path)
+    target = out or Path(f"{settings.calibration}.calibrated.yaml")
+    if target.suffix.lower() not in (".yaml", ".yml"):
+        raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
+    inputs = input_files(settings, path, logs_root)
+    for name in settings.flights:
+        inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
+
+    def own(file: Path) -> bool:
+        return file.read_bytes().startswith(MARK.encode())
+
+    folder = target.with_suffix("")
+    stages = Stages(progress)
+    with (
+        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
+    ):
+        found = calibrate(path, logs_root=logs_root, stages=stages)
+        with output.filling() as place:
+            record, text = write_files(found, place, folder.name, stages.seconds)
+        file.write(text.encode())
+    return CalibrateOutcome(target, folder, calibration_metrics(record))

@@ -136,7 +136,8 @@ def rss_panel(result: RssResult) -> record.RssPanel:
             f"simulated_{name.replace(' ', '_')}_dbm": result.variants[name].level_dbm
             for name in FOLIAGE_RUNS
             if name in result.variants
-        },
+        }
+        | ({} if result.simulated_sd_db is None else {"simulated_sd_db": result.simulated_sd_db}),
     )
 
 

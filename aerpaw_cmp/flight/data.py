@@ -441,14 +441,14 @@ def _check_overlap(data: FlightData) -> None:
             raise InputError(
                 f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
                 expected="logs of the same flight",
-                cause=_clock_cause(data, time, start, end),
+                cause=_clock_cause(data.settings.timezone, time, start, end),
             )
 
 
-def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:
     trap = None
     if len(time):
-        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+        trap = clock_trap((time.min(), time.max()), (start, end), timezone)
     if trap is None:
         return "logs of different flights, or a wrong 'timezone' or 'clock'"
     return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,7 +31,7 @@ from ..compare.result import (
     RssResult,
 )
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.settings import RssSettings, RtSettings
+from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .levels import Levels, at_samples, gain_sd_db, levels_of
@@ -133,7 +134,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
-            expected_offset=_expected(data, series, score.offset_db),
+            expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
@@ -216,8 +217,10 @@ def _averaged(
     }
 
 
-def _expected(data: FlightData, series: RssSeries, offset_db: float) -> ExpectedOffset | None:
-    found = expected_offset(data.settings.rss.reference_powers, data.folder, series)
+def _expected(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
+) -> ExpectedOffset | None:
+    found = expected_offset(budget, folder, series)
     if found is None:
         return None
     expected, received, sent = found

@@ -18,6 +18,7 @@ from .forecast import ForecastScore
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
 
@@ -318,4 +319,5 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()

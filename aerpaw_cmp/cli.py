@@ -149,6 +149,11 @@ def ingest(
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
     ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    columns: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
+    ] = None,
+    unit: Annotated[Optional[str], typer.Option(help="Unit of levels where the file does not fix it.")] = None,  # noqa: UP045
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -158,7 +163,10 @@ def ingest(
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
-    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
+    if columns:
+        options |= run.mapping(columns)
+        reader = reader or "generic_csv"
     summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
     if as_json:
         _print_json(summary)
@@ -172,7 +180,8 @@ def ingest(
     if draft is not None:
         for remark in summary["draft"]:
             _say(remark)
-        print(f"wrote {draft}")
+        for place in summary["drafts"]:
+            print(f"wrote {place}")
 
 
 @app.command(help=COMMANDS["formats"])
@@ -637,6 +646,36 @@ def map_(
             print(path)
 
 
+@app.command(help=COMMANDS["calibrate"])
+def calibrate(
+    calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn antennas and ground from several flights."""
+    from .jobs import run
+
+    outcome = run.run_calibrate(calibration_yaml, out=out, logs_root=logs_root, force=force, progress=_say)
+    if as_json:
+        _print_json(outcome.metrics)
+        return
+    m = outcome.metrics
+    rows = []
+    for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
+        means = [sum(s[key] for s in scores) / len(scores) if scores else None
+                 for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
+        rows.append([name.replace("_", " "), *(_number(v, "{:.2f}") for v in means), str(len(scores))])
+    _table(
+        ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"], rows, "Scores on what was left out, means"
+    )
+    for text in [*m["words"], *m["warnings"]]:
+        print(text)
+    print(outcome.file)
+    print(outcome.folder / "calibration.html")
+
+
 @app.command(help=COMMANDS["campaign"])
 def campaign(
     campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
@@ -644,6 +683,11 @@ def campaign(
     logs_root: LogsRoot = None,
     workers: Annotated[int, typer.Option(min=1, help="Processes that share the flights and settings.")] = 1,
     cluster: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler, in place of processes.")] = None,  # noqa: UP045
+    keep: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="Folder of the outcomes of single tasks; a rerun computes only what is missing there."),
+    ] = None,
+    fresh: Annotated[bool, typer.Option("--fresh", help="Keep no outcomes and take none.")] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
@@ -654,7 +698,14 @@ def campaign(
     from .jobs import run
 
     outcome = run.run_campaign(
-        campaign_yaml, out=out, logs_root=logs_root, workers=workers, cluster=cluster, force=force, progress=_say
+        campaign_yaml,
+        out=out,
+        logs_root=logs_root,
+        workers=workers,
+        cluster=cluster,
+        keep=None if fresh else keep or run.outcomes_folder(),
+        force=force,
+        progress=_say,
     )
     if as_json:
         _print_json(outcome.metrics)

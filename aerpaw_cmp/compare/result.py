@@ -17,6 +17,7 @@ from .field_difference import FieldAudit
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
 
@@ -136,6 +137,8 @@ class RssFurther:
     repeatability: Mapping[str, Repeated]
     foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]
+    simulated_sd_db: float | None = None
+    """Mean of what learned antennas state."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -188,6 +191,8 @@ class RssResult:
     spans: tuple[ErrorSpan, ...]
     residual_by: Mapping[str, ResidualBins]
     further: RssFurther
+    simulated_sd_db: FloatArray | None = None
+    """Standard deviation (n,) of the simulated level that learned antennas state [dB]."""
 
     @property
     def name(self) -> str:
@@ -309,4 +314,5 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()

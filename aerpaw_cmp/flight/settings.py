@@ -41,7 +41,7 @@ class Settings(BaseModel):
 class AntennaSettings(Settings):
     """An element pattern: a named model, or a measured file."""
 
-    model: Literal["iso", "dipole", "tr38901", "file", "gain_grid"] = "iso"
+    model: Literal["iso", "dipole", "tr38901", "file", "gain_grid", "sphere"] = "iso"
     file: str | None = None
     variable: str | None = None
     """Name of the grid inside a .mat file."""
@@ -59,8 +59,8 @@ class AntennaSettings(Settings):
 
     @model_validator(mode="after")
     def _file_where_needed(self) -> AntennaSettings:
-        if (self.file is None) != (self.model not in ("file", "gain_grid")):
-            raise ValueError("'file' belongs to model 'file' or 'gain_grid', and only there")
+        if (self.file is None) != (self.model not in ("file", "gain_grid", "sphere")):
+            raise ValueError("'file' belongs to model 'file', 'gain_grid' or 'sphere', and only there")
         return self
 
 
@@ -137,6 +137,10 @@ def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
         return antennas.TR38901()
     if settings.model == "file":
         return antennas.read_pattern_text(folder / str(settings.file), polarised=settings.polarised)
+    if settings.model == "sphere":
+        from ..site.sphere_pattern import read_sphere_csv
+
+        return read_sphere_csv(folder / str(settings.file))
     if settings.model == "gain_grid":
         if settings.variable is None:
             raise UsageError("a gain grid without 'variable'", expected="the name of the grid inside the .mat file")
@@ -225,6 +229,8 @@ class LogSettings(Settings):
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
+    cells: dict[int, str] = {}
+    """Tower of each cell, by PCI; where it is given, cells that it does not name are left out."""
     skip: list[str] = []
     """Streams of the file to leave out, by name."""
 

@@ -25,6 +25,9 @@ MAXIMUM_GAP_S = 3.0
 COURSE_SPEED_MPS = 1.0
 """Below this ground speed the course says nothing about the heading [m/s]."""
 
+COURSE_SPAN_S = 2.0
+"""Positions this long before and after give a velocity that is not logged [s]."""
+
 REASONS = ("", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time")
 """Why a pose is not valid; index 0 is a valid pose."""
 
@@ -313,7 +316,15 @@ class Track:
             raised[valid] = position[valid, 2] < floor
             position[raised, 2] = floor
         reason = np.asarray(REASONS)[code]
-        return TrackPoses(position, rotation, valid, reason, known, raised, velocity)
+        return TrackPoses(
+            position_m=position,
+            rotation=rotation,
+            valid=valid,
+            reason=reason,
+            attitude_known=known,
+            raised=raised,
+            velocity_mps=velocity,
+        )
 
     def _codes(self, t: FloatArray) -> AnyArray:
         """Index into :data:`REASONS` for every instant."""
@@ -375,10 +386,16 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
 
 
 def _velocities(t: FloatArray, position: FloatArray, logged: FloatArray) -> FloatArray:
-    """Logged velocities (east, north, up); where missing or never moving, differences of position."""
+    """Logged velocities (east, north, up); where missing or never moving, differences of position over 4 s.
+
+    Over shorter times the differences are those of the position's noise: at 10 Hz a hover then has a speed.
+    """
     if len(t) < 2:
         return np.where(np.isfinite(logged), logged, 0.0)
-    derived = np.gradient(position, t, axis=0)
+    early, late = np.maximum(t - COURSE_SPAN_S, t[0]), np.minimum(t + COURSE_SPAN_S, t[-1])
+    early, late = np.minimum(early, np.append(t[0], t[:-1])), np.maximum(late, np.append(t[1:], t[-1]))
+    moved = np.column_stack([np.interp(late, t, p) - np.interp(early, t, p) for p in position.T])
+    derived = moved / (late - early)[:, None]
     missing = np.asarray(~np.isfinite(logged).all(axis=1))
     if not np.any(logged[~missing]):  # converters write (0, 0, 0) for "unknown"
         missing[:] = True

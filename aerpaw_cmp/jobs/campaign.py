@@ -7,9 +7,12 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 from __future__ import annotations
 
 import dataclasses
+import sys
+import tempfile
+from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor
-from contextlib import nullcontext
+from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
+from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import lru_cache
@@ -26,6 +29,7 @@ from ..common.stages import Progress, silent
 from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
+from ..compare import rank, result, rss, statistics
 from ..compare.offset import Pooling, pooled_offsets
 from ..compare.rank import repeat_rank
 from ..compare.result import FlightResult, RankResult, RssResult
@@ -33,6 +37,7 @@ from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Positive, RssSettings, Settings, load_flight
+from ..report import campaign_data
 from ..report.campaign_data import (
     CampaignData,
     Failure,
@@ -47,6 +52,7 @@ from ..report.campaign_data import (
 )
 from .campaign_fit import fit_all
 from .flight_run import run_flight
+from .outcomes import OutcomeStore, records_of, task_key
 
 Stage = Callable[[str], Any]
 
@@ -291,7 +297,13 @@ def cluster_executor(address: str) -> Executor:
     return executor
 
 
-def run_tasks(tasks: Sequence[Task], workers: int, cluster: str | None, progress: Progress) -> list[Outcome]:
+TRIES = 2
+"""A task in work when a worker is lost is tried again; after so many tries once more, alone; then it is a failure."""
+
+
+def run_tasks(
+    tasks: Sequence[Task], workers: int, cluster: str | None, progress: Progress, keep: Path | None = None
+) -> list[Outcome]:
     """All tasks in order: here, in a pool of processes, or on a cluster.
 
     Parameters
@@ -303,36 +315,111 @@ def run_tasks(tasks: Sequence[Task], workers: int, cluster: str | None, progress
         Address of a Dask scheduler, in place of processes.
     progress : Progress
         Gets a line per finished task.
+    keep : Path, optional
+        Folder of outcomes: what stands there is taken, what is computed is put there as soon as it is done.
 
     Returns
     -------
     list of Outcome
         In the order of the tasks; what goes wrong in one is its failure.
     """
+    store, keys = (None, {}) if keep is None else _kept(tasks, keep)
+    found: dict[int, Outcome] = {}
+    if store is not None:
+        found = {i: outcome for i, key in keys.items() if (outcome := store.load(key)) is not None}
+        for text in store.told:
+            progress(text)
+        if found:
+            progress(f"{len(found)} of {len(tasks)} outcomes are kept from before")
+
+    def done(number: int, outcome: Outcome) -> None:
+        found[number] = outcome
+        if store is not None and outcome.failure is None and number in keys:
+            store.save(keys[number], outcome)
+        progress(f"{tasks[number].flight}: {tasks[number].setting}", len(found) / len(tasks))
+
+    todo = [i for i in range(len(tasks)) if i not in found]
     if cluster is None and workers <= 1:
-        out = []
-        for task in tasks:
-            progress(f"{task.flight}: {task.setting}")
-            out.append(run_task(task))
-        return out
-    pool: Executor
-    if cluster is not None:
-        pool = cluster_executor(cluster)
-    else:
-        # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-        pool = ProcessPoolExecutor(max_workers=min(workers, len(tasks)), mp_context=get_context("spawn"))
-    with pool:
-        futures = [pool.submit(run_task, task) for task in tasks]
-        outcomes = []
-        for task, future in zip(tasks, futures, strict=True):
-            error = future.exception()
-            if error is None:
-                outcomes.append(future.result())
+        for i in todo:
+            done(i, run_task(tasks[i]))
+    elif cluster is not None:
+        with cluster_executor(cluster) as pool:
+            _collect(pool, tasks, todo, done)
+    elif todo:
+        _in_processes(tasks, todo, workers, done)
+    return [found[i] for i in range(len(tasks))]
+
+
+def _kept(tasks: Sequence[Task], keep: Path) -> tuple[OutcomeStore, dict[int, str]]:
+    """The store, and the key of every task whose inputs can be read."""
+    keys = {}
+    for number, task in enumerate(tasks):
+        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
+            settings = overridden(load_flight(task.path), task.overrides)
+            more = (task.flight, task.setting, task.reference)
+            keys[number] = task_key(settings, task.path, task.logs_root, *more)
+    return OutcomeStore(keep, records_of(sys.modules[__name__], campaign_data, rank, result, rss, statistics)), keys
+
+
+def _collect(pool: Executor, tasks: Sequence[Task], todo: Sequence[int], done: Callable[[int, Outcome], None]) -> None:
+    """Outcomes of a pool as they come; a lost one is a failure."""
+    futures = {pool.submit(run_task, tasks[i]): i for i in todo}
+    for future in as_completed(futures):
+        error = future.exception()
+        done(futures[future], future.result() if error is None else _lost(tasks[futures[future]], error))
+
+
+def _lost(task: Task, error: BaseException) -> Outcome:
+    text = f"its worker process ended: {error or type(error).__name__}"
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
+
+
+def _in_processes(
+    tasks: Sequence[Task], todo: Sequence[int], workers: int, done: Callable[[int, Outcome], None]
+) -> None:
+    """A pool of processes that is made anew when a worker is lost: only what was running is tried again.
+
+    A pool breaks as a whole, and does not say whose process ended. Each task leaves a mark when it begins, so that
+    those in work are known; the others lost nothing. A task that was in work twice when a worker was lost runs a last
+    time alone, so that it does not pay for its neighbour.
+    """
+    tries: Counter[int] = Counter()
+    waiting = list(todo)
+    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-tasks-") as marks:
+        while waiting:
+            together = [i for i in waiting if tries[i] < TRIES] or waiting[:1]
+            lost = _round(tasks, together, min(workers, len(together)), Path(marks), done)
+            for number, error in lost.items():
+                mark = Path(marks) / str(number)
+                if mark.exists():
+                    mark.unlink()
+                    tries[number] += 1
+                if tries[number] > TRIES:
+                    done(number, _lost(tasks[number], error))
+            waiting = [i for i in waiting if (i in lost and tries[i] <= TRIES) or i not in together]
+
+
+def _round(
+    tasks: Sequence[Task], numbers: Sequence[int], workers: int, marks: Path, done: Callable[[int, Outcome], None]
+) -> dict[int, BaseException]:
+    """One pool, until it is through or breaks; gives the tasks that it did not finish."""
+    lost: dict[int, BaseException] = {}
+    # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
+    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
+        futures = {pool.submit(_marked, tasks[i], str(marks / str(i))): i for i in numbers}
+        for future in as_completed(futures):
+            number, error = futures[future], future.exception()
+            if isinstance(error, BrokenExecutor):
+                lost[number] = error
             else:
-                text = f"its worker process ended: {error or type(error).__name__}"
-                outcomes.append(Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text)))
-            progress(f"{task.flight}: {task.setting}")
-        return outcomes
+                done(number, future.result() if error is None else _lost(tasks[number], error))
+    return lost
+
+
+def _marked(task: Task, mark: str) -> Outcome:
+    """Run a task; its mark stands from its beginning on."""
+    Path(mark).touch()
+    return run_task(task)
 
 
 # --- over all flights -----------------------------------------------------------------------------------------------
@@ -508,6 +595,7 @@ def run(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    keep: Path | None = None,
     stage: Stage = lambda _name: nullcontext(),
     progress: Progress = silent,
 ) -> CampaignData:
@@ -524,6 +612,8 @@ def run(
         Processes.
     cluster : str, optional
         Address of a Dask scheduler, in place of processes here.
+    keep : Path, optional
+        Folder of outcomes, taken and added to.
     stage, progress : callable
         A context manager per named stage; lines of progress.
 
@@ -541,7 +631,7 @@ def run(
     ]
     _check_names(campaign, files, failures)
     with stage("flights"):
-        outcomes = run_tasks(tasks, workers, cluster, progress) if tasks else []
+        outcomes = run_tasks(tasks, workers, cluster, progress, keep) if tasks else []
     failures += [o.failure for o in outcomes if o.failure is not None]
     with stage("pool"):
         rows, pooled = pool_offsets([row for o in outcomes for row in o.rss], campaign.calibration)

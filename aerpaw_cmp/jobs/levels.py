@@ -10,6 +10,7 @@ from ..common.units import BoolArray, FloatArray
 from ..compare import rss
 from ..flight.data import RssSeries
 from ..flight.settings import RssSettings
+from ..site.site import Site
 from .replay import Replayed
 
 
@@ -57,3 +58,24 @@ def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, sett
     """
     level = replayed.spread(level_db)
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
+
+
+def gain_sd_db(site: Site, tower: str, replayed: Replayed) -> FloatArray | None:
+    """Standard deviation (n,) [dB] of the simulated level that learned antennas state, along the direct line.
+
+    The two ends count as independent; they are learned from the same levels, so the true one is rather smaller.
+    None where neither antenna states one.
+    """
+    link, poses = replayed.link, replayed.poses
+    ray = poses.position_m - site.towers[tower].position_m
+    at_uav = np.einsum("nji,nj->ni", poses.rotation, -ray)
+    square = np.zeros(len(ray))
+    stated = False
+    for array, direction in ((link.tower_arrays[tower], ray), (link.uav_array, at_uav)):
+        own = direction @ array.mount
+        sd = getattr(array.patterns[0], "gain_sd_db", None)
+        if sd is not None:
+            stated = True
+            theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
+            square += sd(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
+    return replayed.spread(np.sqrt(square)) if stated else None

@@ -16,6 +16,31 @@ from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
 from ..site.site import Site
 
+_KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
+
+
+def mapping(pairs: list[str]) -> dict[str, Any]:
+    """Reader options of ``--map COLUMN=quantity``: the columns, and the kind of record that they make.
+
+    ``rank`` stands for a rank indicator that counts from one.
+
+    Raises
+    ------
+    UsageError
+        If a pair is none, or two name one quantity.
+    """
+    found: dict[str, str] = {}
+    for pair in pairs:
+        column, mark, quantity = pair.rpartition("=")
+        quantity = {"rank": "ri_raw"}.get(quantity.strip(), quantity.strip())
+        if not mark or not column or not quantity:
+            raise UsageError(f"--map {pair!r}", expected="COLUMN=quantity, e.g. --map 'Power (dBm)=rss_db'")
+        if quantity in found:
+            raise UsageError(f"--map names two columns for {quantity!r}", expected="one column per quantity")
+        found[quantity] = column.strip()
+    kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in found), "telemetry")
+    return {"columns": found, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}
+
 
 def run_ingest(
     paths: list[Path],
@@ -56,15 +81,25 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
         if draft is not None:
-            from ..flight.draft import draft as draft_of
+            from ..flight.draft import drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
             told = {key: options.get(key) for key in ("timezone", "time_origin")}
-            text, account["draft"] = draft_of(files, drafted.target.parent, **told)
-            drafted.write(sealed(text))
+            named = ("columns", "kind", "unit", "ri_base")
+            told["mapping"] = {key: options[key] for key in named if options.get(key)}
+            made = drafts(files, drafted.target.parent, **told)
+            account["draft"] = list(made[0].remarks)
+            drafted.write(sealed(made[0].text))
+            account["drafts"] = [str(draft)]
+            for number, further in enumerate(made[1:], 2):
+                place = draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
+                other = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
+                other.write(sealed(further.text))
+                account["drafts"].append(str(place))
+                account["draft"] += [f"{place.name}: {remark}" for remark in further.remarks]
         if target is not None:
             target.write(flight_bytes(files))
     return account
@@ -581,6 +616,11 @@ class CampaignOutcome:
     nothing_done: bool
 
 
+def outcomes_folder() -> Path:
+    """Where outcomes are kept by default: ``AERPAW_CMP_CACHE``, else the user's cache folder."""
+    return Path(os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp") / "outcomes"
+
+
 def run_campaign(
     path: Path,
     *,
@@ -588,6 +628,7 @@ def run_campaign(
     logs_root: Path | None = None,
     workers: int = 1,
     cluster: str | None = None,
+    keep: Path | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
@@ -605,6 +646,8 @@ def run_campaign(
         Processes.
     cluster : str, optional
         Address of a Dask scheduler, in place of processes.
+    keep : Path, optional
+        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
     force : bool
         Write into a folder that holds files of others.
     progress : Progress
@@ -635,6 +678,7 @@ def run_campaign(
             logs_root=logs_root,
             workers=workers,
             cluster=cluster,
+            keep=keep,
             stage=stages,
             progress=progress,
         )
@@ -646,3 +690,56 @@ def run_campaign(
         failed.append(f"held-out fit: {data.held_out_failure}")
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+
+
+@dataclass(frozen=True, slots=True)
+class CalibrateOutcome:
+    """What ``aerpaw-cmp calibrate`` made: the settings file, its folder, metrics.json as a dict."""
+
+    file: Path
+    folder: Path
+    metrics: dict[str, Any]
+
+
+def run_calibrate(
+    path: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> CalibrateOutcome:
+    """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
+    """
+    from ..flight.settings import load_flight
+    from ..report.calibration_html import calibration_metrics
+    from .calibrate import calibrate, load_calibration
+    from .calibration_files import MARK, write_files
+
+    settings = load_calibration(path)
+    target = out or Path(f"{settings.calibration}.calibrated.yaml")
+    if target.suffix.lower() not in (".yaml", ".yml"):
+        raise UsageError("the output is no YAML file", expected="-o NAME.yaml", path=target)
+    inputs = input_files(settings, path, logs_root)
+    for name in settings.flights:
+        inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
+
+    def own(file: Path) -> bool:
+        return file.read_bytes().startswith(MARK.encode())
+
+    folder = target.with_suffix("")
+    stages = Stages(progress)
+    with (
+        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
+    ):
+        found = calibrate(path, logs_root=logs_root, stages=stages)
+        with output.filling() as place:
+            record, text = write_files(found, place, folder.name, stages.seconds)
+        file.write(text.encode())
+    return CalibrateOutcome(target, folder, calibration_metrics(record))

@@ -132,9 +132,9 @@ def test_gzip_members_are_joined(tmp_path: Path) -> None:
         (bytes(range(256)) * 20, "binary content"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0\nsize 1\n", "Git-LFS pointer"),
         (b"hello, world\n", "no reader knows this content: 'hello, world'"),
-        (gzip.compress(b"hello")[:-6], "gzip file ends too early"),
+        (gzip.compress(b"hello", mtime=0)[:-6], "gzip file ends too early"),
         (b"\x1f\x8b\x08\x00rubbish", "gzip"),
-        (gzip.compress(b""), "empty"),
+        (gzip.compress(b"", mtime=0), "empty"),
     ],
 )
 def test_a_named_file_that_is_no_log(tmp_path: Path, content: bytes, message: str) -> None:
@@ -184,10 +184,9 @@ def test_no_permission(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_size_caps(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(room, "MAX_BYTES", 1000)
-    (tmp_path / "big.txt").write_bytes(VEHICLE * 4)
+    (tmp_path / "big.txt").write_bytes(VEHICLE * 40)
     (tmp_path / "bomb.gz").write_bytes(gzip.compress(b"1" * 100_000))
-    with pytest.raises(InputError, match="at most 1000"):
-        ingest(tmp_path / "big.txt", options=OPTIONS)
+    assert ingest(tmp_path / "big.txt", options=OPTIONS)[0].result.accepted == 120, "no size is refused"
     with pytest.raises(InputError, match="unpacks to more than 1000"):
         ingest(tmp_path / "bomb.gz", options=OPTIONS)
 
@@ -238,8 +237,7 @@ def test_symlink_loops_end(tmp_path: Path) -> None:
 
 def test_a_flight_file_is_not_a_log_and_a_folder_says_why_nothing_was_read(tmp_path: Path) -> None:
     write_flight(tmp_path / "flight.h5", [])
-    with pytest.raises(InputError, match="read_flight"):
-        ingest(tmp_path / "flight.h5")
+    assert ingest(tmp_path / "flight.h5") == []
     with pytest.raises(InputError, match=r"no log that a reader knows \(1 file looked at\); flight.h5: an HDF5 file"):
         ingest(tmp_path)
     with pytest.raises(InputError, match="no log that reader 'vehicle_out' can read"):

@@ -1,0 +1,301 @@
+"""What flights teach about antennas, and how well it carries over to flights, heights and directions left out."""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from ..common.errors import InputError
+from ..common.units import BoolArray, FloatArray
+from .direction_gain import Choice, GainFit, GainModel, LinkSamples, Term, choose_model, fit_gain
+from .mount import GainOf, MountFit, fit_mounts
+from .rss import local_mean_db
+
+SECTORS = 6
+GUARD_DEG = 10.0
+"""Directions this near a left-out sector are not learned from either."""
+
+STRETCHES = 8
+GUARD_S = 20.0
+CRUISE_M = 5.0
+LEAST_SAMPLES = 50
+
+SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out")
+
+
+@dataclass(frozen=True, slots=True)
+class Observed:
+    """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg]."""
+
+    samples: LinkSamples
+    free_space_db: FloatArray
+    heading_deg: FloatArray
+
+    def part(self, keep: BoolArray) -> Observed:
+        """Some of the samples."""
+        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep])
+
+
+@dataclass(frozen=True, slots=True)
+class Recipe:
+    """What is learned.
+
+    Parameters
+    ----------
+    model : GainModel
+        Terms and where their strengths start.
+    patterns : mapping of str to callable
+        Gain of measured patterns in the device frame: ``uav`` and antennas (``tower.channel``); may be empty.
+    rotation : callable
+        ``(yaw, pitch, roll)`` [deg] to a mount (3, 3).
+    mount, tilt : bool
+        Fit the azimuth, and pitch and roll, of antennas with a pattern.
+    """
+
+    model: GainModel
+    rotation: Callable[[float, float, float], FloatArray]
+    patterns: Mapping[str, GainOf] = field(default_factory=dict)
+    mount: bool = True
+    tilt: bool = False
+
+
+@dataclass(frozen=True, slots=True)
+class Learned:
+    """The outcome of :func:`learn`."""
+
+    recipe: Recipe
+    choice: Choice
+    mounts: Mapping[str, MountFit]
+    fit: GainFit | None
+
+    def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
+        """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
+        pattern = self.recipe.patterns.get(name)
+        if pattern is None:
+            return np.zeros(len(direction))
+        mount = self.mounts.get(name)
+        angles = (0.0, 0.0, 0.0) if mount is None else (mount.azimuth_deg, mount.pitch_deg, mount.roll_deg)
+        return pattern(direction @ self.recipe.rotation(*angles))
+
+    def predict(self, samples: LinkSamples) -> tuple[FloatArray, FloatArray]:
+        """Gain of both ends and its standard deviation (n,) [dB], about a mean that the offset takes."""
+        known = self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+        if self.fit is None:
+            return known, np.zeros(len(known))
+        gain, sd = self.fit.predict(samples)
+        return known + gain, sd
+
+
+def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None = None) -> Learned:
+    """Mounts, then the gain over direction on top of the patterns.
+
+    Parameters
+    ----------
+    series : sequence of LinkSamples
+        Residuals against free space of the flights to learn from, and no other.
+    recipe : Recipe
+    choice : Choice, optional
+        Strengths that were chosen on the same flights; chosen anew without.
+    """
+    names = ["uav", *dict.fromkeys(s.antenna for s in series)]
+    patterns = {name: recipe.patterns[name] for name in names if name in recipe.patterns}
+    mounts = fit_mounts(series, patterns, recipe.rotation, tilt=recipe.tilt) if patterns and recipe.mount else {}
+    bare = Learned(recipe, Choice(recipe.model, 1.0, {}, 1.0), mounts, None)
+    if not recipe.model.terms:
+        return bare
+    left = [dataclasses.replace(s, residual_db=s.residual_db - bare.predict(s)[0]) for s in series]
+    choice = choice or choose_model(left, recipe.model)
+    return Learned(recipe, choice, mounts, fit_gain(left, choice.model))
+
+
+@dataclass(frozen=True, slots=True)
+class Score:
+    """Error of one flight and channel that had no part in the fit, after one offset [dB].
+
+    ``rmse_4s_db``: both sides averaged in power over 4 s. ``within_2sd``: share of samples whose error is within two
+    standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured minus predicted, mean.
+    """
+
+    flight: str
+    tower: str
+    channel: str
+    rmse_db: float
+    rmse_4s_db: float
+    free_space_rmse_db: float
+    n: int
+    offset_db: float = math.nan
+    within_2sd: float = math.nan
+
+
+def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = None) -> Score | None:
+    """Score of a prediction; None with fewer than 50 samples to score."""
+    s = observed.samples
+    error = s.residual_db - gain_db
+    good = np.isfinite(error)
+    if good.sum() < LEAST_SAMPLES:
+        return None
+    time, free, left = s.time_s[good], observed.free_space_db[good], error[good]
+    measured, level = s.residual_db[good] + free, gain_db[good] + free
+    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, level, 4.0)
+    inside = math.nan if sd_db is None else float(np.mean(np.abs(left - left.mean()) < 2.0 * sd_db[good]))
+    return Score(
+        flight=s.flight,
+        tower=s.tower,
+        channel=s.channel,
+        rmse_db=float(left.std()),
+        rmse_4s_db=float(means.std()),
+        free_space_rmse_db=float(s.residual_db[good].std()),
+        n=int(good.sum()),
+        offset_db=float(left.mean()),
+        within_2sd=inside,
+    )
+
+
+def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
+    """Mean over flights and channels [dB]; NaN without any."""
+    return float(np.mean([getattr(s, name) for s in scores])) if scores else math.nan
+
+
+def flights_of(observed: Sequence[Observed]) -> list[str]:
+    """Names in order."""
+    return list(dict.fromkeys(o.samples.flight for o in observed))
+
+
+def flight_left_out(
+    observed: Sequence[Observed], recipe: Recipe, kept: dict[str, Learned] | None = None
+) -> tuple[Score, ...]:
+    """Each flight predicted from all others; ``kept`` receives what was learned without each flight."""
+    out = []
+    for flight in flights_of(observed):
+        train = [o.samples for o in observed if o.samples.flight != flight]
+        learned = learn(train, recipe)
+        if kept is not None:
+            kept[flight] = learned
+        known = {s.antenna for s in train}
+        for o in observed:
+            if o.samples.flight == flight and o.samples.antenna in known:
+                gain, sd = learned.predict(o.samples)
+                model = learned.choice.model
+                whole = np.sqrt(sd**2 + model.own_sd_db**2 + model.noise_sd_db**2)
+                out.append(score(o, gain, whole if learned.fit else None))
+    return tuple(s for s in out if s is not None)
+
+
+Parts = Callable[[Observed, Observed], list[tuple[BoolArray, BoolArray]]]
+"""``parts(scored, other)``: per part the samples (n,) of the scored series in it, and those (m,) of another series that
+may be learned from."""
+
+
+def parts_left_out(
+    observed: Sequence[Observed], recipe: Recipe, kept: Mapping[str, Learned], parts: Parts, *, own: bool
+) -> tuple[Score, ...]:
+    """Each flight predicted part by part, from other flights without what is like the part.
+
+    ``own``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples outside
+    it, so that nothing of the part is fitted.
+    """
+    out = []
+    for flight in flights_of(observed):
+        mine = [o for o in observed if o.samples.flight == flight]
+        others = list(observed) if own else [o for o in observed if o.samples.flight != flight]
+        stitched = [np.full(len(o.samples), np.nan) for o in mine]
+        for k in range(len(parts(mine[0], mine[0]))):
+            train = [o.part(parts(mine[0], o)[k][1]).samples for o in others]
+            train = [s for s in train if np.isfinite(s.residual_db).sum() >= LEAST_SAMPLES]
+            if not train or not any(parts(o, o)[k][0].any() for o in mine):
+                continue
+            try:
+                learned = learn(train, recipe, kept[flight].choice)
+            except InputError:
+                continue
+            known = {s.antenna for s in train}
+            for o, whole in zip(mine, stitched, strict=True):
+                inside, outside = parts(o, o)[k]
+                if o.samples.antenna not in known or not inside.any():
+                    continue
+                gain = learned.predict(o.samples)[0]
+                rest = (o.samples.residual_db - gain)[outside]
+                if np.isfinite(rest).sum() >= LEAST_SAMPLES:
+                    whole[inside] = gain[inside] + np.nanmean(rest)
+        out += [score(o, whole) for o, whole in zip(mine, stitched, strict=True)]
+    return tuple(s for s in out if s is not None)
+
+
+def altitude_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """The commonest height of the scored flight, and all other heights."""
+    height = scored.samples.position_m[:, 2]
+    whole, count = np.unique(np.round(height), return_counts=True)
+    cruise = float(whole[count.argmax()])
+    mine = np.abs(height - cruise) < CRUISE_M
+    return [(mine, np.abs(other.samples.position_m[:, 2] - cruise) >= CRUISE_M)]
+
+
+def sector_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Sectors of azimuth at the tower, with a guard."""
+
+    def azimuth(o: Observed) -> FloatArray:
+        return np.degrees(np.arctan2(o.samples.at_tower[:, 1], o.samples.at_tower[:, 0]))
+
+    return _angular(azimuth(scored), azimuth(other), SECTORS, GUARD_DEG)
+
+
+def heading_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Eighths of the compass for the nose, with a guard."""
+    return _angular(scored.heading_deg, other.heading_deg, 8, GUARD_DEG)
+
+
+def _angular(mine: FloatArray, others: FloatArray, count: int, guard_deg: float) -> list[tuple[BoolArray, BoolArray]]:
+    half = 180.0 / count
+    out = []
+    for k in range(count):
+        centre = 2.0 * half * (k + 0.5)
+        near = np.abs((mine - centre + 180.0) % 360.0 - 180.0) <= half
+        far = np.abs((others - centre + 180.0) % 360.0 - 180.0) > half + guard_deg
+        out.append((near, far))
+    return out
+
+
+def route_parts(scored: Observed, other: Observed) -> list[tuple[BoolArray, BoolArray]]:
+    """Stretches of the scored flight in time, with a guard; other flights count whole."""
+    time = scored.samples.time_s
+    edges = np.linspace(time.min(), time.max() + 1e-6, STRETCHES + 1)
+    out = []
+    for low, high in itertools.pairwise(edges):
+        mine = (time >= low) & (time < high)
+        if other.samples.flight == scored.samples.flight:
+            there = other.samples.time_s
+            outside = (there < low - GUARD_S) | (there >= high + GUARD_S)
+        else:
+            outside = np.ones(len(other.samples), np.bool_)
+        out.append((mine, outside))
+    return out
+
+
+def world_frame(observed: Sequence[Observed]) -> list[Observed]:
+    """Control: the UAV's term in the world's axes, where no antenna of it is fixed."""
+    return [_with_uav(o, -o.samples.at_tower) for o in observed]
+
+
+def wrong_way(observed: Sequence[Observed]) -> list[Observed]:
+    """Control: headings taken with the wrong sign."""
+    out = []
+    for o in observed:
+        world, body = -o.samples.at_tower, o.samples.at_uav
+        turned = 2.0 * np.arctan2(world[:, 1], world[:, 0]) - np.arctan2(body[:, 1], body[:, 0])
+        across = np.hypot(body[:, 0], body[:, 1])
+        out.append(_with_uav(o, np.stack([across * np.cos(turned), across * np.sin(turned), body[:, 2]], axis=1)))
+    return out
+
+
+def _with_uav(o: Observed, at_uav: FloatArray) -> Observed:
+    return dataclasses.replace(o, samples=dataclasses.replace(o.samples, at_uav=at_uav))
+
+
+def only_terms(recipe: Recipe, terms: Sequence[Term]) -> Recipe:
+    """The recipe with other terms, and patterns only where an end is still learned."""
+    return dataclasses.replace(recipe, model=dataclasses.replace(recipe.model, terms=tuple(terms)))

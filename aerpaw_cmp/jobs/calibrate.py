@@ -1,0 +1,437 @@
+"""The ``calibrate`` job: antennas as they hang, learned from several flights, scored on what was left out."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
+
+import numpy as np
+from pydantic import Field
+
+from ..common.errors import InputError, UsageError
+from ..common.stages import Stages
+from ..common.units import FloatArray
+from ..common.yamlfile import load_yaml
+from ..compare import calibration
+from ..compare.calibration import Learned, Observed, Recipe, Score
+from ..compare.direction_gain import (
+    PLACE_TERM,
+    TOWER_TERMS,
+    UAV_TERMS,
+    GainModel,
+    LinkSamples,
+    Term,
+    column_forms,
+)
+from ..compare.mount import GainOf
+from ..flight.data import FlightData, RssSeries, gather, read_logs
+from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
+from ..propagation.arrays import rotation_from_yaw_pitch_roll
+from ..propagation.baselines import free_space_dbm, two_ray_dbm
+
+ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
+"""Heights of roughness that are tried [m]; infinite is no ground ray."""
+
+
+class PatternsSettings(Settings):
+    """Measured patterns that the learned gain stands on; none: isotropic."""
+
+    uav: AntennaSettings | None = None
+    tower: AntennaSettings | None = None
+    towers: dict[str, AntennaSettings] = Field(default_factory=dict)
+    """By ``tower.channel``, where they differ."""
+
+
+class FitSettings(Settings):
+    """What is learned."""
+
+    gain: Literal["both", "uav", "tower", "none"] = "both"
+    mount: Literal["azimuth", "tilt", "none"] = "azimuth"
+    """Of antennas with a pattern."""
+    place: bool = False
+    """Also a field over places, drawn and scored apart; never part of an antenna."""
+    ground: bool = True
+    """How rough the ground is, by the likelihood of a two-ray model beside the gains."""
+    bin_s: Annotated[float, Field(gt=0, le=60)] = 4.0
+
+
+class CalibrationFile(Settings):
+    """The whole calibration.yaml."""
+
+    calibration: Annotated[str, Field(pattern=r"^[A-Za-z0-9][A-Za-z0-9_.\\-]*$")]
+    flights: Annotated[list[str], Field(min_length=1)]
+    patterns: PatternsSettings = PatternsSettings()
+    fit: FitSettings = FitSettings()
+    rank: dict[str, Any] | None = None
+    """Settings of the receiver's rank."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class GroundFit:
+    """Roughness of the ground: log likelihood against no ground ray, per height of roughness tried [m]."""
+
+    roughness_m: tuple[float, ...]
+    log_likelihood: tuple[float, ...]
+
+    @property
+    def best_m(self) -> float:
+        """Most probable height; infinite: no coherent ground ray."""
+        return self.roughness_m[int(np.argmax(self.log_likelihood))]
+
+    @property
+    def likely_m(self) -> tuple[float, float]:
+        """Heights within 2 of the best log likelihood (some 95 %)."""
+        least = max(self.log_likelihood) - 2.0
+        near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
+        return min(near), max(near)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Calibration:
+    """All that a calibration found."""
+
+    settings: CalibrationFile
+    flights: tuple[FlightData, ...]
+    observed: tuple[Observed, ...]
+    learned: Learned
+    place: Learned | None
+    scores: Mapping[str, tuple[Score, ...]]
+    controls: Mapping[str, tuple[Score, ...]]
+    ground: GroundFit | None
+    warnings: tuple[str, ...]
+    words: tuple[str, ...]
+    rank: Any = field(default=None)
+
+
+def load_calibration(path: Path) -> CalibrationFile:
+    """Read and check a calibration.yaml; UsageError as of any settings file."""
+    settings = load_yaml(path, CalibrationFile)
+    if len(set(settings.flights)) != len(settings.flights):
+        raise UsageError(
+            "a flight is named twice", expected="each flight once: its copy would be scored on itself", path=path
+        )
+    return settings
+
+
+def calibrate(path: Path, *, logs_root: Path | None = None, stages: Stages | None = None) -> Calibration:
+    """Read the flights, learn, score.
+
+    Raises
+    ------
+    UsageError
+        Settings that are wrong; flights that share no tower and channel.
+    InputError
+        Logs that cannot be read; flights without RSS.
+    """
+    stages = stages or Stages()
+    settings = load_calibration(path)
+    with stages("read"):
+        flights = read_flights(settings, path.parent, logs_root)
+    observed, warnings = observe(flights)
+    recipe = recipe_of(settings, observed, logs_root or path.parent)
+    series = [o.samples for o in observed]
+    with stages("fit"):
+        learned = calibration.learn(series, recipe)
+        place = None
+        if settings.fit.place:
+            with_place = calibration.only_terms(recipe, (*recipe.model.terms, PLACE_TERM))
+            place = calibration.learn(series, with_place)
+    with stages("ground"):
+        ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
+    with stages("scores"):
+        scores, controls = score_all(observed, recipe, stages)
+    warnings += mount_warnings(learned)
+    return Calibration(
+        settings=settings,
+        flights=tuple(flights),
+        observed=tuple(observed),
+        learned=learned,
+        place=place,
+        scores=scores,
+        controls=controls,
+        ground=ground,
+        warnings=tuple(warnings),
+        words=tuple(words_of(scores, controls, ground)),
+    )
+
+
+# --- flights -------------------------------------------------------------------------------------------------------
+
+
+def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> list[FlightData]:
+    """Every flight of the calibration, gathered."""
+    out = []
+    for name in settings.flights:
+        path = folder / name
+        flight = load_flight(path)
+        out.append(gather(flight, path.parent, read_logs(flight, path.parent, logs_root), logs_root))
+    names = [data.settings.flight.name for data in out]
+    for name in names:
+        if names.count(name) > 1:
+            raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
+    return out
+
+
+def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
+    """Samples of every series against free space, and what is to be said of them."""
+    observed: list[Observed] = []
+    warnings: list[str] = []
+    carriers: dict[str, dict[str, float]] = {}
+    for data in flights:
+        name = data.settings.flight.name
+        for series in data.rss:
+            one, guessed = _observe(data, series)
+            if not np.isfinite(one.samples.residual_db).any():
+                warnings.append(f"{name}: {series.tower} {series.channel} has no level at a known pose and is left out")
+                continue
+            if guessed > 0.01:
+                warnings.append(
+                    f"{name}: {100 * guessed:.0f} % of the attitudes at {series.tower} {series.channel} are unknown: "
+                    "heading from the track, level flight"
+                )
+            carriers.setdefault(one.samples.antenna, {})[name] = series.link.carrier_hz
+            observed.append(one)
+    if not observed:
+        raise InputError("none of the flights has RSS at known poses", expected="RSS logs with telemetry")
+    for antenna, per_flight in carriers.items():
+        low, high = min(per_flight.values()), max(per_flight.values())
+        if high > 1.02 * low:
+            raise UsageError(
+                f"{antenna} was received at {low / 1e9:g} and {high / 1e9:g} GHz",
+                expected="one frequency per tower and channel: an antenna's gain is of its frequency",
+                cause="flights of different experiments, or a wrong link.rss.carrier_hz",
+            )
+    lonely = [a for a, per_flight in carriers.items() if len(per_flight) == 1]
+    if len(calibration.flights_of(observed)) > 1 and len(lonely) == len(carriers):
+        raise UsageError(
+            "the flights share no tower and channel: " + "; ".join(f"{a} in {next(iter(carriers[a]))}" for a in lonely),
+            expected="at least one tower and channel that two flights have",
+            cause="different 'node' or 'channel' beside the logs in the flight files",
+        )
+    if len(calibration.flights_of(observed)) < 2:
+        warnings.append("one flight alone: nothing can be left out, nothing here is scored, and mounts are unstable")
+    elif lonely:
+        warnings.append(f"only one flight has {', '.join(lonely)}: learned, but not scored")
+    return observed, warnings
+
+
+def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
+    """One series, and which share of its attitudes stands for an unknown one."""
+    if data.track is None:
+        raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
+    pose = data.track.pose_at(series.time)
+    low = data.settings.rss.minimum_height_m
+    with np.errstate(invalid="ignore"):
+        keep = pose.valid if low is None else pose.valid & (pose.position_m[:, 2] >= low)
+    place = data.site.towers[series.tower].position_m
+    position = pose.position_m[keep]
+    ray = position - place
+    at_tower = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    free = free_space_dbm(place[None, :], position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
+    time = series.time[keep]
+    seconds = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
+    order = np.argsort(seconds, kind="stable")
+    samples = LinkSamples(
+        flight=data.settings.flight.name,
+        tower=series.tower,
+        channel=series.channel,
+        time_s=np.asarray(seconds, dtype=np.float64),
+        position_m=position,
+        at_uav=np.einsum("nji,nj->ni", pose.rotation[keep], -at_tower),
+        at_tower=at_tower,
+        residual_db=series.measured_db[keep] - free,
+    )
+    guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
+    return Observed(samples.part(order), free[order], pose.heading_deg[keep][order]), guessed
+
+
+# --- what is learned -----------------------------------------------------------------------------------------------
+
+
+def rotation(yaw_deg: float, pitch_deg: float, roll_deg: float) -> FloatArray:
+    """Mount (3, 3) from the angles of flight.yaml."""
+    return rotation_from_yaw_pitch_roll(*np.radians([yaw_deg, pitch_deg, roll_deg]))
+
+
+def recipe_of(settings: CalibrationFile, observed: Sequence[Observed], folder: Path) -> Recipe:
+    """Terms and patterns as calibration.yaml asks."""
+    terms: dict[str, tuple[Term, ...]] = {
+        "both": UAV_TERMS + TOWER_TERMS, "uav": UAV_TERMS, "tower": TOWER_TERMS, "none": ()
+    }  # fmt: skip
+    patterns: dict[str, GainOf] = {}
+    if settings.patterns.uav is not None:
+        patterns["uav"] = gain_of(settings.patterns.uav, folder)
+    for antenna in dict.fromkeys(o.samples.antenna for o in observed):
+        chosen = settings.patterns.towers.get(antenna, settings.patterns.tower)
+        if chosen is not None:
+            patterns[antenna] = gain_of(chosen, folder)
+    return Recipe(
+        model=GainModel(terms=terms[settings.fit.gain], bin_s=settings.fit.bin_s),
+        rotation=rotation,
+        patterns=patterns,
+        mount=settings.fit.mount != "none",
+        tilt=settings.fit.mount == "tilt",
+    )
+
+
+def gain_of(settings: AntennaSettings, folder: Path) -> GainOf:
+    """Gain [dBi] of a pattern towards unit vectors (n, 3) of its device frame."""
+    pattern = load_pattern(settings, folder)
+
+    def gain(direction: FloatArray) -> FloatArray:
+        theta = np.arctan2(np.hypot(direction[:, 0], direction[:, 1]), direction[:, 2])
+        e_theta, e_phi = pattern.field(theta, np.arctan2(direction[:, 1], direction[:, 0]))
+        power = np.abs(e_theta) ** 2 + np.abs(e_phi) ** 2
+        return np.asarray(10.0 * np.log10(np.maximum(power, 1e-6)))
+
+    return gain
+
+
+def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], learned: Learned) -> GroundFit:
+    """Likelihood of a coherent ground ray of each roughness, the gains integrated out."""
+    by_name = {data.settings.flight.name: data for data in flights}
+    kept = {(o.samples.flight, o.samples.antenna): o for o in observed}
+
+    def columns(samples: LinkSamples) -> FloatArray:
+        data = by_name[samples.flight]
+        o = kept[samples.flight, samples.antenna]
+        link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
+        tower = data.site.towers[samples.tower]
+        out = [samples.binned(model.bin_s).residual_db]
+        for sigma in ROUGHNESS_M:
+            level = two_ray_dbm(
+                tower.position_m[None, :],
+                samples.position_m,
+                link.carrier_hz,
+                link.transmit_power_dbm,
+                ground_material=data.site.ground_material,
+                ground_m=tower.ground_m,
+                roughness_m=sigma,
+            )[:, 0]
+            ripple = np.where(np.isfinite(samples.residual_db), level - o.free_space_db, np.nan)
+            out.append(dataclasses.replace(samples, residual_db=ripple).binned(model.bin_s).residual_db)
+        whole = np.stack(out, axis=1)
+        return np.asarray(whole - whole.mean(axis=0))
+
+    model = learned.choice.model
+    left = [
+        dataclasses.replace(
+            o.samples,
+            residual_db=o.samples.residual_db
+            - learned.pattern_db("uav", o.samples.at_uav)
+            - learned.pattern_db(o.samples.antenna, o.samples.at_tower),
+        )
+        for o in observed
+    ]
+    form = column_forms(left, model, columns, 1 + len(ROUGHNESS_M))
+    value = np.diag(form)[1:] - 2.0 * form[0, 1:]
+    likelihood = -0.5 * (value - value[-1])
+    return GroundFit(roughness_m=ROUGHNESS_M, log_likelihood=tuple(map(float, likelihood)))
+
+
+# --- scores --------------------------------------------------------------------------------------------------------
+
+
+def score_all(
+    observed: Sequence[Observed], recipe: Recipe, stages: Stages
+) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
+    """Every split, and the controls, all on flights that had no part in the fit."""
+    scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
+    if len(calibration.flights_of(observed)) < 2:
+        return scores, {}
+    kept: dict[str, Learned] = {}
+    scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
+    for split, parts, own in (
+        ("altitude_left_out", calibration.altitude_parts, False),
+        ("heading_left_out", calibration.heading_parts, False),
+        ("sector_left_out", calibration.sector_parts, False),
+        ("route_left_out", calibration.route_parts, True),
+    ):
+        stages.progress(f"scores: {split.replace('_', ' ')}")
+        scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own=own)
+    stages.progress("scores: controls")
+    return scores, controls_of(observed, recipe)
+
+
+def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
+    """Simpler and wrong models, each flight left out in turn."""
+    bare = dataclasses.replace(recipe, patterns={})
+    out: dict[str, Callable[[], tuple[Score, ...]]] = {
+        "world frame at the UAV": lambda: calibration.flight_left_out(calibration.world_frame(observed), bare),
+        "heading turned the wrong way": lambda: calibration.flight_left_out(calibration.wrong_way(observed), bare),
+        "body frame, no patterns": lambda: calibration.flight_left_out(observed, bare),
+        "UAV end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, UAV_TERMS)),
+        "tower end only": lambda: calibration.flight_left_out(observed, calibration.only_terms(bare, TOWER_TERMS)),
+        "field over places only": lambda: calibration.flight_left_out(
+            observed, calibration.only_terms(bare, (PLACE_TERM,))
+        ),
+    }
+    if recipe.patterns:
+        out["patterns with fitted mounts only"] = lambda: calibration.flight_left_out(
+            observed, calibration.only_terms(recipe, ())
+        )
+    return {name: run() for name, run in out.items()}
+
+
+def mount_warnings(learned: Learned) -> list[str]:
+    """Mounts that the data do not fix."""
+    out = []
+    for name, mount in learned.mounts.items():
+        if not mount.identified:
+            out.append(
+                f"azimuth of {name} is not identified: {mount.azimuth_deg:.0f} deg is likeliest, with a standard "
+                f"deviation of {mount.azimuth_sd_deg:.0f} deg"
+            )
+    return out
+
+
+def words_of(
+    scores: Mapping[str, Sequence[Score]], controls: Mapping[str, Sequence[Score]], ground: GroundFit | None
+) -> list[str]:
+    """What the scores say: antenna, or memory of the place."""
+    headline = scores["flight_left_out"]
+    if not headline:
+        return ["Nothing is scored: one flight alone."]
+    mean = calibration.mean_rmse
+    free, here = mean(headline, "free_space_rmse_db"), mean(headline)
+    out = [
+        f"On flights left out the learned antennas leave {here:.2f} dB "
+        f"({mean(headline, 'rmse_4s_db'):.2f} dB over 4 s); free space leaves {free:.2f} dB."
+    ]
+    if sectors := scores["sector_left_out"]:
+        base, left = mean(sectors, "free_space_rmse_db"), mean(sectors)
+        gain = free - here
+        share = (base - left) / gain if gain > 0 else 0.0
+        out.append(
+            f"Towards sectors of directions that the other flights never saw it leaves {left:.2f} dB: "
+            f"{100 * min(max(share, 0.0), 1.0):.0f} % of the gain over free space carries over there; the rest is "
+            "bound to directions and places that were flown before."
+        )
+    body, world, wrong = (
+        mean(controls.get(name, ())) for name in
+        ("body frame, no patterns", "world frame at the UAV", "heading turned the wrong way")
+    )  # fmt: skip
+    if math.isfinite(body) and math.isfinite(world):
+        kind = (
+            "at least partly antenna"
+            if body < min(world, wrong) - 0.05
+            else ("not told apart from the place: the headings are too much alike")
+        )
+        out.append(
+            f"Without patterns, the UAV's gain in the body frame leaves {body:.2f} dB, in the world frame {world:.2f} "
+            f"dB, with the heading turned the wrong way {wrong:.2f} dB: it is {kind}."
+        )
+    if not scores["heading_left_out"]:
+        out.append("No heading could be left out: the flights share one.")
+    if ground is not None:
+        low, high = ground.likely_m
+        rough = f"{100 * low:.1f} cm or more" if math.isinf(high) else f"{100 * low:.1f} to {100 * high:.1f} cm"
+        out.append(
+            "A coherent ground ray is not in the data." if math.isinf(low) else
+            f"Roughness of the ground that the data allow: {rough}."
+        )  # fmt: skip
+    return out

@@ -1,0 +1,159 @@
+"""Antenna files, the settings that name them, and the page of a calibration."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Mapping
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import FloatArray
+from ..common.versions import versions
+from ..compare.calibration import Learned
+from ..report.calibration_data import AntennaMap, CalibrationData
+from ..report.calibration_html import write_calibration
+from ..report.export import write_file
+from ..report.names import safe_name
+from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, unit_mean_gain
+from .calibrate import Calibration
+
+MARK = "# aerpaw-cmp calibrate"
+"""First words of calibrated.yaml, by which an own earlier output is known."""
+
+
+def antenna_maps(found: Calibration) -> dict[tuple[str, str], AntennaMap]:
+    """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
+    theta, azimuth, vectors = sphere_grid()
+    flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
+    fit = found.learned.fit
+    if fit is None:
+        raise UsageError(
+            "fit.gain is 'none': there is no gain over direction to write", expected="gain: both, uav or tower"
+        )
+    out = {}
+    for antenna in fit.antennas:
+        for end, frame in (("uav", "body"), ("tower", "mast")):
+            name = "uav" if end == "uav" else antenna
+            gain, sd = fit.gain("body" if frame == "body" else "mast", antenna, flat)
+            whole = unit_mean_gain((gain + found.learned.pattern_db(name, flat)).reshape(shape))
+            out[antenna, end] = AntennaMap(
+                name=f"{antenna} {end}",
+                theta_deg=theta,
+                azimuth_deg=azimuth,
+                gain_dbi=whole,
+                sd_db=sd.reshape(shape),
+                seen=fit.seen("body" if frame == "body" else "mast", antenna),
+            )
+    return out
+
+
+def antenna_files(found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float) -> dict[str, str]:
+    """Text of each file by its name: the full sphere with standard deviation, and cuts for planning tools."""
+    names = ", ".join(data.settings.flight.name for data in found.flights)
+    notes = (
+        f"aerpaw-cmp calibrate: {found.settings.calibration}, from {names}",
+        "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
+        "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
+    )
+    out = {}
+    for (antenna, end), one in maps.items():
+        stem = safe_name(f"{antenna}.{end}")
+        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, notes)
+        pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
+        out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
+    return out
+
+
+def settings_text(found: Calibration, folder_name: str) -> str:
+    """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
+    names = [data.settings.flight.name for data in found.flights]
+    lines = [
+        f"{MARK}: {found.settings.calibration}. Learned from {', '.join(names)}.",
+        *(f"# {text}" for text in found.words),
+        "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
+        "link:",
+        "  channels:",
+    ]
+    for antenna in found.learned.fit.antennas if found.learned.fit else ():
+        tower, _, channel = antenna.partition(".")
+        link = next(s.link for data in found.flights for s in data.rss if (s.tower, s.channel) == (tower, channel))
+        ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
+        lines += [
+            f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
+            f"      carrier_hz: {link.carrier_hz:.6g}",
+            f"      transmit_power_dbm: {link.transmit_power_dbm:g}",
+            f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
+            f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
+        ]
+    lines += [
+        "# the gains were learned beside line of sight alone",
+        "rt: {engine: image, max_depth: 0, attitude: logged}",
+    ]
+    return "\n".join(lines) + "\n"
+
+
+def record_of(
+    found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
+) -> CalibrationData:
+    """All that the page shows."""
+    model = found.learned.choice.model
+    mounts = {
+        name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
+        | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
+        for name, m in found.learned.mounts.items()
+    }
+    ground = None
+    if found.ground is not None:
+        named = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in found.ground.roughness_m]
+        ground = {"rows": list(zip(named, found.ground.log_likelihood, strict=True)), "likely_m": found.ground.likely_m}
+    return CalibrationData(
+        name=found.settings.calibration,
+        generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
+        flights=[data.settings.flight.name for data in found.flights],
+        words=found.words,
+        warnings=found.warnings,
+        scores={k: [dataclasses.asdict(s) for s in v] for k, v in found.scores.items()},
+        controls={k: [dataclasses.asdict(s) for s in v] for k, v in found.controls.items()},
+        mounts=mounts,
+        strengths={
+            "spread": found.learned.choice.spread,
+            "scale": found.learned.choice.scale,
+            "left_out_rmse_db": {f"{k:g}": v for k, v in found.learned.choice.left_out_rmse_db.items()},
+            "model": dataclasses.asdict(model),
+        },
+        ground=ground,
+        antennas=tuple(maps.values()),
+        place=None if found.place is None else _place(found, found.place),
+        rank=found.rank,
+        settings_text=text,
+        versions=versions(),
+        stages_s=stages_s,
+    )
+
+
+def _place(found: Calibration, place: Learned) -> dict[str, FloatArray]:
+    """The place field of the first antenna along all flights, thinned."""
+    assert place.fit is not None
+    first = place.fit.antennas[0]
+    own = [o.samples for o in found.observed if o.samples.antenna == first]
+    thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
+    gain = [place.fit.predict(s, ("place",))[0] for s in thin]
+    position = np.concatenate([s.position_m for s in thin])
+    return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
+
+
+def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[str, float]) -> tuple[Any, str]:
+    """Fill the folder of a calibration; gives its record and the text of calibrated.yaml."""
+    maps = antenna_maps(found)
+    carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
+    for file, text in antenna_files(found, maps, carrier).items():
+        write_file(folder / file, text)
+    text = settings_text(found, name)
+    record = record_of(found, maps, text, stages_s)
+    write_calibration(record, folder)
+    return record, text

@@ -1,0 +1,53 @@
+"""What the page of a calibration shows: numbers in, nothing computed here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+from ..common.units import FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class AntennaMap:
+    """One antenna over the sphere.
+
+    Parameters
+    ----------
+    name : str
+        Such as ``LW1.USRP1 tower``.
+    theta_deg, azimuth_deg : (t,), (p,)
+    gain_dbi, sd_db : (t, p)
+    seen : (m, 3)
+        Unit vectors of the directions that flights looked in.
+    """
+
+    name: str
+    theta_deg: FloatArray
+    azimuth_deg: FloatArray
+    gain_dbi: FloatArray
+    sd_db: FloatArray
+    seen: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CalibrationData:
+    """The record of a calibration; ``scores`` and ``controls`` hold rows with flight, tower, channel, RMSE."""
+
+    name: str
+    generated: str
+    flights: Sequence[str]
+    words: Sequence[str]
+    warnings: Sequence[str]
+    scores: Mapping[str, Sequence[Mapping[str, Any]]]
+    controls: Mapping[str, Sequence[Mapping[str, Any]]]
+    mounts: Mapping[str, Mapping[str, Any]]
+    strengths: Mapping[str, Any]
+    ground: Mapping[str, Any] | None
+    antennas: Sequence[AntennaMap]
+    place: Mapping[str, FloatArray] | None = None
+    rank: Mapping[str, Any] | None = None
+    settings_text: str = ""
+    versions: Mapping[str, str] = field(default_factory=dict)
+    stages_s: Mapping[str, float] = field(default_factory=dict)

@@ -149,6 +149,11 @@ def ingest(
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
     ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    columns: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
+    ] = None,
+    unit: Annotated[Optional[str], typer.Option(help="Unit of levels where the file does not fix it.")] = None,  # noqa: UP045
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -158,7 +163,10 @@ def ingest(
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
-    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
+    if columns:
+        options |= run.mapping(columns)
+        reader = reader or "generic_csv"
     summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
     if as_json:
         _print_json(summary)
@@ -172,7 +180,8 @@ def ingest(
     if draft is not None:
         for remark in summary["draft"]:
             _say(remark)
-        print(f"wrote {draft}")
+        for place in summary["drafts"]:
+            print(f"wrote {place}")
 
 
 @app.command(help=COMMANDS["formats"])
@@ -658,13 +667,25 @@ def calibrate(
         means = [sum(s[key] for s in scores) / len(scores) if scores else None
                  for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
         rows.append([name.replace("_", " "), *(_number(v, "{:.2f}") for v in means), str(len(scores))])
-    _table(
-        ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"], rows, "Scores on what was left out, means"
-    )
+    if rows:
+        heads = ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"]
+        _table(heads, rows, "Scores on what was left out, means")
+    rows = [
+        [split.replace("_", " "), one["flight"], one["tower"], _number(one["kappa"], "{:.3f}"),
+         _number(one["agreement"], "{:.3f}"), _number(one["majority_agreement"], "{:.3f}"),
+         _number(one["log_score"], "{:.3f}"), _number(one["constant_log_score"], "{:.3f}"),
+         _number(one["total_variation_expected"], "{:.3f}")]
+        for split, scores in m["rank"].items()
+        for one in scores
+    ]  # fmt: skip
+    if rows:
+        heads = ["left out", "flight", "tower", "kappa", "agree", "commonest", "log score", "constant", "TV"]
+        _table(heads, rows, "Rank on what was left out")
     for text in [*m["words"], *m["warnings"]]:
         print(text)
     print(outcome.file)
-    print(outcome.folder / "calibration.html")
+    page = outcome.folder / "calibration.html"
+    print(page if page.exists() else outcome.folder)
 
 
 @app.command(help=COMMANDS["campaign"])

@@ -14,9 +14,11 @@ from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .field_difference import FieldAudit
+from .forecast import ForecastScore
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
 
@@ -229,6 +231,7 @@ class RankFurther:
     kappa_ci95: Mapping[str, Interval]
     commonest: CommonestRank
     repeat: Mapping[str, RankRepeat]
+    receiver: ForecastScore | None = None
     foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 
 
@@ -250,6 +253,8 @@ class RankResult:
         Singular values of the simulated channels, falling, relative to a scale of each channel.
     level_dbm : (n,)
         Simulated level, NaN without a path.
+    probability : (n, 4), optional
+        Of rank 1 to 4, by the fitted receiver that ``rank.receiver`` names.
     rank : mapping of float to (n,) int
         Simulated, per K; 0: no path.
     foliage_rank : mapping of str to mapping of float to (n,) int
@@ -270,6 +275,7 @@ class RankResult:
     foliage_rank: Mapping[str, Mapping[float, IntArray]]
     score: RankComparison
     further: RankFurther
+    probability: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -313,4 +319,5 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()

@@ -229,6 +229,8 @@ class LogSettings(Settings):
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
+    cells: dict[int, str] = {}
+    """Tower of each cell, by PCI; where it is given, cells that it does not name are left out."""
     skip: list[str] = []
     """Streams of the file to leave out, by name."""
 
@@ -434,6 +436,8 @@ class RankSettings(Settings):
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    receiver: str | None = None
+    """Receiver file of ``calibrate``: gives a probability of each rank."""
 
     @field_validator("k")
     @classmethod

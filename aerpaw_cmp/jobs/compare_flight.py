@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
+from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.result import (
     Censored,
     ExpectedOffset,
@@ -29,10 +32,12 @@ from ..compare.result import (
     RssFurther,
     RssResult,
 )
+from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.settings import RssSettings, RtSettings
+from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
+from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
 from .replay import FlightReplay, Replayed, direct_foliage_m
 from .what_if import (
@@ -64,7 +69,37 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
         rss=found,
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(found)),
+        serving=serving_of(data.rss, found),
     )
+
+
+SERVING_WITHIN_S = 1.5
+"""A prediction of another cell at most this long before or after stands for the moment: phones report once a second."""
+
+
+def serving_of(series: Sequence[RssSeries], found: Sequence[RssResult]) -> ServingComparison | None:
+    """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
+
+    Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
+    simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
+    """
+    cells = [(one, result) for one, result in zip(series, found, strict=True) if one.serving is not None]
+    if len(cells) < 2 or not any(np.nansum(one.serving) for one, _ in cells if one.serving is not None):
+        return None
+    start = min(one.time.min() for one, _ in cells if len(one.time))
+    times, served = [], []
+    for i, (one, _) in enumerate(cells):
+        assert one.serving is not None
+        mine = (one.time - start)[one.serving == 1] / np.timedelta64(1, "s")
+        times.append(mine)
+        served.append(np.full(len(mine), i))
+    at = np.concatenate(times)
+    predicted = np.full((len(at), len(cells)), np.nan)
+    for j, (one, result) in enumerate(cells):
+        order = np.argsort(one.time, kind="stable")
+        seconds = ((one.time - start) / np.timedelta64(1, "s"))[order]
+        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=SERVING_WITHIN_S)
+    return compare_serving(np.concatenate(served), predicted, [f"{one.tower} {one.channel}" for one, _ in cells])
 
 
 # --- RSS -----------------------------------------------------------------------------------------------------------
@@ -133,7 +168,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
-            expected_offset=_expected(data, series, score.offset_db),
+            expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
@@ -216,8 +251,10 @@ def _averaged(
     }
 
 
-def _expected(data: FlightData, series: RssSeries, offset_db: float) -> ExpectedOffset | None:
-    found = expected_offset(data.settings.rss.reference_powers, data.folder, series)
+def _expected(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
+) -> ExpectedOffset | None:
+    found = expected_offset(budget, folder, series)
     if found is None:
         return None
     expected, received, sent = found
@@ -415,6 +452,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma = ranks.singular_values(h)
+    probability, forecast = _receiver_forecast(data, series)
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
@@ -432,9 +470,30 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             commonest=ranks.commonest_rank(series.rank[rows]),
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
+            receiver=forecast,
             foliage=foliage_rank_difference(paired) or None,
         ),
+        probability=probability,
     )
+
+
+def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray | None, ForecastScore | None]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, and its score; None without one."""
+    named = data.settings.rank.receiver
+    if named is None:
+        return None, None
+    receivers = read_receiver(data.folder / named)
+    if series.tower not in receivers:
+        raise InputError(
+            f"no receiver at {series.tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    samples, receiver = rank_samples(data, series), receivers[series.tower]
+    probability, said = receiver.forecast(samples)
+    constant = receiver.mixture.members[0].constant
+    replicates = max(data.settings.rank.bootstrap, 2)
+    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates)
 
 
 def _repeated_rank(

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,31 @@ from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
 from ..site.site import Site
+
+_KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
+
+
+def mapping(pairs: list[str]) -> dict[str, Any]:
+    """Reader options of ``--map COLUMN=quantity``: the columns, and the kind of record that they make.
+
+    ``rank`` stands for a rank indicator that counts from one.
+
+    Raises
+    ------
+    UsageError
+        If a pair is none, or two name one quantity.
+    """
+    found: dict[str, str] = {}
+    for pair in pairs:
+        column, mark, quantity = pair.rpartition("=")
+        quantity = {"rank": "ri_raw"}.get(quantity.strip(), quantity.strip())
+        if not mark or not column or not quantity:
+            raise UsageError(f"--map {pair!r}", expected="COLUMN=quantity, e.g. --map 'Power (dBm)=rss_db'")
+        if quantity in found:
+            raise UsageError(f"--map names two columns for {quantity!r}", expected="one column per quantity")
+        found[quantity] = column.strip()
+    kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in found), "telemetry")
+    return {"columns": found, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}
 
 
 def run_ingest(
@@ -56,15 +82,25 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
         if draft is not None:
-            from ..flight.draft import draft as draft_of
+            from ..flight.draft import drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
             told = {key: options.get(key) for key in ("timezone", "time_origin")}
-            text, account["draft"] = draft_of(files, drafted.target.parent, **told)
-            drafted.write(sealed(text))
+            named = ("columns", "kind", "unit", "ri_base")
+            told["mapping"] = {key: options[key] for key in named if options.get(key)}
+            made = drafts(files, drafted.target.parent, **told)
+            account["draft"] = list(made[0].remarks)
+            drafted.write(sealed(made[0].text))
+            account["drafts"] = [str(draft)]
+            for number, further in enumerate(made[1:], 2):
+                place = draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
+                other = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
+                other.write(sealed(further.text))
+                account["drafts"].append(str(place))
+                account["draft"] += [f"{place.name}: {remark}" for remark in further.remarks]
         if target is not None:
             target.write(flight_bytes(files))
     return account
@@ -703,8 +739,39 @@ def run_calibrate(
         OutputFile(target, own=own, inputs=inputs, force=force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
     ):
-        found = calibrate(path, logs_root=logs_root, stages=stages)
-        with output.filling() as place:
-            record, text = write_files(found, place, folder.name, stages.seconds)
+        ranked, has_rss = _calibrated_rank(settings, path, logs_root, stages)
+        if not has_rss and ranked is not None:
+            text, metrics = MARK + "\n", {**_RANK_ALONE, "calibration": settings.calibration}
+            with output.filling() as place:
+                metrics |= {"rank": ranked.metrics(), "warnings": list(ranked.warnings), "flights": settings.flights}
+                (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+                (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        else:
+            found = calibrate(path, logs_root=logs_root, stages=stages)
+            if ranked is not None:
+                found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
+            with output.filling() as place:
+                record, text = write_files(found, place, folder.name, stages.seconds)
+                if ranked is not None:
+                    (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+            metrics = calibration_metrics(record)
+        if ranked is not None:
+            text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
         file.write(text.encode())
-    return CalibrateOutcome(target, folder, calibration_metrics(record))
+    return CalibrateOutcome(target, folder, metrics)
+
+
+_RANK_ALONE: dict[str, Any] = {"scores": {}, "controls": {}, "words": [], "antennas": []}
+"""What a calibration of flights without RSS has instead of antennas."""
+
+
+def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, bool]:
+    """The receiver, where calibration.yaml asks for one, and whether there is RSS to learn antennas from."""
+    if settings.rank is None:
+        return None, True
+    from .calibrate import read_flights
+    from .calibrate_rank import fit_rank
+
+    with stages("rank"):
+        flights = read_flights(settings, path.parent, logs_root)
+        return fit_rank(flights, settings.rank), any(data.rss for data in flights)

@@ -149,6 +149,11 @@ def ingest(
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
     ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    columns: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
+    ] = None,
+    unit: Annotated[Optional[str], typer.Option(help="Unit of levels where the file does not fix it.")] = None,  # noqa: UP045
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -158,7 +163,10 @@ def ingest(
 
     if ri_base not in (None, "zero", "one"):
         raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
-    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base}
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
+    if columns:
+        options |= run.mapping(columns)
+        reader = reader or "generic_csv"
     summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
     if as_json:
         _print_json(summary)
@@ -172,7 +180,8 @@ def ingest(
     if draft is not None:
         for remark in summary["draft"]:
             _say(remark)
-        print(f"wrote {draft}")
+        for place in summary["drafts"]:
+            print(f"wrote {place}")
 
 
 @app.command(help=COMMANDS["formats"])

@@ -17,6 +17,7 @@ from .field_difference import FieldAudit
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
+from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
 
@@ -313,4 +314,5 @@ class FlightResult:
     rank: tuple[RankResult, ...] = ()
     pairs: tuple[PairResult, ...] = ()
     engine: EngineResult | None = None
+    serving: ServingComparison | None = None
     ladder: tuple[LadderRow, ...] = ()

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
-from ..logs.ingest import IngestedFile, ingest, read_bytes
+from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
 from ..logs.limits import UNSCORED, flagged
-from ..logs.readers import HEAD_BYTES, Reader, by_name, catalogue
+from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
 from ..site.site import Site
 from ..site.siteyaml import load_site
@@ -43,6 +43,8 @@ class RssSeries:
     """Equal for series whose link settings are equal: they share a replay."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
+    serving: FloatArray | None = None
+    """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
     log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Number of the log (n,) under ``logs:`` that holds each sample; empty where it is not known."""
     line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -105,7 +107,7 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     files = []
     for log in settings.logs:
         path = (logs_root or folder) / log.path
-        if not path.exists():
+        if not exists(path):
             root = logs_root or folder
             raise InputError(
                 "there is no such log",
@@ -130,9 +132,10 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 
 def _refuse_other_kind(path: Path, reader: Reader) -> None:
     """A log whose content another reader recognises, and the named one does not, is the wrong file."""
-    head = read_bytes(path)[0][:HEAD_BYTES]
-    others = [r.name for r in catalogue() if r.sniff(head)]
-    if not others or reader.name in (*others, "generic_csv"):  # that one is told its columns, whatever the file is
+    if reader.name == "generic_csv":
+        return  # its columns were named: no other reader knows better
+    others = sniffers_of(path)
+    if not others or reader.name in others:
         return
     raise InputError(
         f"the content is that of {' or '.join(others)}",
@@ -168,10 +171,12 @@ def gather(
                 continue
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
-            elif stream.kind == "rss":
+            elif stream.kind == "rss" and not _unnamed_cell(log, stream):
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
             elif stream.kind == "rank":
                 rank.append((log.path, _rank_series(settings, log, stream, site)))
+        if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
+            warnings.append(f"{log.path}: {len(others)} cells that 'cells' does not name are left out")
         names = [s.name for s in file.result.streams]
         if unknown := [name for name in log.skip if name not in names]:
             warnings.append(
@@ -335,8 +340,16 @@ def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:
     return name
 
 
+def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
+    """Whether a stream is that of a cell that the flight file, which names others, does not name."""
+    pci = stream.attributes.get("pci")
+    return bool(log.cells) and pci is not None and int(pci) not in log.cells
+
+
 def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RssSeries:
-    tower = _known_tower(log.node or _text(stream, "node"), log, site)
+    pci = stream.attributes.get("pci")
+    home = log.cells.get(int(pci)) if pci is not None else None
+    tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = log.channel or _text(stream, "channel") or stream.name
     link = settings.link.channels.get(channel, settings.link.rss)
     frame, left_out = _scored(stream, log.path)
@@ -351,6 +364,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         log=np.full(len(frame), settings.logs.index(log), dtype=np.int64),
         line=frame["line"].to_numpy(np.int64),
         flagged=left_out,
+        serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,
     )
 
 
@@ -441,14 +455,14 @@ def _check_overlap(data: FlightData) -> None:
             raise InputError(
                 f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
                 expected="logs of the same flight",
-                cause=_clock_cause(data, time, start, end),
+                cause=_clock_cause(data.settings.timezone, time, start, end),
             )
 
 
-def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:
     trap = None
     if len(time):
-        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+        trap = clock_trap((time.min(), time.max()), (start, end), timezone)
     if trap is None:
         return "logs of different flights, or a wrong 'timezone' or 'clock'"
     return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"

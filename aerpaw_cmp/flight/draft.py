@@ -17,7 +17,9 @@ from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream, has_wall_clock
 from .data import is_ratio
+from .grouping import flights
 from .settings import FlightFile, LogSettings
+from .time_origin import Origin, origin_of
 
 _TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
 _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
@@ -37,7 +39,12 @@ Span = tuple[np.datetime64, np.datetime64]
 
 
 def draft(
-    files: Sequence[IngestedFile], folder: Path, *, timezone: str | None = None, time_origin: str | None = None
+    files: Sequence[IngestedFile],
+    folder: Path,
+    *,
+    timezone: str | None = None,
+    time_origin: str | None = None,
+    mapping: Mapping[str, Any] | None = None,
 ) -> tuple[str, list[str]]:
     """The text of a flight.yaml that names the logs.
 
@@ -49,6 +56,8 @@ def draft(
         Of the flight.yaml; the paths in it are relative to it.
     timezone, time_origin : str, optional
         What zone-less clocks and relative times were read with.
+    mapping : mapping, optional
+        ``columns``, ``kind``, ``unit`` and ``ri_base`` that generic CSVs were read with.
 
     Returns
     -------
@@ -61,7 +70,7 @@ def draft(
         If no log has what a flight needs.
     """
     flown = _flown(files)
-    entries = _Entries(folder, flown, _has_level(files, flown), time_origin)
+    entries = _Entries(folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}))
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
         entries.enter(file)
     entries.sort(files)
@@ -83,6 +92,53 @@ def draft(
     parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
     asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
     return text, asked + [f"left out: {remark}" for remark in entries.out]
+
+
+@dataclass(frozen=True, slots=True)
+class Draft:
+    """A first flight.yaml.
+
+    Parameters
+    ----------
+    name : str
+        Of the flight.
+    text : str
+    remarks : tuple of str
+        What is left to check, or was left out.
+    """
+
+    name: str
+    text: str
+    remarks: tuple[str, ...]
+
+
+def drafts(
+    files: Sequence[IngestedFile],
+    folder: Path,
+    *,
+    timezone: str | None = None,
+    time_origin: str | None = None,
+    mapping: Mapping[str, Any] | None = None,
+) -> list[Draft]:
+    """A flight.yaml for each flight that the logs are of, in the order of time; see :func:`draft`.
+
+    Where one flight alone is complete (levels or ranks, and positions) all logs stand in its draft, those that do not
+    belong to it as left out.
+    """
+    found = [flight for flight in flights(files) if flight.complete]
+    told = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
+    groups = [flight.files for flight in found] if len(found) > 1 else [list(files)]
+    made = []
+    for group in groups:
+        text, remarks = draft(group, folder, **told)  # type: ignore[arg-type]
+        made.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
+    home = {file.path for group in groups for file in group}
+    left = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]
+    if left:
+        first = made[0]
+        out = tuple(f"left out: {path}: it goes with no flight here" for path in left)
+        made[0] = Draft(first.name, first.text, (*first.remarks, *out))
+    return made
 
 
 MINIMUM_HEIGHT_M = 5.0
@@ -143,6 +199,8 @@ class _Entries:
     """The telemetry that gives the track, and its span."""
     has_level: bool
     time_origin: str | None
+    mapping: dict[str, Any]
+    """Of generic CSVs."""
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
@@ -176,9 +234,11 @@ class _Entries:
             self._enter(file, path, shown)
 
     def _enter(self, file: IngestedFile, path: str, shown: str) -> None:
+        streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
         entry, asked = _entry(file, path)
-        refused = self._refused(file, entry, shown)
-        kept = [s for s in file.result.streams if s.name not in refused]
+        origin = None if self.time_origin else self._origin(streams)
+        refused = self._refused(streams, entry, shown, dated=origin is not None)
+        kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
         if not kept:
             self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
@@ -188,9 +248,17 @@ class _Entries:
             entry, asked = {"path": path, "reader": file.result.reader}, ""
         if self.time_origin and any("clock" in s.attributes for s in kept):
             entry["time_origin"] = self.time_origin
+        elif origin is not None:
+            entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
+            asked += f"{'' if asked else '  #'} time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?"
+        if file.result.reader == "generic_csv":
+            entry |= self.mapping
         if refused:
             entry["skip"] = sorted(refused)
-        if (floor := receiver_floor_db([s for s in kept if s.kind == "rss"])) is not None:
+        levels = [
+            s for s in kept if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
+        ]  # whole decibels repeat
+        if (floor := receiver_floor_db(levels)) is not None:
             entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
             asked += f" floor of the receiver at {floor:.1f} dB?" if asked else f"  # receiver floor {floor:.1f} dB?"
         if any(is_ratio(s) for s in kept):
@@ -199,14 +267,26 @@ class _Entries:
         self.kinds |= {s.kind for s in kept}
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
-    def _refused(self, file: IngestedFile, entry: Mapping[str, Any], shown: str) -> dict[str, str]:
-        """Streams that stay out, by name, and why; the others are taken."""
+    def _origin(self, streams: Sequence[Stream]) -> Origin | None:
+        """Origin of relative times whose positions lie on the track of the flight."""
+        if self.flown is None or not has_wall_clock(self.flown[1][0]):
+            return None
+        relative = [s for s in streams if s.attributes.get("clock") == "relative"]
+        return next((one for s in relative if (one := origin_of(s, self.flown[0])) is not None), None)
+
+    def _refused(
+        self, streams: Sequence[Stream], entry: Mapping[str, Any], shown: str, *, dated: bool
+    ) -> dict[str, str]:
+        """Streams that stay out, by name, and why; the others are taken.
+
+        ``dated`` says that relative times have an origin now.
+        """
         refused = {}
-        for stream in sorted(file.result.streams, key=_missing):
+        for stream in sorted(streams, key=_missing):
             span = _span(stream)
             if span is None:
                 refused[stream.name] = "no samples"
-            elif reason := self._reason(stream, span):
+            elif reason := self._reason(stream, span, dated=dated):
                 refused[stream.name] = reason
             elif stream.kind != "telemetry":
                 key = _key(stream, entry)
@@ -218,13 +298,16 @@ class _Entries:
                     self.taken.setdefault(key, []).append((span, shown))
         return refused
 
-    def _reason(self, stream: Stream, span: Span) -> str | None:
+    def _reason(self, stream: Stream, span: Span, *, dated: bool) -> str | None:
         relative = not has_wall_clock(span[0])
         if stream.kind == "telemetry":
             if self.flown is None or stream is self.flown[0]:
                 return None
+            if relative and has_wall_clock(self.flown[1][0]):
+                return "the track is that of other telemetry"
             return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
-        if relative and not _has_positions(stream):
+        beside = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
+        if relative and not (dated or beside or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"
         if self.flown is not None and not relative and not _meet(span, self.flown[1]):
             return _late(span, self.flown[1])
@@ -270,19 +353,25 @@ def _samples(file: IngestedFile) -> int:
 def _flown(files: Sequence[IngestedFile]) -> tuple[Stream, Span] | None:
     """The telemetry that most levels and ranks go with, first and last time; of equals, the longest."""
     telemetry: list[tuple[Stream, Span]] = []
+    relative: list[tuple[Stream, Span]] = []
     others: list[Span] = []
     for file in files:
+        measured = any(stream.kind in ("rss", "rank") for stream in file.result.streams)
         for stream in file.result.streams:
-            if (span := _span(stream)) and has_wall_clock(span[0]):
-                if stream.kind == "telemetry":
-                    telemetry.append((stream, span))
-                else:
-                    others.append(span)
+            if (span := _span(stream)) is None:
+                continue
+            if stream.kind != "telemetry":
+                others += [span] if has_wall_clock(span[0]) else []
+            elif has_wall_clock(span[0]):
+                telemetry.append((stream, span))
+            elif measured:
+                relative.append((stream, span))
 
     def worth(flight: tuple[Stream, Span]) -> tuple[int, np.timedelta64]:
         return sum(_meet(flight[1], other) for other in others), flight[1][1] - flight[1][0]
 
-    return max(telemetry, key=worth, default=None)
+    # without any wall clock, a log that holds both levels and positions is a flight in its own time
+    return max(telemetry or relative[:1], key=worth, default=None)
 
 
 def _meet(one: Span, other: Span) -> bool:
@@ -295,15 +384,32 @@ def _span(stream: Stream) -> Span | None:
     return (time.min(), time.max()) if len(time) else None
 
 
+MOST_CELLS = 6
+"""Of a log's cells, those told most often are proposed; in a city a phone hears a hundred."""
+
+
+def _cells(streams: Sequence[Stream]) -> list[int]:
+    """PCIs of a log of several cells, those with a twentieth of the samples of the first and more."""
+    counts = {int(s.attributes["pci"]): len(s.frame) for s in streams if "pci" in s.attributes}
+    most = max(counts.values(), default=0)
+    kept = sorted(counts, key=lambda pci: -counts[pci])[:MOST_CELLS]
+    return sorted(pci for pci in kept if 20 * counts[pci] >= most)
+
+
 def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     """Keys of a log and a question about what had to be guessed."""
     entry: dict[str, Any] = {"path": path, "reader": file.result.reader}
-    need = [s for s in file.result.streams if s.kind != "telemetry" and not s.attributes.get("node")]
+    need = [s for s in file.result.streams if s.kind in ("rss", "rank") and not s.attributes.get("node")]
     if not need:
         return entry, ""
     near = _TOWER.findall("/".join(Path(file.path).resolve().parts[-2:]))  # of the file or its folder
     towers = near or _TOWER.findall(path)
     entry["node"] = f"LW{towers[-1]}" if towers else "LW1"
+    if cells := _cells(need):
+        entry["cells"] = dict.fromkeys(cells, entry["node"])
+        if all("pci" in stream.attributes for stream in need):
+            del entry["node"]
+        return entry, "  # which tower has which PCI?"
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
     return entry, "" if near else "  # which tower?"

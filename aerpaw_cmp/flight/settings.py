@@ -229,6 +229,8 @@ class LogSettings(Settings):
     kind: Kind | None = None
     unit: str | None = None
     floor_db: float = -200.0
+    cells: dict[int, str] = {}
+    """Tower of each cell, by PCI; where it is given, cells that it does not name are left out."""
     skip: list[str] = []
     """Streams of the file to leave out, by name."""
 

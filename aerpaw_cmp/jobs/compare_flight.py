@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,9 @@ from ..compare.result import (
     RssFurther,
     RssResult,
 )
+from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.settings import RssSettings, RtSettings
+from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .levels import Levels, at_samples, gain_sd_db, levels_of
@@ -64,7 +66,37 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
         rss=found,
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(found)),
+        serving=serving_of(data.rss, found),
     )
+
+
+SERVING_WITHIN_S = 1.5
+"""A prediction of another cell at most this long before or after stands for the moment: phones report once a second."""
+
+
+def serving_of(series: Sequence[RssSeries], found: Sequence[RssResult]) -> ServingComparison | None:
+    """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
+
+    Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
+    simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
+    """
+    cells = [(one, result) for one, result in zip(series, found, strict=True) if one.serving is not None]
+    if len(cells) < 2 or not any(np.nansum(one.serving) for one, _ in cells if one.serving is not None):
+        return None
+    start = min(one.time.min() for one, _ in cells if len(one.time))
+    times, served = [], []
+    for i, (one, _) in enumerate(cells):
+        assert one.serving is not None
+        mine = (one.time - start)[one.serving == 1] / np.timedelta64(1, "s")
+        times.append(mine)
+        served.append(np.full(len(mine), i))
+    at = np.concatenate(times)
+    predicted = np.full((len(at), len(cells)), np.nan)
+    for j, (one, result) in enumerate(cells):
+        order = np.argsort(one.time, kind="stable")
+        seconds = ((one.time - start) / np.timedelta64(1, "s"))[order]
+        predicted[:, j] = at_times(at, seconds, result.simulated_dbm[order], within_s=SERVING_WITHIN_S)
+    return compare_serving(np.concatenate(served), predicted, [f"{one.tower} {one.channel}" for one, _ in cells])
 
 
 # --- RSS -----------------------------------------------------------------------------------------------------------
@@ -133,7 +165,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
-            expected_offset=_expected(data, series, score.offset_db),
+            expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
@@ -216,8 +248,10 @@ def _averaged(
     }
 
 
-def _expected(data: FlightData, series: RssSeries, offset_db: float) -> ExpectedOffset | None:
-    found = expected_offset(data.settings.rss.reference_powers, data.folder, series)
+def _expected(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
+) -> ExpectedOffset | None:
+    found = expected_offset(budget, folder, series)
     if found is None:
         return None
     expected, received, sent = found

@@ -16,6 +16,31 @@ from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
 from ..site.site import Site
 
+_KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
+
+
+def mapping(pairs: list[str]) -> dict[str, Any]:
+    """Reader options of ``--map COLUMN=quantity``: the columns, and the kind of record that they make.
+
+    ``rank`` stands for a rank indicator that counts from one.
+
+    Raises
+    ------
+    UsageError
+        If a pair is none, or two name one quantity.
+    """
+    found: dict[str, str] = {}
+    for pair in pairs:
+        column, mark, quantity = pair.rpartition("=")
+        quantity = {"rank": "ri_raw"}.get(quantity.strip(), quantity.strip())
+        if not mark or not column or not quantity:
+            raise UsageError(f"--map {pair!r}", expected="COLUMN=quantity, e.g. --map 'Power (dBm)=rss_db'")
+        if quantity in found:
+            raise UsageError(f"--map names two columns for {quantity!r}", expected="one column per quantity")
+        found[quantity] = column.strip()
+    kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in found), "telemetry")
+    return {"columns": found, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}
+
 
 def run_ingest(
     paths: list[Path],
@@ -56,15 +81,25 @@ def run_ingest(
         if out is not None:
             target = outputs.enter_context(OutputFile(out, own=is_flight_file, inputs=paths, force=force))
         if draft is not None:
-            from ..flight.draft import draft as draft_of
+            from ..flight.draft import drafts
 
             drafted = outputs.enter_context(OutputFile(draft, own=is_sealed, inputs=paths, force=force))
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
             told = {key: options.get(key) for key in ("timezone", "time_origin")}
-            text, account["draft"] = draft_of(files, drafted.target.parent, **told)
-            drafted.write(sealed(text))
+            named = ("columns", "kind", "unit", "ri_base")
+            told["mapping"] = {key: options[key] for key in named if options.get(key)}
+            made = drafts(files, drafted.target.parent, **told)
+            account["draft"] = list(made[0].remarks)
+            drafted.write(sealed(made[0].text))
+            account["drafts"] = [str(draft)]
+            for number, further in enumerate(made[1:], 2):
+                place = draft.with_name(f"{draft.stem}_{number}{draft.suffix}")
+                other = outputs.enter_context(OutputFile(place, own=is_sealed, inputs=paths, force=force))
+                other.write(sealed(further.text))
+                account["drafts"].append(str(place))
+                account["draft"] += [f"{place.name}: {remark}" for remark in further.remarks]
         if target is not None:
             target.write(flight_bytes(files))
     return account

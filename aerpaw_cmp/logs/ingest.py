@@ -1,6 +1,7 @@
 """Find logs, sniff them, read them and account for every line.
 
-A path named by the user must be readable; inside a folder, files of unknown kinds are skipped and reported.
+A path named by the user must be readable; inside a folder or an archive, files of unknown kinds are skipped and
+reported. ``dataset.zip/LW1/power_log.txt`` names a member of an archive.
 """
 
 from __future__ import annotations
@@ -15,15 +16,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line
-from .flight_file import IngestedFile
+from . import archives, blocks
+from .flight_file import IngestedFile, read_flight
+from .pieces import join
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
 from .records import has_wall_clock
 
 if TYPE_CHECKING:
     import pandas as pd
 
-MAX_BYTES = 512 * 2**20
-"""Largest file read, and largest content of a gzip file: a log of a day is a hundred times smaller."""
+MAX_BYTES = 2**32
+"""Largest content of a gzip file that is unpacked in memory: larger logs are read in blocks, or are no logs."""
 
 FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
@@ -72,9 +75,6 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
             raise InputError("a folder stands where a log is expected", path=place)
         if not place.is_file() and place.exists():
             raise InputError("not a regular file", expected="a log", path=place)
-        size = place.stat().st_size
-        if size > MAX_BYTES:
-            raise InputError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=place)
         if limit is None:
             return place.read_bytes()
         with place.open("rb") as file:
@@ -116,7 +116,8 @@ def ingest(
     Parameters
     ----------
     paths : sequence of path
-        Files and folders; folders are searched to the bottom, in sorted order. Hidden files are left out.
+        Files, folders and archives (zip, tar); folders are searched to the bottom, in sorted order. Hidden files are
+        left out. A flight file that ``ingest -o`` wrote gives the files that it holds.
     options : ReadOptions or callable, optional
         What the files cannot say themselves; a callable gives them per path.
     reader : str, optional
@@ -139,22 +140,119 @@ def ingest(
     skipped: list[Skipped] = []
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
         place = Path(path)
-        if not _is_folder(place):
+        if _is_folder(place):
+            found, left = _folder(place, options, chosen)
+        elif _is_archive(place):
+            found, left = _archive(place, options, chosen)
+        elif chosen is None and _head(place).startswith(_HDF5):
+            files += read_flight(place)
+            continue
+        else:
             files.append(read_file(place, options=options, reader=chosen))
             continue
-        found, left = _folder(place, options, chosen)
-        files += found
+        files += join(found)
         skipped += left
         if not found:
             known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
             looked = "1 file" if len(left) == 1 else f"{len(left)} files"
             first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
+            what = "folder" if _is_folder(place) else "archive"
             raise InputError(
-                f"the folder holds no log that {known} ({looked} looked at){first}",
+                f"the {what} holds no log that {known} ({looked} looked at){first}",
                 expected="one of the formats of 'aerpaw-cmp formats'",
                 path=place,
             )
     return Ingested(files, skipped)
+
+
+def _present(path: Path) -> bool:
+    try:
+        return path.exists()
+    except (OSError, ValueError):
+        return False  # an impossible path: read_bytes says so
+
+
+def exists(path: Path) -> bool:
+    """Whether a path names a file, a folder, or a member of an archive."""
+    return _present(path) or archives.inside(path) is not None
+
+
+def sniffers_of(path: Path) -> list[str]:
+    """Names of the readers whose sniffers accept a log; none for a folder of pieces."""
+    from .readers import catalogue, head_of
+
+    if path.is_dir():
+        return []
+    part = None if _present(path) else archives.inside(path)
+    if part is None:
+        data = read_bytes(path)[0]
+    else:
+        content = dict(archives.members(read_bytes(part[0])[0], part[0]))
+        data = content[part[1]]() if part[1] in content else b""
+    return [reader.name for reader in catalogue() if reader.kinds and reader.sniff(head_of(data))]
+
+
+def _head(place: Path) -> bytes:
+    """First bytes of a file, none where it cannot be read: reading it says why."""
+    try:
+        return _raw(place, HEAD_BYTES)
+    except InputError:
+        return b""
+
+
+def _is_archive(place: Path) -> bool:
+    head = _head(place)
+    if head.startswith(_GZIP):
+        try:
+            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1024)
+        except zlib.error:
+            return False
+    return archives.is_archive(head)
+
+
+def _archive(
+    place: Path, options: OptionsFor | None, chosen: Reader | None
+) -> tuple[list[IngestedFile], list[Skipped]]:
+    """All logs of an archive; what cannot be read is reported, not fatal."""
+    files: list[IngestedFile] = []
+    skipped: list[Skipped] = []
+    content = dict(archives.members(read_bytes(place)[0], place))
+    for name, read in content.items():
+        path = place / name
+        try:
+            files.append(_member(path, read(), content, name, options, chosen))
+        except InputError as error:
+            skipped.append(Skipped(str(path), _samples_of(name, set(content)) or error.found))
+    return files, skipped
+
+
+def _member(
+    path: Path,
+    raw: bytes,
+    content: Mapping[str, Callable[[], bytes]],
+    name: str,
+    options: OptionsFor | None,
+    chosen: Reader | None,
+) -> IngestedFile:
+    """One file of an archive."""
+    digest = hashlib.sha256(raw).hexdigest()
+    data = _gunzip(raw, path) if raw.startswith(_GZIP) else raw
+    if archives.is_archive(data[:HEAD_BYTES]):
+        raise InputError("an archive inside an archive: unpack it", path=path)
+
+    def beside(other: str) -> bytes | None:
+        found = content.get(f"{name.rpartition('/')[0]}/{other}".lstrip("/"))
+        return None if found is None else found()
+
+    return _read(path, data, digest, chosen or identify(data, path=str(path)), options, beside)
+
+
+def _samples_of(name: str, names: set[str]) -> str | None:
+    """What a file of samples is whose meta file lies beside it."""
+    meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
+    if name.endswith(".sigmf-data") and meta in names:
+        return f"no log: the samples of {Path(meta).name}, read with it"
+    return None
 
 
 def _is_folder(place: Path) -> bool:
@@ -165,29 +263,82 @@ def _is_folder(place: Path) -> bool:
 
 
 def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Reader | None = None) -> IngestedFile:
-    """Read one file; see :func:`ingest`."""
+    """Read one file, or one member of an archive; see :func:`ingest`."""
     place = Path(path)
+    if (part := None if _present(place) else archives.inside(place)) is not None:
+        archive, name = part
+        content = dict(archives.members(read_bytes(archive)[0], archive))
+        if name not in content:
+            raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
+        return _member(place, content[name](), content, name, options, reader)
     head = _raw(place, HEAD_BYTES)
     if head.startswith(_HDF5):
         raise InputError(
-            "an HDF5 file, such as 'ingest -o' writes",
-            expected="the logs themselves (logs.flight_file.read_flight gives back what a flight file holds)",
-            cause="a flight file, or a MATLAB 7.3 file (save it with -v7)",
+            "an HDF5 file, such as the flight file that 'ingest -o' writes",
+            expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
             path=path,
         )
-    if reader is None and not head.startswith(_GZIP) and not hides_its_content(head):
+    packed = head.startswith(_GZIP)
+    if packed and place.stat().st_size > blocks.FROM_BYTES // 16:
+        head, packed = _unpacked_head(head), False
+    if reader is None and not packed and not hides_its_content(head):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
+    if (large := _in_blocks(place, reader, options)) is not None:
+        return large
     data, digest = read_bytes(place)
     if not data.strip() or data.startswith(b"version https://git-lfs"):
         identify(data, path=str(path))  # raises the message for an empty file or a pointer
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 
 
-def _read(path: Path, data: bytes, digest: str, reader: Reader, options: OptionsFor | None) -> IngestedFile:
+def _unpacked_head(head: bytes) -> bytes:
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, HEAD_BYTES)
+    except zlib.error:
+        return head  # damaged: reading it says so
+
+
+def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -> IngestedFile | None:
+    """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
+    from . import limits
+
+    least = blocks.FROM_BYTES // 16 if _raw(place, 2) == _GZIP else blocks.FROM_BYTES
+    if place.stat().st_size < least or reader is None or reader.apart is None:
+        return None
+    given = _options(place, options, _beside(place))
+    try:
+        result, digest = blocks.read(place, reader, given)
+    except blocks.Whole:
+        return None
+    return IngestedFile(str(place), digest, limits.check(result)) if result.accepted else None
+
+
+def _options(path: Path, options: OptionsFor | None, beside: Callable[[str], bytes | None]) -> ReadOptions:
+    given = options(path) if callable(options) else options or ReadOptions()
+    return replace(given, file_name=path.name, beside=beside)
+
+
+def _beside(path: Path) -> Callable[[str], bytes | None]:
+    """Reads another file of a log's folder."""
+
+    def read(name: str) -> bytes | None:
+        other = path.parent / Path(name).name
+        return read_bytes(other)[0] if other.is_file() else None
+
+    return read
+
+
+def _read(
+    path: Path,
+    data: bytes,
+    digest: str,
+    reader: Reader,
+    options: OptionsFor | None,
+    beside: Callable[[str], bytes | None] | None = None,
+) -> IngestedFile:
     from . import limits  # loads pandas, as any reader does
 
-    given = options(path) if callable(options) else options or ReadOptions()
-    given = replace(given, file_name=path.name)
+    given = _options(path, options, beside or _beside(path))
     try:
         result = limits.check(reader.read(data, given))
     except (InputError, UsageError) as error:
@@ -223,9 +374,15 @@ def _folder(
             skipped.append(Skipped(str(place), what))
             continue
         try:
-            files.append(read_file(place, options=options, reader=chosen))
+            if _is_archive(place):
+                found, left = _archive(place, options, chosen)
+                files, skipped = files + found, skipped + left
+            else:
+                files.append(read_file(place, options=options, reader=chosen))
         except InputError as error:
-            skipped.append(Skipped(str(place), error.found))
+            meta = place.with_suffix(".sigmf-meta")
+            names = {place.name, meta.name} if meta.exists() else set()
+            skipped.append(Skipped(str(place), _samples_of(place.name, names) or error.found))
     return files, skipped
 
 

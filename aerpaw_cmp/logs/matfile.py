@@ -2,7 +2,7 @@
 
 SciPy's reader is compiled code that trusts the file: a single wrong byte can end the process with a segmentation
 fault, which nobody can catch. Here every size is checked before it is used. What a merged flight and a gain grid need
-is read: full real numeric arrays and character matrices, plain or compressed; variables of other classes are left out.
+is read: full numeric arrays and character matrices, plain or compressed; variables of other classes are left out.
 Layout: "MAT-File Format" (MathWorks), chapter 1, level 5.
 """
 
@@ -155,14 +155,23 @@ def _variable(body: bytes, order: str, wanted: Collection[str] | None) -> tuple[
     word = struct.unpack(order + "II", flags.body)[0]
     family, is_complex = word & 0xFF, bool(word & 0x0800)
     unwanted = wanted is not None and title not in wanted
-    if unwanted or is_complex or (family not in _CLASSES and family != _CHARACTERS):
+    if unwanted or (family not in _CLASSES and family != _CHARACTERS):
         return title, None
     values = next(parts, None)
     if values is None:
         raise _damaged(f"variable {title!r} without values")
     if family == _CHARACTERS:
         return title, _rows(values, shape, order)
-    return title, _numbers(values, shape, order, _CLASSES[family])
+    real = _numbers(values, shape, order, _CLASSES[family])
+    if not is_complex:
+        return title, real
+    imaginary = next(parts, None)
+    if imaginary is None:
+        raise _damaged(f"complex variable {title!r} without imaginary part")
+    with np.errstate(all="ignore"):
+        both = real.astype(np.complex128)
+        both.imag = _numbers(imaginary, shape, order, _CLASSES[family])  # 1j * inf would be no number
+    return title, both
 
 
 def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) -> AnyArray:
@@ -172,7 +181,8 @@ def _numbers(values: _Element, shape: tuple[int, ...], order: str, kind: str) ->
     count = math.prod(shape)
     if len(values.body) != count * np.dtype(stored).itemsize:
         raise _damaged(f"{len(values.body)} bytes for {count} values")
-    return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
+    with np.errstate(all="ignore"):  # damaged values may be any number
+        return np.frombuffer(values.body, dtype=order + stored).astype(kind).reshape(shape, order="F")
 
 
 def _rows(values: _Element, shape: tuple[int, ...], order: str) -> AnyArray:

@@ -6,6 +6,7 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
@@ -47,6 +48,9 @@ class ReadOptions:
         RSS at or below this is out of coverage.
     file_name : str
         Of the log, without folders; set by ``ingest``. For formats whose content does not say what it is.
+    beside : callable, optional
+        Content of another file of the log's folder by its name, None where there is none; set by ``ingest``. For
+        formats that keep their samples in a second file.
     """
 
     timezone: str | None = None
@@ -61,6 +65,7 @@ class ReadOptions:
     unit: str | None = None
     floor_db: float = -200.0
     file_name: str = ""
+    beside: Callable[[str], bytes | None] | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,6 +86,11 @@ class Reader:
         ``sniff(head: bytes) -> bool``: content only, never the file name; must not raise.
     read : callable
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
+    pieces : bool
+        Is a file of a few records a piece of the log that its folder holds?
+    apart : re.Pattern, optional
+        Lines that are read alone, one record each: between two of them a large file may be cut. None where a line
+        needs others (a header, a block it stands in).
     """
 
     name: str
@@ -89,6 +99,8 @@ class Reader:
     sample: str
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
+    pieces: bool = False
+    apart: re.Pattern[bytes] | None = None
 
 
 @cache
@@ -181,10 +193,42 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     binary = b"\0" in head
     raise InputError(
         "binary content that no reader knows" if binary else f"no reader knows this content: {_excerpt(head)}",
-        expected="one of the formats of 'aerpaw-cmp formats'",
-        cause="another kind of file, or a damaged one" if binary else "a log of a kind that is not supported",
+        expected="one of the formats of 'aerpaw-cmp formats'" + ("" if binary else nearest(head)),
+        cause="another kind of file, or a damaged one" if binary else _way_out(head),
         path=path,
     )
+
+
+def nearest(head: bytes) -> str:
+    """The format whose sample line looks most like the first lines, in words; nothing where none is near.
+
+    Compared are shapes: digits become 0, letters a, so that what counts is how a line is built.
+    """
+    from difflib import SequenceMatcher
+
+    lines = [_shape(line.decode("utf-8", "replace")[:200]) for line in head[:4096].split(b"\n")[:6] if line.strip()]
+    best, name, sample = 0.0, "", ""
+    for reader in catalogue():
+        if not reader.kinds or not reader.sample or reader.sample.startswith("binary"):
+            continue
+        shape = _shape(reader.sample)
+        score = max((SequenceMatcher(None, line, shape, autojunk=False).ratio() for line in lines), default=0.0)
+        if score > best:
+            best, name, sample = score, reader.name, reader.sample
+    return f"; the nearest is {name!r}, with lines such as {sample!r}" if best > 0.6 else ""
+
+
+def _shape(text: str) -> str:
+    return re.sub(r"a+", "a", re.sub(r"[A-Za-z]", "a", re.sub(r"\d", "0", text)))
+
+
+def _way_out(head: bytes) -> str:
+    first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
+    names = [name.strip().strip('"') for name in first.split(",")]
+    if len(names) > 1 and all(name and not name[0].isdigit() for name in names):
+        example = f"--map {names[0]!r}=time --map {names[-1]!r}=rss_db"
+        return f"a table of another kind: name what its columns hold, e.g. {example}"
+    return "a log of a kind that is not supported: docs/adding_a_reader.md"
 
 
 def _excerpt(head: bytes) -> str:

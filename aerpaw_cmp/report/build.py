@@ -17,7 +17,8 @@ from ..compare.rank import RankFit
 from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, LogSettings
+from ..logs.ingest import IngestedFile
 from . import data as record
 from .export import merge
 
@@ -68,7 +69,7 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=(*inputs_of(data), *other_inputs),
+        inputs=(*inputs_of(settings.logs, data.files), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(
@@ -84,10 +85,21 @@ def report_data(
         speed=tuple(speed),
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
-        notes=(*settings.flight.notes, *notes),  # the page adds those of the site
+        notes=(*settings.flight.notes, *notes, *_serving_note(result)),  # the page adds those of the site
         settings=settings.model_dump(mode="json"),
         stages_s=dict(stages_s or {}),
     )
+
+
+def _serving_note(result: FlightResult) -> list[str]:
+    """How often the cell predicted strongest is the one that served, and what always naming one would hit."""
+    if result.serving is None or not result.serving.n:
+        return []
+    hits, most = 100 * result.serving.hit_share, 100 * result.serving.majority_share
+    return [
+        f"Serving cell: the one predicted strongest served in {hits:.0f} % of {result.serving.n} samples; "
+        f"always naming the most frequent one hits {most:.0f} % (confusion matrix: metrics.json, serving)."
+    ]
 
 
 # --- RSS -----------------------------------------------------------------------------------------------------------
@@ -241,6 +253,8 @@ def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
         merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
+    if result.serving is not None:
+        merge(found, {"serving": result.serving.as_dict()})
     for pair in result.pairs:
         merge(found, {"pairs": {pair.tower: {f"{pair.first} - {pair.second}": pair.score.as_dict()}}})
     return found
@@ -339,7 +353,7 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
 # --- the flight ----------------------------------------------------------------------------------------------------
 
 
-def inputs_of(data: FlightData) -> tuple[record.InputFile, ...]:
+def inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[record.InputFile, ...]:
     """The account of every log."""
     return tuple(
         record.InputFile(
@@ -354,7 +368,7 @@ def inputs_of(data: FlightData) -> tuple[record.InputFile, ...]:
             warnings=file.result.warnings,
             rejected_lines=file.result.rejected,
         )
-        for log, file in zip(data.settings.logs, data.files, strict=True)
+        for log, file in zip(logs, files, strict=True)
     )
 
 

@@ -330,3 +330,45 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
     return rows.stream(
         "rss", tower, {"rss_db": level}, where=where, flag=flag, node=tower, channel="snr", unit="dB", quantity="SNR"
     )
+
+
+def mean_rank(
+    rows: Rows,
+    ri: FloatArray,
+    beside: Mapping[str, FloatArray],
+    *,
+    none: BoolArray,
+    pick: IntArray | None = None,
+) -> Stream | None:
+    """Rank stream ``gnb`` of a base station that counts from one and prints means over its report period.
+
+    A mean between two ranks is no rank: it stands in ``rank_mean`` and its row is flagged ``rank_is_a_mean``.
+
+    Parameters
+    ----------
+    ri : float array, shape (m,)
+    beside : mapping
+        Further columns.
+    none : bool array, shape (m,)
+        Where the number means that nothing was reported.
+    pick : int array, shape (m,), optional
+        See :meth:`Rows.stream`.
+    """
+    flag = (rows.flag if pick is None else rows.flag[pick]).copy()
+    absent = np.isnan(ri) | none
+    good = (ri >= 1) & (ri <= 8) & ~absent
+    whole = good & (ri == np.round(ri))
+    _lines.add_flag(flag, absent, "no_csi")
+    _lines.add_flag(flag, ~good & ~absent, "ri_out_of_range")
+    _lines.add_flag(flag, good & ~whole, "rank_is_a_mean")
+    values = {
+        "rank": np.where(whole, ri, np.nan),
+        "ri_raw": ri,
+        **beside,
+        "rank_mean": np.where(good, ri, np.nan),
+    }
+    where = None if pick is not None else np.ones(len(rows), dtype=bool)
+    about = {"ri_base": "one", "source": "CSI report, mean over the period"}
+    if pick is not None:
+        return rows.stream("rank", rows.options.channel or "gnb", values, pick=pick, flag=flag, about=about)
+    return rows.stream("rank", rows.options.channel or "gnb", values, where=where, flag=flag, about=about)

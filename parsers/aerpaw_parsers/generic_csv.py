@@ -11,6 +11,7 @@ import re
 from difflib import get_close_matches
 
 import numpy as np
+import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
@@ -20,6 +21,8 @@ from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Str
 from . import _frames, _lines, _time
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
+_BESIDE: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
+"""What may stand beside a rank, or beside a level: the positions of a table merged by hand are its track."""
 _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": ("rss_db",), "rank": ("ri_raw",)}
 """Columns that a record of a kind is about."""
 
@@ -51,7 +54,7 @@ def _checked(options: ReadOptions, header: list[str]) -> tuple[Kind, dict[str, i
     """Kind, and the position of the file column for each record column."""
     if options.kind is None:
         raise UsageError("generic_csv does not know what the file holds", expected="'kind:' telemetry, rss or rank")
-    allowed = ["time", *COLUMNS[options.kind], *(EXTRA if options.kind == "rank" else ())]
+    allowed = ["time", *COLUMNS[options.kind], *_BESIDE.get(options.kind, ())]
     unknown = sorted(set(options.columns) - set(allowed))
     if unknown:
         near = get_close_matches(unknown[0], allowed, 1)
@@ -152,7 +155,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
         "generic_csv",
-        (stream,) if len(frame) else (),
+        (stream, *_track(kind, frame, options)) if len(frame) else (),
         len(lines),
         len(frame),
         int(blank.sum()) + 1,
@@ -180,6 +183,17 @@ def _table(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[
         else:
             rejected.append(lines.reject(i, f"{len(fields)} fields where the header has {width} (torn line?)"))
     return np.array(numbers, dtype=np.int64), cells, rejected
+
+
+def _track(kind: Kind, frame: pd.DataFrame, options: ReadOptions) -> list[Stream]:
+    """Positions that stand beside levels, as the track of the flight: a table merged by hand holds both."""
+    names = [name for name in COLUMNS["telemetry"] if name in frame and name not in ("fix", "satellites")]
+    if kind != "rss" or not {"latitude_deg", "longitude_deg"} <= set(names):
+        return []
+    values = {name: frame[name].to_numpy() for name in names}
+    flag = _lines.flags(len(frame))
+    track = _frames.frame("telemetry", frame["time"].to_numpy(), frame["line"].to_numpy(), flag, values)
+    return [Stream("telemetry", "vehicle", track, _frames.attributes(options, source="mapped columns"))]
 
 
 def _values(

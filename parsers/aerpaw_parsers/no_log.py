@@ -13,7 +13,7 @@ from aerpaw_cmp.logs.matfile import MAGIC
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, flight_mat, gpx, nemo_kml, vehicle_log
+from . import _lines, flight_mat, gpx, iq_burst, nemo_kml, vehicle_log
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
@@ -41,12 +41,9 @@ def _antenna_mat(head: bytes) -> bool:
 
 
 def _other_mat(head: bytes) -> bool:
-    return (
-        head.startswith(MAGIC)
-        and not flight_mat.sniff(head)
-        and not _antenna_mat(head)
-        and bool(flight_mat.names_of(head))
-    )
+    if not head.startswith(MAGIC) or flight_mat.sniff(head) or iq_burst.sniff(head):
+        return False
+    return not _antenna_mat(head) and bool(flight_mat.names_of(head))
 
 
 def _kml(head: bytes) -> bool:

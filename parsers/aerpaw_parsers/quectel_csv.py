@@ -294,4 +294,5 @@ READER = Reader(
     sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
     sniff=sniff,
     read=read,
+    apart=_CSI,
 )

@@ -279,4 +279,5 @@ READER = Reader(
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
     sniff=sniff,
     read=read,
+    apart=re.compile(_HEAD + rb"[0-7]{7,12} +[-0-9.]{1,16}\r?$"),
 )

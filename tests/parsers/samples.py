@@ -13,6 +13,7 @@ import numpy as np
 import scipy.io
 
 from aerpaw_cmp.logs.readers import ReadOptions
+from tests.parsers import autopilots
 
 OPTIONS = ReadOptions(
     timezone="America/New_York",
@@ -20,6 +21,7 @@ OPTIONS = ReadOptions(
     kind="rss",
     columns={"time": "Time", "rss_db": "Level"},
     unit="dBm",
+    file_name="results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat",
 )
 
 VEHICLE_10 = (
@@ -308,6 +310,88 @@ def mat_73() -> bytes:
     return head.ljust(512, b"\0") + file.getvalue()[512:]
 
 
+SRSRAN_GNB = (
+    b"[2025-03-02 10:00:00.000001]          |--------DL--------|---UL---\n"
+    b"[2025-03-02 10:00:00.000002]  pci rnti | cqi  ri  mcs  brate   ok  nok  (%)  dl_bs | pusch  rsrp  ri  mcs  brate\n"
+    b"[2025-03-02 10:00:00.000003]    1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2   1   28    17M\n"
+    b"[2025-03-02 10:00:01.000003]    1 4601 |  15 2.2   28    17M  908    0   0%    44k |  26.7 -21.2   1   28    17M\n"
+    b"[2025-03-02 10:00:02.000003]    1 4601 | n/a n/a   28    17M  908    0   0%    44k |  26.7 -21.2   1   28    17M\n"
+    b"[2025-03-02 10:00:03.000003]    1 4601 |  15 \n"
+)
+SRSRAN_GNB_OLD = (
+    b"[2025-03-02 10:00:00.000002]  pci rnti  cqi  ri  mcs  brate   ok  nok  (%)  dl_bs | pusch  mcs  brate\n"
+    b"[2025-03-02 10:00:00.000003]    1 4601   15   1   27   797k  471    0   0%    359 |  65.5   28    28M\n"
+)
+SRSRAN_LOG = (
+    b"2025-03-02T10:00:00.000001 [GNB     ] [I] Built in Release mode\n"
+    b"2025-03-02T10:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=15 dl_ri=2.0 dl_mcs=27 dl_brate_bps=1000\n"
+)
+SRSRAN_JSON = (
+    b'{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "rnti": 17921, "cqi": 15, "dl_ri": 2.0, "dl_mcs": 27}}]}\n'
+    b'{"timestamp": "2025-03-02T15:00:01.250Z", "cells": [{"cell_metrics": {}, "ue_list": [{"pci": 1, "rnti": 17921, "cqi": 15, "dl_ri": 1.5, "dl_mcs": 27}]}]}\n'
+    b'{"timestamp": 1740927602.25, "app_resource_usage": {"cpu": 12}}\n'
+    b'{"timestamp": 17409\n'
+).replace(b'"2025-03-02T15:00:01.250Z"', b"1740927601.25")
+OAI_GNB = (
+    b"[2025-03-02 10:00:00.000001] [NR_MAC]   Frame.Slot 128.0\n"
+    b"[2025-03-02 10:00:00.000002] UE RNTI 1f4d CU-UE-ID 1 in-sync PH 51 dB PCMAX 21 dBm, average RSRP -78 (16 meas)\n"
+    b"[2025-03-02 10:00:00.000003] UE 1f4d: CQI 15, RI 2, PMI (14,1)\n"
+    b"[2025-03-02 10:00:00.000004] UE 1f4d: dlsch_rounds 5/0/0/0, dlsch_errors 0\n"
+    b"[2025-03-02 10:00:01.280003] UE 1f4d: CSI [CQI 14 RI 1 PMI (0,1)] SRS [UL-RI 2 TPMI 0]\n"
+)
+OAI_GNB_FRAMES = (
+    b"[NR_MAC]   Frame.Slot 128.0\nUE 1f4d: CQI 15, RI 2, PMI (14,1)\n"
+    b"[NR_MAC]   Frame.Slot 256.0\nUE 1f4d: CQI 15, RI 1, PMI (14,1)\n"
+)
+OAI_UE = (
+    b"1740927600.250000 [NR_PHY] I RSRP = -80 dBm, RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI = 15\n"
+    b"1740927601.250000 [NR_PHY] I RI = 1 i1 = 0.0.0, i2 = 1, SINR = 19 dB, CQI = 15\n"
+)
+AMARISOFT = (
+    b"[2025-03-02 10:00:00.000001]          ------DL------------------------ ------UL------\n"
+    b"[2025-03-02 10:00:00.000002] UE_ID  CL RNTI C cqi  ri  mcs retx txok brate  snr puc1\n"
+    b"[2025-03-02 10:00:00.000003]     1 000 0046 1  15 2.0 27.5    0  138  1.2M 25.5    -\n"
+    b"[2025-03-02 10:00:01.000003]     1 000 0046 1  15 1.5 27.5    0  138  1.2M 25.5    -\n"
+    b"[2025-03-02 10:00:02.000003]     1 000 00\n"
+)
+AMARISOFT_JSON = (
+    b'{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"enb_ue_id": 1, "rnti": 70, "cells": [{"cqi": 15, "ri": 2.0, "dl_mcs": 27.5}]}]}\n'
+    b'{"message": "ue_get", "utc": 1740927601.25, "ue_list": [{"enb_ue_id": 1, "rnti": 70, "cells": [{"cqi": 15, "ri": 1.25}]}]}\n'
+)
+SIGMF = (
+    b'{"global": {"core:datatype": "cf32_le", "core:version": "1.0.0", "core:sample_rate": 2000000},\n'
+    b' "captures": [{"core:sample_start": 0,\n'
+    b'  "measurement:time_stamp": ["2025-03-02 10:00:00.250", "2025-03-02 10:00:00.550", "none"],\n'
+    b'  "measurement:values": {"mX": [-78.7, -78.71, 0], "mY": [35.73, 35.74, 0], "mZ": [0.5, 1.5, 0],\n'
+    b'   "RSS1": [-40.5, -41.5, -1], "RSS2": [-50.5, -800, -1]}}], "annotations": []}\n'
+)
+RSS_EXPORT = (
+    b"time_utc,time_s,tower,channel,unit,east_m,north_m,up_m,measured_db,calibrated_db\n"
+    b"2025-03-02T15:00:00.250Z,0,LW1,USRP1,dBm,1,2,3,-81.5,-80\n"
+    b"2025-03-02T15:00:01.250Z,1,LW1,USRP1,dBm,1,2,3,,\n"
+    b"2025-03-02T15:00:00.250Z,0,LW2,USRP1,dBm,1,2,3,-91.5,-80\n"
+)
+RANK_EXPORT = b"time_utc,time_s,tower,east_m,north_m,up_m,measured_rank\n,0,LW1,1,2,3,2\n,1.5,LW1,1,2,3,\n"
+TAP_EXPORT = (
+    b"time_utc,uncertainty_s,n,query,status,rank,ri_raw,mcs,cqi,rsrp_dbm,sinr_db\n"
+    b"2025-03-02T15:00:00.250Z,0.02,1,nr5g_csi,ok,2,2,11,9,,\n"
+    b"2025-03-02T15:00:00.350Z,0.02,2,servingcell,ok,,,,,-80,20\n"
+)
+
+
+def iq_mat() -> bytes:
+    """A burst of two channels with amplitudes 0.1 and 0.01."""
+    phase = np.exp(1j * np.linspace(0, 20, 400))
+    file = io.BytesIO()
+    scipy.io.savemat(
+        file, {"IQ": np.array([0.1 * phase, 0.01 * phase]).astype(np.complex64), "time_stamp": np.zeros((2, 1))}
+    )
+    return file.getvalue()
+
+
+IQ_NAME = "results_3320000000.0_2000000.0_2025_03_02_10_00_00_250.mat"
+
+
 def tap_line(text: str) -> bytes:
     """A record of the tap with its checksum."""
     return f'{text},"crc":"{zlib.crc32(text.encode()):08x}"}}\n'.encode()
@@ -374,8 +458,21 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     },
     "pose_csv": {"airdata": (AIRDATA, 2, 0), "dji": (DJI, 2, 0), "converted": (CONVERTED, 2, 1)},
     "quectel_console": {"tables": (QUECTEL_CONSOLE, 4, 1)},
+    "srsran_gnb": {"console": (SRSRAN_GNB, 3, 1), "old_console": (SRSRAN_GNB_OLD, 1, 0), "log": (SRSRAN_LOG, 1, 0)},
+    "srsran_json": {"metrics": (SRSRAN_JSON, 2, 1)},
+    "oai_log": {"gnb": (OAI_GNB, 3, 0), "frames": (OAI_GNB_FRAMES, 2, 0), "ue": (OAI_UE, 2, 0)},
+    "amarisoft": {"monitor": (AMARISOFT, 2, 1)},
+    "amarisoft_json": {"answers": (AMARISOFT_JSON, 2, 0)},
+    "sigmf": {"dataset12": (SIGMF, 2, 1)},
+    "iq_burst": {"two_channels": (iq_mat(), 1, 0)},
+    "own_csv": {"rss": (RSS_EXPORT, 3, 0), "rank": (RANK_EXPORT, 2, 0), "tap": (TAP_EXPORT, 2, 0)},
+    "ardupilot_bin": {"flight": (autopilots.dataflash(), 5, 0)},
+    "mavlink_tlog": {"version_2": (autopilots.tlog(2), 5, 0), "version_1": (autopilots.tlog(1), 5, 0)},
+    "px4_ulog": {"flight": (autopilots.ulog(), 5, 0)},
     "generic_csv": {"mapped": (GENERIC, 2, 1)},
 }
+BINARY = ("flight_mat", "iq_burst", "sigmf", "ardupilot_bin", "mavlink_tlog", "px4_ulog")
+"""Formats whose account counts rows, values or messages."""
 CASES = [(reader, name) for reader, samples in SAMPLES.items() for name in samples]
 
 WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
@@ -388,6 +485,14 @@ WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
     ("flight_mat", "processed"),
     ("gpx", "track"),
     ("pose_csv", "airdata"),
+    "srsran_json",
+    ("oai_log", "frames"),
+    ("oai_log", "ue"),
+    "amarisoft_json",
+    "own_csv",
+    "ardupilot_bin",
+    "mavlink_tlog",
+    "px4_ulog",
 )
 """Readers and samples whose clock is UTC or relative."""
 

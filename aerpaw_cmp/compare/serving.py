@@ -1,0 +1,106 @@
+"""Which cell serves: the one that the prediction says is strongest, against the one that the phone was on."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from ..common.units import FloatArray, IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ServingComparison:
+    """Serving cells, logged against predicted.
+
+    Parameters
+    ----------
+    cells : tuple of str
+    confusion : (cells, cells + 1) int
+        Samples by the cell that served (row) and the one predicted strongest (column); the last column counts samples
+        at which no cell is predicted at all.
+    n : int
+        Samples with a serving cell among ``cells``.
+    """
+
+    cells: tuple[str, ...]
+    confusion: IntArray
+    n: int
+
+    @property
+    def hit_share(self) -> float:
+        """Share of the samples whose serving cell is the one predicted strongest; NaN without samples."""
+        return float(np.trace(self.confusion) / self.n) if self.n else float("nan")
+
+    @property
+    def majority_share(self) -> float:
+        """Share that always naming the cell that served most would hit: what a prediction has to beat."""
+        return float(self.confusion.sum(axis=1).max() / self.n) if self.n else float("nan")
+
+    def as_dict(self) -> dict[str, Any]:
+        """For metrics.json."""
+        names = (*self.cells, "none")
+        return {
+            "cells": list(self.cells),
+            "n": self.n,
+            "hit_share": self.hit_share,
+            "majority_share": self.majority_share,
+            "confusion": {
+                cell: dict(zip(names, map(int, row), strict=True))
+                for cell, row in zip(self.cells, self.confusion, strict=True)
+            },
+        }
+
+
+def compare_serving(served: ArrayLike, predicted_dbm: ArrayLike, cells: Sequence[str]) -> ServingComparison:
+    """Serving-cell hits and the confusion matrix.
+
+    Parameters
+    ----------
+    served : array_like, int, (n,)
+        Index of the serving cell; negative where it is not known or none of ``cells``: left out.
+    predicted_dbm : array_like, (n, cells)
+        NaN where no path is predicted. Of equal levels the first cell counts as strongest.
+    cells : sequence of str
+
+    Examples
+    --------
+    >>> compare_serving([0, 1, 1, -1], [[-70, -80], [-75, -71], [-60, -90], [-60, -90]], ["a", "b"]).confusion.tolist()
+    [[1, 0, 0], [1, 1, 0]]
+    """
+    index = np.asarray(served, dtype=np.int64)
+    level: FloatArray = np.asarray(predicted_dbm, dtype=np.float64)
+    if level.shape != (len(index), len(cells)):
+        raise ValueError(f"levels must have shape {(len(index), len(cells))}, found {level.shape}")
+    if index.size and index.max() >= len(cells):
+        raise ValueError(f"serving cell {index.max()} of {len(cells)}")
+    known = index >= 0
+    filled = np.where(np.isnan(level), -np.inf, level)
+    strongest = np.where(np.isnan(level).all(axis=1), len(cells), filled.argmax(axis=1) if len(cells) else 0)
+    confusion = np.zeros((len(cells), len(cells) + 1), dtype=np.int64)
+    np.add.at(confusion, (index[known], strongest[known]), 1)
+    return ServingComparison(cells=tuple(cells), confusion=confusion, n=int(known.sum()))
+
+
+def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s: float) -> FloatArray:
+    """Values of one clock at the times of another: those of the nearest sample, NaN where none is near.
+
+    Parameters
+    ----------
+    time_s : array_like, (n,)
+    of_s : array_like, (m,)
+        Ascending.
+    values : array_like, (m,)
+    within_s : float
+    """
+    wanted, known = np.asarray(time_s, dtype=np.float64), np.asarray(of_s, dtype=np.float64)
+    column = np.asarray(values, dtype=np.float64)
+    if not len(known):
+        return np.full(len(wanted), np.nan)
+    after = np.clip(np.searchsorted(known, wanted), 0, len(known) - 1)
+    before = np.maximum(after - 1, 0)
+    near = np.where(np.abs(known[before] - wanted) <= np.abs(known[after] - wanted), before, after)
+    return np.where(np.abs(known[near] - wanted) <= within_s, column[near], np.nan)

@@ -1,0 +1,136 @@
+"""Logs of several flights told apart by time and place."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..logs.ingest import IngestedFile
+from ..logs.records import Stream, has_wall_clock
+from .time_origin import Origin, origin_of
+
+SLACK = np.timedelta64(5, "m")
+"""Logs that end and begin within this are of one flight: radios are started before the take-off."""
+APART_DEG = 0.05
+"""Tracks at one time, but some 5 km apart, are of two aircraft."""
+
+Span = tuple[np.datetime64, np.datetime64]
+
+
+@dataclass
+class Flight:
+    """Files of one flight, and when it was (None: nothing has a wall clock)."""
+
+    files: list[IngestedFile] = field(default_factory=list)
+    span: Span | None = None
+    place: tuple[float, float] | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether it holds something to compare, and positions to compare it at."""
+        streams = [stream for file in self.files for stream in file.result.streams]
+        measured = [stream for stream in streams if stream.kind in ("rss", "rank")]
+        tracked = any(stream.kind == "telemetry" for stream in streams)
+        return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
+
+
+def flights(files: Sequence[IngestedFile]) -> list[Flight]:
+    """Flights in the order of time.
+
+    Telemetry begins a flight; a radio log belongs to the flight that it shares most time with. Logs with relative
+    times go to the flight on whose track their positions lie, else to that whose files lie in their folder; where
+    that says nothing, to the only flight, or to one of their own.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+    """
+    timed = [(file, span) for file in files if (span := span_of(file)) is not None]
+    found: list[Flight] = []
+    for file, span in sorted(timed, key=lambda one: (not _has_track(one[0]), one[1][0])):
+        place = _place(file)
+        near = [flight for flight in found if _meet(flight, span, place)]
+        flight = max(near, key=lambda one: _shared(one.span, span), default=None)
+        if flight is None:
+            flight = Flight(span=span, place=place)
+            found.append(flight)
+        flight.files.append(file)
+        if _has_track(file) or not any(_has_track(other) for other in flight.files):
+            assert flight.span is not None
+            flight.span = (min(flight.span[0], span[0]), max(flight.span[1], span[1]))
+            flight.place = flight.place or place
+    for file in files:
+        if span_of(file) is None:
+            _home(file, found).files.append(file)
+    return sorted(found, key=lambda one: (one.span is None, one.span[0] if one.span else np.datetime64(0, "ns")))
+
+
+def span_of(file: IngestedFile) -> Span | None:
+    """First and last time of a file's streams; None where it has no wall clock."""
+    times = [stream.frame["time"].to_numpy("datetime64[ns]") for stream in file.result.streams if len(stream.frame)]
+    times = [time[~np.isnat(time)] for time in times]
+    times = [time for time in times if len(time)]
+    if not times:
+        return None
+    first, last = min(time.min() for time in times), max(time.max() for time in times)
+    return (first, last) if has_wall_clock(first) else None
+
+
+def _tracks(file: IngestedFile) -> list[Stream]:
+    return [stream for stream in file.result.streams if stream.kind == "telemetry"]
+
+
+def _has_track(file: IngestedFile) -> bool:
+    return bool(_tracks(file))
+
+
+def _place(file: IngestedFile) -> tuple[float, float] | None:
+    for stream in _tracks(file):
+        known = stream.frame[["latitude_deg", "longitude_deg"]].dropna()
+        if len(known):
+            return float(known["latitude_deg"].median()), float(known["longitude_deg"].median())
+    return None
+
+
+def _meet(flight: Flight, span: Span, place: tuple[float, float] | None) -> bool:
+    if flight.span is None or flight.span[0] - SLACK > span[1] or span[0] > flight.span[1] + SLACK:
+        return False
+    if place is None or flight.place is None:
+        return True
+    # the margin before and after is for radios: two tracks must share time
+    if flight.span[0] > span[1] or span[0] > flight.span[1]:
+        return False
+    return max(abs(place[0] - flight.place[0]), abs(place[1] - flight.place[1])) < APART_DEG
+
+
+def _shared(one: Span | None, other: Span) -> np.timedelta64:
+    """Time that two spans share; negative where they do not."""
+    assert one is not None
+    return min(one[1], other[1]) - max(one[0], other[0])
+
+
+def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
+    """Origin under which a log with positions lies on the track of a flight."""
+    tracks = [track for other in flight.files for track in _tracks(other)]
+    found = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
+    return min((one for one in found if one is not None), key=lambda one: one.distance_m, default=None)
+
+
+def _home(file: IngestedFile, found: list[Flight]) -> Flight:
+    """The flight of a file without a wall clock; a new one is added to ``found``."""
+    by_track = [
+        (origin.distance_m, i) for i, flight in enumerate(found) if (origin := _origin(file, flight)) is not None
+    ]
+    if by_track:
+        return found[min(by_track)[1]]
+    folder = Path(file.path).parent
+    near = [flight for flight in found if any(Path(other.path).parent == folder for other in flight.files)]
+    if len(near) != 1:
+        near = found if len(found) == 1 else []
+    if not near:
+        found.append(Flight())
+        near = found[-1:]
+    return near[0]

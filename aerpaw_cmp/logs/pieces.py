@@ -1,0 +1,71 @@
+"""Files that are pieces of one log: a folder of thousands of bursts is read as one file."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from .flight_file import IngestedFile
+from .readers import catalogue
+from .records import ReadResult, RejectedLine, Stream
+
+if TYPE_CHECKING:
+    import pandas as pd
+
+PIECE_RECORDS = 50
+"""A file with more records than this in a stream is a log of its own."""
+
+
+def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
+    """Files in order, the pieces of one folder and reader joined under the name of the folder."""
+    kinds = {reader.name for reader in catalogue() if reader.pieces}
+    groups: dict[tuple[str, str], list[IngestedFile]] = {}
+    for file in files:
+        if file.result.reader in kinds and all(len(s.frame) <= PIECE_RECORDS for s in file.result.streams):
+            groups.setdefault((str(Path(file.path).parent), file.result.reader), []).append(file)
+    joined: dict[str, IngestedFile | None] = {}
+    for (folder, _), group in groups.items():
+        if len(group) > 1:
+            joined |= {file.path: None for file in group[1:]}
+            joined[group[0].path] = _joined(folder, group)
+    made = [joined.get(file.path, file) for file in files]
+    return [file for file in made if file is not None]
+
+
+def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
+    """One log of the pieces; its lines are theirs, one behind the other."""
+    digest = hashlib.sha256("".join(file.sha256 for file in group).encode()).hexdigest()
+    before = 0
+    parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}
+    rejected: list[RejectedLine] = []
+    for file in group:
+        for stream in file.result.streams:
+            frame = stream.frame.assign(line=stream.frame["line"] + before)
+            parts.setdefault((stream.kind, stream.name), []).append((stream, frame))
+        rejected += [RejectedLine(line.number + before, line.reason, line.text) for line in file.result.rejected]
+        before += file.result.lines
+    streams = tuple(_stream(part) for part in parts.values())
+    warnings = dict.fromkeys(text for file in group for text in file.result.warnings)
+    result = ReadResult(
+        group[0].result.reader,
+        streams,
+        before,
+        sum(file.result.accepted for file in group),
+        sum(file.result.blank for file in group),
+        tuple(rejected),
+        (f"{len(group)} files of this folder were joined", *warnings),
+    )
+    return IngestedFile(folder, digest, result)
+
+
+def _stream(part: Sequence[tuple[Stream, pd.DataFrame]]) -> Stream:
+    import pandas as pd
+
+    first = part[0][0]
+    common = {
+        key: value for key, value in first.attributes.items() if all(s.attributes.get(key) == value for s, _ in part)
+    }
+    frame = pd.concat([frame for _, frame in part]).sort_values("time", kind="stable").reset_index(drop=True)
+    return Stream(first.kind, first.name, frame, common)

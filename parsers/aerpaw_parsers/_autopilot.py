@@ -1,0 +1,120 @@
+"""One pose from the messages of any autopilot.
+
+Positions stand at their own times; attitude and velocity are those of the nearest message.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
+
+from . import _frames, _lines, _rows, _time
+
+NEAR_S = 0.5
+"""An attitude farther in time than this from a position is not that of the position."""
+_GPS_EPOCH_S = 315_964_800 - 18
+"""GPS week 0 as UTC seconds of 1970, leap seconds since 2017 taken off."""
+
+
+@dataclass
+class Series:
+    """Messages of one kind: ``time_s`` of the autopilot (n,), their 0-based numbers, and columns (n,)."""
+
+    time_s: FloatArray
+    number: IntArray
+    columns: dict[str, FloatArray] = field(default_factory=dict)
+
+    def near(self, name: str, time_s: FloatArray) -> FloatArray:
+        """A column at other times: that of the nearest message, NaN where none is near."""
+        if not len(self.time_s) or name not in self.columns:
+            return np.full(len(time_s), np.nan)
+        after = np.clip(np.searchsorted(self.time_s, time_s), 0, len(self.time_s) - 1)
+        before = np.maximum(after - 1, 0)
+        left = np.abs(self.time_s[before] - time_s) <= np.abs(self.time_s[after] - time_s)
+        best = np.where(left, before, after)
+        return np.where(np.abs(self.time_s[best] - time_s) <= NEAR_S, self.columns[name][best], np.nan)
+
+
+_MOST_S = 4e9
+"""Autopilots count seconds since 1970 or since they were switched on; more is damage, and no room for it in ns."""
+
+NONE = Series(np.zeros(0), np.zeros(0, dtype=np.int64))
+
+
+def gps_utc_s(week: FloatArray, milliseconds: FloatArray) -> FloatArray:
+    """GPS week and milliseconds of the week as seconds of UTC."""
+    return np.asarray(_GPS_EPOCH_S + week * 604_800.0 + milliseconds / 1e3)
+
+
+def offset_s(utc_s: FloatArray, time_s: FloatArray) -> float | None:
+    """UTC minus the autopilot's clock; None where no message carries both."""
+    known = (utc_s > 1e9) & (utc_s < _MOST_S) & (np.abs(time_s) < _MOST_S)
+    return float(np.median(utc_s[known] - time_s[known])) if known.any() else None
+
+
+def result(
+    reader: str, options: ReadOptions, position: Series, attitude: Series, velocity: Series, fix: Series, *,
+    utc_minus_clock_s: float | None, messages: int, damaged: list[RejectedLine], source: str,
+) -> ReadResult:  # fmt: skip
+    """Telemetry stream ``vehicle``; the lines of the account are messages, all but positions count as comments.
+
+    Parameters
+    ----------
+    position : Series
+        Columns ``latitude_deg longitude_deg altitude_m``.
+    attitude : Series
+        ``roll_deg pitch_deg yaw_deg``.
+    velocity : Series
+        ``velocity_north_mps`` and so on.
+    fix : Series
+        ``fix satellites``.
+    messages : int
+        Sound messages; each of ``damaged`` comes on top.
+    """
+    warnings: list[str] = []
+    origin = _time.origin_ns(options, needed_by=reader)
+    if utc_minus_clock_s is not None:
+        zero_ns = round(utc_minus_clock_s * 1e6) * 1000  # autopilots count microseconds
+    else:
+        zero_ns = origin or 0
+        warnings += [] if origin is not None else ["no message carries UTC: " + _rows.RELATIVE]
+    broken = len(damaged)
+    beyond = ~(np.abs(position.time_s) < _MOST_S) | ~np.isfinite(position.time_s)
+    damaged = [*damaged, *(RejectedLine(int(i) + 1, _rows.NO_TIME, "") for i in position.number[beyond])]
+    kept = np.flatnonzero(~beyond)
+    columns = {name: column[kept] for name, column in position.columns.items()}
+    position = Series(position.time_s[kept], position.number[kept], columns)
+    time: AnyArray = (np.round(position.time_s * 1e6).astype(np.int64) * 1000 + zero_ns).astype("datetime64[ns]")
+    flag = _lines.flags(len(time))
+    values: dict[str, AnyArray] = dict(position.columns)
+    lost = (np.abs(values["latitude_deg"]) < 1e-6) & (np.abs(values["longitude_deg"]) < 1e-6)
+    _lines.add_flag(flag, lost, "no_fix")
+    for name in ("latitude_deg", "longitude_deg", "altitude_m"):
+        values[name] = np.where(lost, np.nan, values[name])
+    for name in ("roll_deg", "pitch_deg", "yaw_deg"):
+        values[name] = attitude.near(name, position.time_s)
+    for name in ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps"):
+        values[name] = velocity.near(name, position.time_s)
+    for name in ("fix", "satellites"):
+        values[name] = np.nan_to_num(fix.near(name, position.time_s), nan=-1).clip(-1, 255).astype(np.int64)
+    about: dict[str, Attribute] = {"source": source}
+    if utc_minus_clock_s is None and origin is None:
+        about["clock"] = "relative"
+    frame = _frames.frame("telemetry", time, position.number + 1, flag, values)
+    warnings += _frames.steps_back(frame)
+    stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, **about))
+    accepted = len(frame)
+    return ReadResult(
+        reader,
+        (stream,) if accepted else (),
+        messages + broken,
+        accepted,
+        messages + broken - accepted - len(damaged),
+        tuple(sorted(damaged, key=lambda line: line.number)),
+        tuple(warnings),
+    )

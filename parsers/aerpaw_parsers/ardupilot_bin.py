@@ -1,0 +1,176 @@
+"""ArduPilot dataflash log (``.bin``): positions, attitude and velocity of the aircraft's own log.
+
+The format describes itself: every message begins with A3 95 and its number, ``FMT`` messages give the length and
+columns of each. Read are ``POS`` (else ``GPS``), ``ATT``, ``XKF1`` or ``NKF1`` (velocity) and ``GPS`` (UTC, fix).
+Heights are above home (``RelHomeAlt``), else above the first position. Source: ArduPilot
+``libraries/AP_Logger/LogStructure.h``.
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+
+from . import _autopilot
+
+_MARK = b"\xa3\x95"
+_FMT = 128
+_TYPES = {
+    "b": ("b", 1.0),
+    "B": ("B", 1.0),
+    "h": ("h", 1.0),
+    "H": ("H", 1.0),
+    "i": ("i", 1.0),
+    "I": ("I", 1.0),
+    "f": ("f", 1.0),
+    "d": ("d", 1.0),
+    "c": ("h", 0.01),
+    "C": ("H", 0.01),
+    "e": ("i", 0.01),
+    "E": ("I", 0.01),
+    "L": ("i", 1e-7),
+    "M": ("B", 1.0),
+    "q": ("q", 1.0),
+    "Q": ("Q", 1.0),
+    "g": ("e", 1.0),
+    "n": ("4s", 0.0),
+    "N": ("16s", 0.0),
+    "Z": ("64s", 0.0),
+    "a": ("64s", 0.0),
+}
+_WANTED = ("POS", "GPS", "ATT", "XKF1", "NKF1", "EKF1")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it begins with the description of the description."""
+    return head[:3] == _MARK + bytes([_FMT])
+
+
+class _Form:
+    """Layout of one kind of message."""
+
+    def __init__(self, length: int, name: str, form: str, columns: list[str]) -> None:
+        self.length, self.name, self.columns = length, name, columns
+        known = [_TYPES.get(letter, ("", 0.0)) for letter in form]
+        self.scales = [scale for _, scale in known]
+        self.layout = struct.Struct("<" + "".join(code for code, _ in known))
+        self.sound = self.layout.size == length - 3 and len(columns) == len(known)
+
+
+def _form(body: bytes) -> tuple[int, _Form]:
+    kind, length = body[0], body[1]
+    texts = [part.split(b"\0")[0].decode("ascii", "replace") for part in (body[2:6], body[6:22], body[22:86])]
+    return kind, _Form(length, texts[0], texts[1], texts[2].split(","))
+
+
+def _messages(
+    data: bytes,
+) -> tuple[dict[str, list[tuple[int, tuple[float, ...]]]], dict[str, _Form], int, list[RejectedLine]]:
+    """Values of the wanted messages, their forms, the number of sound messages, and damaged stretches."""
+    forms: dict[int, _Form] = {_FMT: _Form(89, "FMT", "BBnNZ", ["Type", "Length", "Name", "Format", "Columns"])}
+    found: dict[str, list[tuple[int, tuple[float, ...]]]] = {name: [] for name in _WANTED}
+    damaged: list[RejectedLine] = []
+    count, at, end = 0, 0, len(data)
+    while at + 3 <= end:
+        form = forms.get(data[at + 2]) if data[at : at + 2] == _MARK else None
+        if form is None or form.length < 3 or at + form.length > end:
+            next_mark = data.find(_MARK, at + 1)
+            next_mark = end if next_mark < 0 else next_mark
+            damaged.append(
+                RejectedLine(count + len(damaged) + 1, f"{next_mark - at} bytes at {at} that are no message", "")
+            )
+            at = next_mark
+            continue
+        body = data[at + 3 : at + form.length]
+        if data[at + 2] == _FMT:
+            kind, made = _form(body)
+            if kind != _FMT:
+                forms[kind] = made
+        elif form.name in found and form.sound:
+            raw = form.layout.unpack(body)
+            values = tuple(v * s if s else float("nan") for v, s in zip(raw, form.scales, strict=True))
+            found[form.name].append((count + len(damaged), values))
+        count += 1
+        at += form.length
+    if at < end:
+        damaged.append(RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are no message", ""))
+    return found, {form.name: form for form in forms.values()}, count, damaged
+
+
+def _series(
+    found: dict[str, list[tuple[int, tuple[float, ...]]]], forms: dict[str, _Form], name: str
+) -> _autopilot.Series:
+    """Messages of one name; of several instances (sensors, filters) the first."""
+    rows, form = found.get(name) or [], forms.get(name)
+    if not rows or form is None or "TimeUS" not in form.columns:
+        return _autopilot.NONE
+    table = np.array([values for _, values in rows], dtype=np.float64)
+    columns = {column: table[:, i] for i, column in enumerate(form.columns)}
+    number = np.array([i for i, _ in rows], dtype=np.int64)
+    for instance in ("I", "C", "Instance"):
+        if instance in columns:
+            keep = columns[instance] == columns[instance][0]
+            columns, number = {key: column[keep] for key, column in columns.items()}, number[keep]
+            break
+    return _autopilot.Series(columns["TimeUS"] / 1e6, number, columns)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Telemetry ``vehicle``."""
+    found, forms, count, damaged = _messages(data)
+    series = {name: _series(found, forms, name) for name in _WANTED}
+    gps = series["GPS"]
+    place = series["POS"] if len(series["POS"].time_s) else gps
+    column = place.columns
+    if "Lat" not in column or "Lng" not in column:
+        return ReadResult("ardupilot_bin", (), count + len(damaged), 0, count, tuple(damaged))
+    altitude = column.get("RelHomeAlt", column.get("Alt", np.full(len(place.time_s), np.nan)))
+    if "RelHomeAlt" not in column and len(altitude):
+        altitude = altitude - altitude[0]
+    position = _autopilot.Series(
+        place.time_s,
+        place.number,
+        {"latitude_deg": column["Lat"], "longitude_deg": column["Lng"], "altitude_m": altitude},
+    )
+    filters = next((series[name] for name in ("XKF1", "NKF1", "EKF1") if len(series[name].time_s)), _autopilot.NONE)
+    return _autopilot.result(
+        "ardupilot_bin",
+        options,
+        position,
+        _renamed(series["ATT"], {"Roll": "roll_deg", "Pitch": "pitch_deg", "Yaw": "yaw_deg"}),
+        _renamed(filters, {"VN": "velocity_north_mps", "VE": "velocity_east_mps", "VD": "velocity_down_mps"}),
+        _renamed(gps, {"Status": "fix", "NSats": "satellites"}),
+        utc_minus_clock_s=_offset(gps),
+        messages=count,
+        damaged=damaged,
+        source="ArduPilot dataflash log",
+    )
+
+
+def _renamed(series: _autopilot.Series, names: dict[str, str]) -> _autopilot.Series:
+    columns: dict[str, FloatArray] = {new: series.columns[old] for old, new in names.items() if old in series.columns}
+    return _autopilot.Series(series.time_s, series.number, columns)
+
+
+def _offset(gps: _autopilot.Series) -> float | None:
+    if "GWk" not in gps.columns or "GMS" not in gps.columns:
+        return None
+    known = gps.columns["GWk"] > 1000
+    return _autopilot.offset_s(
+        _autopilot.gps_utc_s(gps.columns["GWk"][known], gps.columns["GMS"][known]), gps.time_s[known]
+    )
+
+
+READER = Reader(
+    name="ardupilot_bin",
+    title="ArduPilot dataflash log (.bin)",
+    kinds=("telemetry",),
+    sample="binary: POS, GPS, ATT, XKF1",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,78 @@
+"""One I/Q burst as AERPAW's ``get_IQ.py`` writes it: ``results_<Hz>_<samples per s>_<YYYY_mm_dd_HH_MM_SS_mmm>.mat``.
+
+``IQ`` is (channels, samples) complex; the level of a channel is the mean power of its samples over the burst, 10
+log10, dB re full scale. The time of the burst is that of the file name, local; a flight is a folder of thousands of
+them, which ``ingest`` reads as one log.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.matfile import MAGIC, read_arrays
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, Stream
+
+from . import _frames, _lines, _time, flight_mat
+
+_NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether its first variables are samples and device times."""
+    return head.startswith(MAGIC) and "IQ" in flight_mat.names_of(head)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """One level per channel, ``USRP1`` and so on.
+
+    Raises
+    ------
+    InputError
+        If there are no samples, or the file name does not say when the burst was.
+    UsageError
+        If no time zone is given.
+    """
+    samples = read_arrays(data, {"IQ"}).get("IQ")
+    if samples is None or not samples.size:
+        raise InputError("the burst holds no samples", expected="a variable IQ of channels by samples")
+    named = _NAME.search(options.file_name)
+    if named is None:
+        raise InputError(
+            "the name of the burst does not say when it was",
+            expected="results_<Hz>_<samples per s>_<YYYY_mm_dd_HH_MM_SS_mmm>.mat",
+            cause="a renamed file",
+        )
+    year, month, day, hour, minute, second, part = named.groups()[2:]
+    text = f"{year}-{month}-{day} {hour}:{minute}:{second}.{part or '0'}".encode()
+    instants, valid = _time.texts_to_utc(np.array([text]), options, needed_by="iq_burst")
+    if not valid[0]:
+        raise InputError(
+            "the date in the name of the burst is none of the calendar", expected="YYYY_mm_dd_HH_MM_SS_mmm"
+        )
+    with np.errstate(all="ignore"):  # damaged samples may be any number
+        power = np.mean(np.abs(np.atleast_2d(samples)) ** 2, axis=1)
+    streams = []
+    for i, one in enumerate(power.tolist()):
+        level = np.array([10 * np.log10(one) if 0 < one < np.inf else np.nan])
+        flag = _lines.flags(1)
+        instants.flag(flag)
+        _lines.add_flag(flag, ~(level > options.floor_db), "out_of_coverage")
+        frame = _frames.frame("rss", instants.time, np.array([1]), flag, {"rss_db": level})
+        attributes = _frames.attributes(options, channel=f"USRP{i + 1}", unit=options.unit or "dB re full scale")
+        streams.append(Stream("rss", f"USRP{i + 1}", frame, {"frequency_hz": float(named[1]), **attributes}))
+    return ReadResult("iq_burst", tuple(streams), 1, 1, 0, (), instants.warnings)
+
+
+READER = Reader(
+    name="iq_burst",
+    title="I/Q burst of get_IQ.py (.mat), a folder of them is one log",
+    kinds=("rss",),
+    sample="results_3320000000_2000000_2025_01_01_12_00_07_250.mat",
+    sniff=sniff,
+    read=read,
+    pieces=True,
+)

@@ -1,0 +1,163 @@
+"""MAVLink telemetry log of a ground station (``.tlog``): eight bytes of UTC in us, then one packet, and so on.
+
+Read are GLOBAL_POSITION_INT (33: position, height above home, velocity), ATTITUDE (30) and GPS_RAW_INT (24: fix) of
+the vehicle that sends most positions; checksums are checked. Source: MAVLink guide, "Packet Serialization".
+"""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+
+from . import _autopilot
+
+_POSITION, _ATTITUDE, _GPS = 33, 30, 24
+_EXTRA = {_POSITION: 104, _ATTITUDE: 39, _GPS: 24}
+_LAYOUT = {
+    _POSITION: struct.Struct("<IiiiihhhH"),
+    _ATTITUDE: struct.Struct("<Iffffff"),
+    _GPS: struct.Struct("<QiiiHHHHBB"),
+}
+_FIELDS = {_POSITION: 9, _ATTITUDE: 7, _GPS: 10}
+_EARLIEST_US, _LATEST_US = 946_684_800_000_000, 9_200_000_000_000_000
+
+
+def _crc(data: bytes) -> int:
+    """X.25 checksum, as MAVLink uses it."""
+    crc = 0xFFFF
+    for byte in data:
+        t = byte ^ (crc & 0xFF)
+        t = (t ^ (t << 4)) & 0xFF
+        crc = (crc >> 8) ^ (t << 8) ^ (t << 3) ^ (t >> 4)
+    return crc & 0xFFFF
+
+
+def _packet(data: bytes, at: int) -> tuple[int, int, int, bytes] | None:
+    """Length with its time, message number, system, and payload of the packet at a place; None if there is none."""
+    if at + 16 > len(data):
+        return None
+    stamp = int.from_bytes(data[at : at + 8], "big")
+    if not _EARLIEST_US <= stamp <= _LATEST_US:
+        return None
+    mark, size = data[at + 8], data[at + 9]
+    if mark == 0xFE:
+        head, kind, system, tail = 6, data[at + 13], data[at + 11], 2
+    elif mark == 0xFD:
+        if at + 18 > len(data):
+            return None
+        head, system = 10, data[at + 13]
+        kind, tail = int.from_bytes(data[at + 15 : at + 18], "little"), 15 if data[at + 10] & 1 else 2
+    else:
+        return None
+    whole = 8 + head + size + tail
+    if at + whole > len(data):
+        return None
+    begin = at + 8 + head
+    if kind in _EXTRA:
+        written = int.from_bytes(data[begin + size : begin + size + 2], "little")
+        if _crc(data[at + 9 : begin + size] + bytes([_EXTRA[kind]])) != written:
+            return None
+    return whole, kind, system, data[begin : begin + size]
+
+
+def sniff(head: bytes) -> bool:
+    """Whether the first three packets follow each other."""
+    at = 0
+    for _ in range(3):
+        found = _packet(head, at)
+        if found is None:
+            return False
+        at += found[0]
+        if at == len(head):
+            break
+    return at > 0
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Telemetry ``vehicle``."""
+    found: dict[int, list[tuple[int, int, float, tuple[float, ...]]]] = {kind: [] for kind in _EXTRA}
+    damaged: list[RejectedLine] = []
+    count, at = 0, 0
+    while at < len(data):
+        packet = _packet(data, at)
+        if packet is None:
+            begin = at
+            while at < len(data) and _packet(data, at) is None:
+                at = _next_mark(data, at)
+            damaged.append(
+                RejectedLine(count + len(damaged) + 1, f"{at - begin} bytes at {begin} that are no packet", "")
+            )
+            continue
+        whole, kind, system, payload = packet
+        if kind in _EXTRA:
+            layout = _LAYOUT[kind]
+            values = layout.unpack(payload[: layout.size].ljust(layout.size, b"\0"))  # trailing zeros are not sent
+            found[kind].append((count + len(damaged), system, int.from_bytes(data[at : at + 8], "big") / 1e6, values))
+        count += 1
+        at += whole
+    position, attitude, gps = _of_vehicle(found)
+    return _autopilot.result(
+        "mavlink_tlog",
+        options,
+        position,
+        attitude,
+        position,
+        gps,
+        utc_minus_clock_s=0.0,
+        messages=count,
+        damaged=damaged,
+        source="MAVLink telemetry log",
+    )
+
+
+def _next_mark(data: bytes, at: int) -> int:
+    """The next place where a packet could begin: eight bytes before a mark."""
+    places = [place for mark in (b"\xfe", b"\xfd") if (place := data.find(mark, at + 9)) >= 0]
+    return min(places) - 8 if places else len(data)
+
+
+def _of_vehicle(
+    found: dict[int, list[tuple[int, int, float, tuple[float, ...]]]],
+) -> tuple[_autopilot.Series, _autopilot.Series, _autopilot.Series]:
+    systems = [one[1] for one in found[_POSITION]]
+    vehicle = max(set(systems), key=systems.count) if systems else -1
+    made = []
+    for kind in (_POSITION, _ATTITUDE, _GPS):
+        rows = [one for one in found[kind] if one[1] == vehicle]
+        table = np.array([one[3] for one in rows], dtype=np.float64).reshape(len(rows), _FIELDS[kind])
+        series = _autopilot.Series(
+            np.array([one[2] for one in rows]), np.array([one[0] for one in rows], dtype=np.int64), {}
+        )
+        series.columns = _columns(kind, table) if len(rows) or kind == _POSITION else {}
+        made.append(series)
+    return made[0], made[1], made[2]
+
+
+def _columns(kind: int, table: np.ndarray) -> dict[str, np.ndarray]:  # type: ignore[type-arg]
+    if kind == _POSITION:
+        table = table if table.size else np.zeros((0, 9))
+        return {
+            "latitude_deg": table[:, 1] / 1e7,
+            "longitude_deg": table[:, 2] / 1e7,
+            "altitude_m": table[:, 4] / 1e3,
+            "velocity_north_mps": table[:, 5] / 100,
+            "velocity_east_mps": table[:, 6] / 100,
+            "velocity_down_mps": table[:, 7] / 100,
+        }
+    if kind == _ATTITUDE:
+        return {name: np.degrees(table[:, 1 + i]) for i, name in enumerate(("roll_deg", "pitch_deg", "yaw_deg"))}
+    return {"fix": table[:, 8], "satellites": table[:, 9]}
+
+
+READER = Reader(
+    name="mavlink_tlog",
+    title="MAVLink telemetry log of a ground station (.tlog)",
+    kinds=("telemetry",),
+    sample="binary: GLOBAL_POSITION_INT, ATTITUDE, GPS_RAW_INT",
+    sniff=sniff,
+    read=read,
+)

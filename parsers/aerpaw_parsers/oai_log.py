@@ -1,0 +1,107 @@
+"""OpenAirInterface: the gNB's statistics in both layouts, and the UE's CSI lines.
+
+gNB: ``UE 1f4d: CQI 15, RI 2, PMI (14,1)`` or ``... CSI [CQI 15 RI 2 PMI (14,1)] SRS [...]``, and ``UE RNTI 1f4d ...
+average RSRP -78 (16 meas)``. UE: ``RI = 2 i1 = 0.0.0, i2 = 1, SINR = 20 dB, CQI = 15`` with or without ``RSRP = -80
+dBm,`` in front. All three add one to the index of the report before they print it: RI counts from one. A gNB prints
+the last report, not a mean.
+
+Times, the first that the log has: a stamp of ``ts`` or of srsRAN's form in front of the line or of one above it;
+OAI's own seconds (``log_config ... time``: from an unknown origin unless they are an epoch); else 1.28 s per
+``Frame.Slot`` line, which comes every 128 frames.
+"""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, IntArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _cells, _lines, _rows, _time
+
+_CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
+_LEVEL = re.compile(
+    rb"\bUE RNTI (?P<rnti>[0-9a-f]{4})\b[^\n]{0,120}?average RSRP (?P<rsrp>-?\d{1,3}) \((?P<meas>\d{1,9}) meas\)"
+)
+_UE = re.compile(
+    rb"(?:\bRSRP = (?P<rsrp>-?\d{1,3}) dBm, )?\bRI = (?P<ri>\d{1,2}) i1 = [-\d.]{1,20}, i2 = -?\d{1,5}, "
+    rb"SINR = (?P<sinr>-?\d{1,3}) dB, CQI = (?P<cqi>\d{1,2})"
+)
+_UE_LEVEL = re.compile(rb"\[UE \d{1,2}\] RSRP = (?P<rsrp>-?\d{1,3}) dBm")
+_STAMP = re.compile(rb"^\[?(" + _time.TIME + _time.ZONE + rb")\]?[ :]")
+_SECONDS = re.compile(rb"^(?:\x1b\[[0-9;]{0,8}m)?(\d{1,10}\.\d{3,9}) ")
+_FRAME = re.compile(rb"Frame\.Slot \d")
+_FRAMES_S = 1.28
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it is OAI's talk with CSI or levels in it."""
+    return any(pattern.search(head) for pattern in (_CSI, _LEVEL, _UE)) and re.search(
+        rb"\[(?:NR_)?(?:MAC|PHY)\]|Frame\.Slot|dlsch_rounds|\bi1 = ", head
+    ) is not None  # fmt: skip
+
+
+def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str, AnyArray]:
+    """Lines with a quantity, their values, the clock, and the times."""
+    row, found, stamps = [], [], []
+    stamp, seconds, frame = b"", b"", -1
+    for i in range(len(lines)):
+        line = lines.raw(i)
+        if written := _STAMP.match(line):
+            stamp = written[1]
+        elif counted := _SECONDS.match(line):
+            seconds = counted[1]
+        if _FRAME.search(line):
+            frame += 1
+        match = next((m for p in (_CSI, _LEVEL, _UE, _UE_LEVEL) if (m := p.search(line))), None)
+        if match is not None:
+            row.append(i)
+            found.append({key: value for key, value in match.groupdict().items() if value is not None})
+            stamps.append((stamp, seconds, max(frame, 0) * _FRAMES_S))
+    number = np.array(row, dtype=np.int64)
+    if stamps and all(one[0] for one in stamps):
+        return number, found, "wall", np.array([one[0] for one in stamps], dtype=np.bytes_)
+    if stamps and all(one[1] for one in stamps):
+        value = np.array([float(one[1]) for one in stamps])
+        return number, found, "epoch_s" if value.min() > 1e9 else "relative_s", value
+    return number, found, "relative_s", np.array([one[2] for one in stamps], dtype=np.float64)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Rank stream ``oai`` and RSRP; UsageError if stamps have no zone and none is given."""
+    lines = _lines.split(data)
+    row, found, clock, time = _rows_of(lines)
+    rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
+    kept = [found[i] for i in rows.at.tolist()]
+    value = {
+        name: np.array([float(one.get(name, b"nan")) for one in kept]) for name in ("ri", "cqi", "sinr", "rsrp", "meas")
+    }
+    rnti = np.array([float(int(one["rnti"], 16)) if "rnti" in one else np.nan for one in kept])
+    reported = np.flatnonzero(~np.isnan(value["ri"]))
+    ri = value["ri"][reported]
+    good = (ri >= 1) & (ri <= 8)
+    flag = rows.flag[reported].copy()
+    _lines.add_flag(flag, ~good, "ri_out_of_range")
+    beside = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
+    beside |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
+    rank = rows.stream(
+        "rank", options.channel or "oai", beside, pick=reported, flag=flag, ri_base="one", source="CSI report, last one"
+    )
+    levels = [
+        _cells.Reading(int(i), "nr", np.nan, np.nan, value["rsrp"][i], True)
+        for i in np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
+    ]  # a gNB prints 0 of 0 measurements
+    return rows.result([rank, *_cells.streams(rows, levels, source="OpenAirInterface")])
+
+
+READER = Reader(
+    name="oai_log",
+    title="OpenAirInterface gNB statistics or UE log: rank indicator, RSRP",
+    kinds=("rank", "rss"),
+    sample="[2025-01-01 12:00:07.000000] UE 1f4d: CQI 15, RI 2, PMI (14,1)",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,108 @@
+"""Exports of aerpaw-cmp read back: ``rss.csv`` and ``rank.csv`` of a report, and the table that ``tap export`` writes.
+
+``rss.csv``: a stream per tower and channel with ``measured_db`` as logged. ``rank.csv``: a stream per tower. Tap
+export: rank per query, RSRP of the serving cell. Times are UTC; where a report had none, seconds from an unknown
+origin.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from aerpaw_cmp.common.units import BoolArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, Stream
+
+from . import _rows, _sheet
+
+_RSS = ("time utc", "tower", "channel", "unit", "measured db")
+_RANK = ("time utc", "tower", "measured rank")
+_TAP = ("time utc", "query", "status", "rank", "ri raw")
+
+
+def is_header(names: list[str]) -> bool:
+    """Whether plain names are those of one of the three tables."""
+    return any(set(form) <= set(names) for form in (_RSS, _RANK, _TAP))
+
+
+def sniff(head: bytes) -> bool:
+    """Whether the first line is one of our headers."""
+    return head.lstrip(b"\xef\xbb\xbf").startswith(b"time_utc,") and _sheet.starts(head, is_header)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """What the table was made of."""
+    sheet = _sheet.read(data, is_header)
+    if sheet is None:
+        return _sheet.nothing(data, "own_csv", "no header of an export")
+    column = sheet.find("time utc")
+    seconds = sheet.find("time s")
+    empty = column is not None and not any(sheet.texts(column))
+    rows = _sheet.rows(
+        sheet, options, reader="own_csv", also=("time s",) if empty and seconds is not None else ("time utc",)
+    )
+    if rows is None:
+        return _sheet.nothing(data, "own_csv", "no header of an export")
+    names = set(sheet.plain)
+    if set(_RSS) <= names:
+        return rows.result(_levels(rows, sheet))
+    return rows.result(_ranks(rows, sheet) if set(_RANK) <= names else _tap(rows, sheet))
+
+
+def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
+    place = sheet.find(name)
+    return np.array([] if place is None else sheet.texts(place), dtype=object)
+
+
+def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
+    place = sheet.find(name)
+    return np.full(len(sheet.cells), np.nan) if place is None else sheet.numbers(place)
+
+
+def _levels(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+    tower, channel, unit = (_text(sheet, name) for name in ("tower", "channel", "unit"))
+    level, flag = rows.level(_number(sheet, "measured db"))
+    made = []
+    for node, name in dict.fromkeys(zip(tower.tolist(), channel.tolist(), strict=True)):
+        mine: BoolArray = (tower == node) & (channel == name)
+        about = {"node": node, "channel": name, "unit": str(unit[mine][0])}
+        made.append(rows.stream("rss", f"{node}_{name}", {"rss_db": level}, where=mine, flag=flag, about=about))
+    return made
+
+
+def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+    tower, ri = _text(sheet, "tower"), _number(sheet, "measured rank")
+    values = rows.rank(ri)
+    return [
+        rows.stream("rank", f"{node}_rank", values, where=tower == node, node=node, ri_base="one", source="report")
+        for node in dict.fromkeys(tower.tolist())
+    ]
+
+
+def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+    query, status = _text(sheet, "query"), _text(sheet, "status")
+    made = []
+    for name in ("nr5g_csi", "lte_csi"):
+        mine: BoolArray = (query == name) & (status == "ok")
+        columns = {"rank": "rank", "ri_raw": "ri raw", "cqi": "cqi", "mcs": "mcs", "uncertainty_s": "uncertainty s"}
+        values = {key: _number(sheet, plain) for key, plain in columns.items()}
+        name = name.removesuffix("_csi")
+        if name == "nr5g" or np.isfinite(values["rank"][mine]).any():
+            made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
+    cell: BoolArray = (query == "servingcell") & np.isfinite(_number(sheet, "rsrp dbm"))
+    level, flag = rows.level(_number(sheet, "rsrp dbm"))
+    values = {"rss_db": level, "sinr_db": _number(sheet, "sinr db")}
+    made.append(
+        rows.stream("rss", "nr5g_rsrp", values, where=cell, flag=flag, channel="nr5g_rsrp", unit="dBm", quantity="RSRP")
+    )
+    return made
+
+
+READER = Reader(
+    name="own_csv",
+    title="exports of aerpaw-cmp read back: rss.csv, rank.csv, tap export",
+    kinds=("rss", "rank"),
+    sample="time_utc,time_s,tower,channel,unit,east_m,north_m,up_m,measured_db",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,183 @@
+"""PX4 log (``.ulg``): position, attitude, velocity and GPS of the aircraft's own log.
+
+The format describes itself: ``F`` messages give the fields of each topic, ``A`` its number, ``D`` its data. Read
+are ``vehicle_global_position``, ``vehicle_attitude`` (quaternion), ``vehicle_local_position`` (velocity) and
+``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix); instance 0 of each. Heights are above ``home_position``, else
+above the first position. Source: PX4 guide, "ULog File Format".
+"""
+
+from __future__ import annotations
+
+import re
+import struct
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+
+from . import _autopilot
+
+_MAGIC = b"ULog\x01\x12\x35"
+_TYPES = {
+    "int8_t": "i1",
+    "uint8_t": "u1",
+    "bool": "u1",
+    "char": "S1",
+    "int16_t": "<i2",
+    "uint16_t": "<u2",
+    "int32_t": "<i4",
+    "uint32_t": "<u4",
+    "int64_t": "<i8",
+    "uint64_t": "<u8",
+    "float": "<f4",
+    "double": "<f8",
+}
+_WANTED = (
+    "vehicle_global_position",
+    "vehicle_attitude",
+    "vehicle_local_position",
+    "vehicle_gps_position",
+    "sensor_gps",
+    "home_position",
+)
+_FIELD = re.compile(r"(\w+)(?:\[(\d{1,4})\])? (\w+)")
+_KINDS = frozenset(b"BFIMPQADLCSORT")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it begins with ULog's mark."""
+    return head.startswith(_MAGIC)
+
+
+def _layout(text: str) -> np.dtype[np.void] | None:  # type: ignore[type-var]
+    """Layout of a topic; None where it nests another, which none of the wanted ones does."""
+    fields: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
+    for part in text.split(";"):
+        if not part:
+            continue
+        found = _FIELD.fullmatch(part.strip())
+        if found is None or found[1] not in _TYPES:
+            return None
+        kind = _TYPES[found[1]]
+        fields.append((found[3], kind, (int(found[2]),)) if found[2] else (found[3], kind))
+    try:
+        return np.dtype(fields)
+    except (ValueError, TypeError):
+        return None
+
+
+def _topics(data: bytes) -> tuple[dict[str, AnyArray], dict[str, list[int]], int, list[RejectedLine]]:
+    """Messages of the wanted topics, their numbers, the number of sound messages, and damaged stretches."""
+    forms: dict[str, str] = {}
+    names: dict[int, str] = {}
+    bodies: dict[str, list[bytes]] = {name: [] for name in _WANTED}
+    numbers: dict[str, list[int]] = {name: [] for name in _WANTED}
+    damaged: list[RejectedLine] = []
+    count, at = 0, 16
+    while at + 3 <= len(data):
+        size, kind = struct.unpack_from("<HB", data, at)
+        if kind not in _KINDS or at + 3 + size > len(data):
+            damaged.append(
+                RejectedLine(count + 1, f"{len(data) - at} bytes at {at} that are no message: read no further", "")
+            )
+            break
+        body = data[at + 3 : at + 3 + size]
+        if kind == ord("F"):
+            name, _, text = body.decode("ascii", "replace").partition(":")
+            forms[name] = text
+        elif kind == ord("A") and size > 3 and body[0] == 0:
+            names[struct.unpack_from("<H", body, 1)[0]] = body[3:].decode("ascii", "replace")
+        elif kind == ord("D") and size > 2:
+            topic = names.get(struct.unpack_from("<H", body)[0], "")
+            if topic in bodies:
+                bodies[topic].append(body[2:])
+                numbers[topic].append(count)
+        count += 1
+        at += 3 + size
+    return {name: _table(bodies[name], forms.get(name, "")) for name in _WANTED}, numbers, count, damaged
+
+
+def _table(bodies: list[bytes], text: str) -> AnyArray:
+    layout = _layout(text)
+    if layout is None or not bodies or "timestamp" not in (layout.names or ()):
+        return np.zeros(0, dtype=[("timestamp", "<u8")])
+    size = layout.itemsize
+    # padding at the end of a topic is left out of its messages
+    return np.frombuffer(b"".join(body[:size].ljust(size, b"\0") for body in bodies), dtype=layout)
+
+
+def _column(table: AnyArray, *names: str) -> FloatArray | None:
+    return next((table[name].astype(np.float64) for name in names if name in (table.dtype.names or ())), None)
+
+
+def _series(table: AnyArray, numbers: list[int], columns: dict[str, FloatArray | None]) -> _autopilot.Series:
+    if not len(table):
+        return _autopilot.NONE
+    kept = {name: values for name, values in columns.items() if values is not None}
+    return _autopilot.Series(table["timestamp"].astype(np.float64) / 1e6, np.array(numbers, dtype=np.int64), kept)
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Telemetry ``vehicle``."""
+    tables, numbers, count, damaged = _topics(data)
+    place, gps_name = tables["vehicle_global_position"], "vehicle_gps_position"
+    gps = tables[gps_name] if len(tables[gps_name]) else tables["sensor_gps"]
+    gps_name = gps_name if len(tables[gps_name]) else "sensor_gps"
+    latitude, longitude, altitude = (_column(place, name) for name in ("lat", "lon", "alt"))
+    if latitude is None or longitude is None or not len(place):
+        return ReadResult("px4_ulog", (), count + len(damaged), 0, count, tuple(damaged))
+    height = np.full(len(place), np.nan) if altitude is None else altitude - _home(tables["home_position"], altitude)
+    position = _series(
+        place,
+        numbers["vehicle_global_position"],
+        {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": height},
+    )
+    local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
+    velocity = {
+        f"velocity_{way}_mps": _column(local, name) for way, name in (("north", "vx"), ("east", "vy"), ("down", "vz"))
+    }
+    fix = {"fix": _column(gps, "fix_type"), "satellites": _column(gps, "satellites_used")}
+    utc = _column(gps, "time_utc_usec")
+    offset = None if utc is None else _autopilot.offset_s(utc / 1e6, gps["timestamp"].astype(np.float64) / 1e6)
+    return _autopilot.result(
+        "px4_ulog",
+        options,
+        position,
+        _series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
+        _series(local, numbers["vehicle_local_position"], velocity),
+        _series(gps, numbers[gps_name], fix),
+        utc_minus_clock_s=offset,
+        messages=count,
+        damaged=damaged,
+        source="PX4 ULog",
+    )
+
+
+def _home(table: AnyArray, altitude: FloatArray) -> float:
+    home = _column(table, "alt")
+    return float(home[0]) if home is not None and len(home) else float(altitude[0])
+
+
+def _angles(table: AnyArray) -> dict[str, FloatArray | None]:
+    """Roll, pitch and yaw of the quaternions (w, x, y, z) from the body (front, right, down) to north, east, down."""
+    q = _column(table, "q")
+    if q is None or q.ndim != 2 or q.shape[1] != 4:
+        return {}
+    w, x, y, z = q.T
+    return {
+        "roll_deg": np.degrees(np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))),
+        "pitch_deg": np.degrees(np.arcsin(np.clip(2 * (w * y - z * x), -1, 1))),
+        "yaw_deg": np.degrees(np.arctan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))),
+    }
+
+
+READER = Reader(
+    name="px4_ulog",
+    title="PX4 log (.ulg)",
+    kinds=("telemetry",),
+    sample="binary: vehicle_global_position, vehicle_attitude, vehicle_local_position",
+    sniff=sniff,
+    read=read,
+)

@@ -1,0 +1,123 @@
+"""srsRAN Project gNB: the console's table through ``ts``, its log's scheduler lines, and its metrics as JSON.
+
+Console: ``[time] pci rnti | cqi ri mcs brate ok nok (%) ...`` once a second, with or without the bar and the
+columns behind. Log: ``time [METRICS ] ... Scheduler UE ... cqi=15 dl_ri=2.0 dl_mcs=27 ...``. JSON: an object per
+line with ``timestamp`` (epoch in s, or text) and ``ue_list``, at the top or in ``cells``.
+
+RI counts from one and is the mean over the report period: a value between two ranks is kept as ``rank_mean`` and
+gives no rank.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from typing import Any
+
+import numpy as np
+
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import ReadResult
+
+from . import _json, _lines, _rows, _stamps, _time
+
+_N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
+_STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
+_ROW = re.compile(
+    _STAMP
+    + rb" *(?P<pci>\d{1,4}) +(?P<rnti>[0-9a-fA-F]{4})(?: +\|)?"
+    + _N % b"cqi"
+    + _N % b"ri"
+    + _N % b"mcs"
+    + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}%[^\n]{0,200}$",
+    re.MULTILINE,
+)
+_LOG = re.compile(
+    _STAMP + rb" +\[METRICS *\][^\n]{0,200}?\bpci=(?P<pci>\d{1,4})[^\n]{0,80}?\brnti=(?:0x)?(?P<rnti>[0-9a-fA-F]{1,6})"
+    rb"[^\n]{0,200}?\bcqi=(?P<cqi>[0-9.]{1,8}|n/a) dl_ri=(?P<ri>[0-9.]{1,8}|n/a) dl_mcs=(?P<mcs>[0-9.]{1,8}|n/a)"
+    rb"[^\n]{0,4000}$",
+    re.MULTILINE,
+)
+_TITLE = re.compile(_STAMP + rb" *\|? *pci +rnti +(?:\| +)?cqi +ri +mcs", re.MULTILINE)
+_SCHEDULER = re.compile(_STAMP + rb" +\[METRICS *\][^\n]{0,300}\bdl_ri=", re.MULTILINE)
+_TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +[0-9a-fA-F]{4} ")
+
+
+def sniff(head: bytes) -> bool:
+    """Whether it is the console with its title line, or the log with scheduler metrics."""
+    return _TITLE.search(head) is not None or _SCHEDULER.search(head) is not None
+
+
+def read(data: bytes, options: ReadOptions) -> ReadResult:
+    """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
+    pattern = _LOG if _SCHEDULER.search(data[: 1 << 20]) and not _TITLE.search(data[: 1 << 20]) else _ROW
+    torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
+    rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
+    rnti = np.array([int(text, 16) if text else -1 for text in rows.text("rnti")], dtype=np.float64)
+    beside = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
+    ri = rows.number("ri")
+    return rows.result([_rows.mean_rank(rows, ri, beside, none=ri == 0)])
+
+
+def sniff_json(head: bytes) -> bool:
+    """Whether the first object holds a list of UEs with RI."""
+    first = _json.first(head)
+    if first is None:  # a first line longer than what sniffers see
+        return head.lstrip()[:1] == b"{" and b'"ue_list"' in head and re.search(rb'"(dl_)?ri"\s*:', head) is not None
+    return ("timestamp" in first and any(True for _ in _ues(first))) or (
+        "timestamp" in first and '"ue_list"' in str(head)
+    )
+
+
+def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
+    """The UEs of an object, at the top or in its cells."""
+    for place in (one, *_json.listed(one, "cells"), *_json.listed(one, "cell_list")):
+        for ue in _json.listed(_json.inside(place, "cell_container") or place, "ue_list"):
+            yield _json.inside(ue, "ue_container") or ue
+
+
+def read_json(data: bytes, options: ReadOptions) -> ReadResult:
+    """Rank stream ``gnb``: a record per UE and report."""
+    lines = _lines.split(data)
+    row, found, rejected = _json.objects(lines)
+    with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
+    texts = [str(found[i].get("timestamp", "")) for i in with_ue]
+    clock, time, warnings = _stamps.read(texts, options)
+    mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
+    rows = _rows.built(
+        lines,
+        row[with_ue],
+        {"time": time},
+        options,
+        reader="srsran_json",
+        reason=_json.bracket,
+        clock=clock,
+        extra=rejected,
+        markup=mute,
+    )
+    rows.warnings += warnings
+    pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(found[with_ue[at]])]
+    pick = np.array([i for i, _ in pairs], dtype=np.int64)
+    ues = [ue for _, ue in pairs]
+    names = {"cqi": ("cqi", "dl_cqi"), "mcs": ("dl_mcs", "mcs"), "rnti": ("rnti",), "pci": ("pci",)}
+    beside = {name: _json.column(ues, *keys) for name, keys in names.items()}
+    ri = _json.column(ues, "dl_ri", "ri")
+    return rows.result([_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick)])
+
+
+READER = Reader(
+    name="srsran_gnb",
+    title="srsRAN Project gNB console (through ts) or log: rank indicator",
+    kinds=("rank",),
+    sample="[2025-01-01 12:00:07.000000]   1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2",
+    sniff=sniff,
+    read=read,
+)
+JSON_READER = Reader(
+    name="srsran_json",
+    title="srsRAN Project gNB metrics, JSON lines: rank indicator",
+    kinds=("rank",),
+    sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
+    sniff=sniff_json,
+    read=read_json,
+)

@@ -1,0 +1,54 @@
+"""Serving cells: hits, confusion, and what a planted fault does to them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from aerpaw_cmp.compare.serving import at_times, compare_serving
+
+
+def test_a_perfect_prediction_hits_always_and_an_exchanged_one_never() -> None:
+    rng = np.random.default_rng(1)
+    level = rng.normal(-80, 8, (500, 3))
+    served = level.argmax(axis=1)
+    assert compare_serving(served, level, "abc").hit_share == 1.0
+    assert compare_serving(served, -level, "abc").hit_share == 0.0
+    assert compare_serving(served, level + 30.0, "abc").hit_share == 1.0, "a common offset changes nothing"
+    turned = compare_serving(served, level[:, [1, 2, 0]], "abc")
+    assert turned.hit_share < 0.6, "towers exchanged"
+
+
+@given(st.lists(st.integers(-1, 2), min_size=1, max_size=60), st.randoms(use_true_random=False))
+def test_rows_of_the_confusion_count_the_served(served: list[int], random: object) -> None:
+    rng = np.random.default_rng(random.randint(0, 2**31))  # type: ignore[attr-defined]
+    level = rng.normal(size=(len(served), 3))
+    level[rng.random(level.shape) < 0.3] = np.nan
+    found = compare_serving(served, level, ["a", "b", "c"])
+    assert found.confusion.sum(axis=1).tolist() == [served.count(i) for i in range(3)]
+    assert found.n == sum(one >= 0 for one in served)
+    brute = sum(
+        one >= 0 and not np.isnan(row).all() and int(np.nanargmax(row)) == one
+        for one, row in zip(served, level, strict=True)
+    )
+    assert found.n == 0 or found.hit_share == pytest.approx(brute / found.n)
+
+
+def test_no_prediction_is_a_column_of_its_own() -> None:
+    found = compare_serving([0, 1], [[np.nan, np.nan], [-70, -80]], ["a", "b"])
+    assert found.confusion.tolist() == [[0, 0, 1], [1, 0, 0]]
+    assert found.as_dict()["confusion"]["a"] == {"a": 0, "b": 0, "none": 1}
+
+
+def test_wrong_shapes_are_refused() -> None:
+    with pytest.raises(ValueError, match="shape"):
+        compare_serving([0], [[1.0]], ["a", "b"])
+    with pytest.raises(ValueError, match="serving cell 2 of 2"):
+        compare_serving([2], [[1.0, 2.0]], ["a", "b"])
+
+
+def test_values_at_the_nearest_time() -> None:
+    assert at_times([0.4, 5.0, 9.9], [0.0, 1.0, 10.0], [1.0, 2.0, 3.0], within_s=1.0).tolist()[::2] == [1.0, 3.0]
+    assert np.isnan(at_times([5.0], [0.0, 10.0], [1.0, 2.0], within_s=1.0)).all()

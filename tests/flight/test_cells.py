@@ -1,0 +1,85 @@
+"""Cells of a phone's log: flight.yaml gives them to towers, the others are left out, and who serves is compared."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.flight.data import gather, read_logs
+from aerpaw_cmp.flight.draft import draft
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.compare_flight import serving_of
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+ZONE = "America/New_York"
+
+
+@pytest.fixture
+def phone(tmp_path: Path) -> Path:
+    """The sample telemetry and a phone that hears three cells, changing from the first to the second half-way."""
+    shutil.copy(next((SAMPLE / "UAV").glob("*vehicleOut.txt")), tmp_path / "x_vehicleOut.txt")
+    (track,) = ingest(tmp_path, options=ReadOptions(timezone=ZONE))
+    time_ms = track.result.streams[0].frame["time"].to_numpy().astype(np.int64)[50:150] / 1e6
+    lines = []
+    for i, now in enumerate(time_ms.tolist()):
+        cells = [
+            {
+                "technology": "4G_LTE",
+                "rsrp": -70 - i,
+                "pci": pci,
+                "earfcn": 66911,
+                "is_connected": str(pci == 1 + i // 50),
+            }
+            for pci in (1, 2, 7)
+        ]
+        lines.append(
+            json.dumps({"abs_time": now, "companion_abs_time": now, "connected_pci": 1 + i // 50, "cells": cells})
+        )
+    (tmp_path / "phone.jsonl").write_text("\n".join(lines) + "\n")
+    return tmp_path
+
+
+def flight(folder: Path, cells: str) -> Path:
+    path = folder / "flight.yaml"
+    path.write_text(
+        f"flight: phone\nsite: lake_wheeler\ntimezone: {ZONE}\nlogs:\n  - {{path: x_vehicleOut.txt}}\n"
+        f"  - {{path: phone.jsonl, {cells}}}\nlink:\n  rss: {{carrier_hz: 3.4e9, transmit_power_dbm: 40}}\n"
+    )
+    return path
+
+
+def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
+    settings = load_flight(flight(phone, "cells: {1: LW1, 2: LW2}"))
+    data = gather(settings, phone, read_logs(settings, phone))
+    assert [(one.tower, one.channel) for one in data.rss] == [("LW1", "lte_pci1"), ("LW2", "lte_pci2")]
+    assert any("1 cells that 'cells' does not name are left out" in text for text in data.warnings)
+    first = data.rss[0].serving
+    assert first is not None
+    assert first.tolist() == [1.0] * 50 + [0.0] * 50
+
+
+def test_a_draft_asks_which_tower_has_which_cell(phone: Path) -> None:
+    files = ingest(phone, options=ReadOptions(timezone=ZONE))
+    text, remarks = draft(files, phone, timezone=ZONE)
+    assert "cells: {1: LW1, 2: LW1, 7: LW1}}  # which tower has which PCI?" in text
+    assert any("which PCI?" in remark for remark in remarks)
+
+
+@pytest.mark.parametrize(("exchanged", "hits"), [(False, 1.0), (True, 0.0)])
+def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, exchanged: bool, hits: float) -> None:
+    settings = load_flight(flight(phone, "cells: {1: LW1, 2: LW2}"))
+    data = gather(settings, phone, read_logs(settings, phone))
+    right = [np.where(np.arange(100) < 50, -60.0, -70.0), np.where(np.arange(100) < 50, -70.0, -60.0)]
+    levels = right[::-1] if exchanged else right
+    results = [SimpleNamespace(simulated_dbm=level) for level in levels]
+    found = serving_of(data.rss, results)  # type: ignore[arg-type]
+    assert found is not None
+    assert (found.n, found.hit_share, found.majority_share) == (100, hits, 0.5)
+    assert serving_of(data.rss[:1], results[:1]) is None, "one cell is no choice"  # type: ignore[arg-type]

@@ -1,0 +1,106 @@
+"""Folders of several flights: one draft each, and origins of relative times from tracks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.grouping import flights
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.time_origin import origin_of
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.records import COLUMNS, Stream
+from aerpaw_cmp.logs.writers import format_nemo_csv, format_power_log, format_vehicle_out
+
+ZONE = "America/New_York"
+OPTIONS = ReadOptions(timezone=ZONE)
+
+
+def track(start: str, *, seconds: int = 300, turn: float = 1.0, east_deg: float = -78.7) -> pd.DataFrame:
+    """A curved flight with a place of its own at each time."""
+    t = np.arange(seconds)
+    content = {name: np.zeros(seconds) for name in COLUMNS["telemetry"]}
+    content["latitude_deg"] = 35.73 + 2e-3 * np.sin(turn * t / 40) + 1e-5 * t
+    content["longitude_deg"] = east_deg + 2e-3 * np.cos(turn * t / 25)
+    content["altitude_m"] = np.minimum(t, 30.0)
+    frame = pd.DataFrame(content).assign(yaw_deg=10.0, fix=4, satellites=14, line=t + 1, flag="")
+    return frame.assign(time=np.datetime64(start, "ns") + t * np.timedelta64(1, "s"))
+
+
+def write_flight(folder: Path, start: str, **how: float) -> pd.DataFrame:
+    folder.mkdir(parents=True)
+    frame = track(start, **how)  # type: ignore[arg-type]
+    (folder / "x_vehicleOut.txt").write_bytes(format_vehicle_out(frame, ZONE))
+    times = frame["time"].to_numpy()[20:280]
+    (folder / "LW1_power_log.txt").write_bytes(format_power_log(times, np.linspace(-40, -60, len(times)), ZONE))
+    return frame
+
+
+def nemo_of(frame: pd.DataFrame, origin: str) -> bytes:
+    ranks = frame.iloc[30:250].assign(rank=2.0, ri_raw=2.0, rsrp_dbm=-80.0, sinr_db=20.0, cqi=10.0)
+    return format_nemo_csv(ranks, origin)
+
+
+def test_two_flights_in_a_folder_give_two_drafts(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    logs = tmp_path / "logs"
+    write_flight(logs / "morning", "2025-03-02T15:00:00")
+    write_flight(logs / "noon", "2025-03-02T17:00:00", turn=0.5)
+    target = tmp_path / "flight.yaml"
+    assert main(["ingest", str(logs), "--timezone", ZONE, "--draft", str(target)]) == 0
+    said = capsys.readouterr().out
+    assert "flight_2.yaml" in said
+    first, second = load_flight(target), load_flight(tmp_path / "flight_2.yaml")
+    assert {log.path for log in first.logs} == {"logs/morning/x_vehicleOut.txt", "logs/morning/LW1_power_log.txt"}
+    assert {log.path for log in second.logs} == {"logs/noon/x_vehicleOut.txt", "logs/noon/LW1_power_log.txt"}
+    assert first.flight != second.flight
+
+
+def test_two_aircraft_at_one_time_are_two_flights(tmp_path: Path) -> None:
+    write_flight(tmp_path / "here", "2025-03-02T15:00:00")
+    write_flight(tmp_path / "there", "2025-03-02T15:00:10", east_deg=-78.5)
+    found = flights(ingest(tmp_path, options=OPTIONS))
+    assert len(found) == 2
+    assert sorted(len(flight.files) for flight in found) in ([2, 2], [1, 3])
+
+
+def test_relative_logs_find_the_flight_on_whose_track_they_lie(tmp_path: Path) -> None:
+    write_flight(tmp_path / "logs" / "a", "2025-03-02T15:00:00")
+    noon = write_flight(tmp_path / "logs" / "b", "2025-03-02T17:00:00", turn=0.5)
+    (tmp_path / "logs" / "phone.csv").write_bytes(nemo_of(noon, "2025-03-02T17:00:07.300Z"))
+    target = tmp_path / "flight.yaml"
+    assert main(["ingest", str(tmp_path / "logs"), "--timezone", ZONE, "--draft", str(target)]) == 0
+    text = (tmp_path / "flight_2.yaml").read_text()
+    assert "phone.csv" in text
+    assert "2025-03-02T17:00:07.3" in text
+    assert "the same flight?" in text
+    assert "phone.csv" not in target.read_text()
+
+
+def stream_of(frame: pd.DataFrame) -> Stream:
+    return Stream("telemetry", "x", frame)
+
+
+@pytest.mark.parametrize("shift_s", [-120.0, 0.0, 33.3])
+def test_the_origin_is_found_to_a_tenth_of_a_second(shift_s: float) -> None:
+    flown = track("2025-03-02T15:00:00")
+    origin = np.datetime64("2025-03-02T15:00:00", "ns") + np.timedelta64(round(shift_s * 1000), "ms")
+    log = flown.iloc[40:240].assign(time=lambda f: np.datetime64(0, "ns") + (f["time"].to_numpy() - origin))
+    noise = np.random.default_rng(1).normal(0, 1e-5, (2, len(log)))
+    log = log.assign(latitude_deg=log["latitude_deg"] + noise[0], longitude_deg=log["longitude_deg"] + noise[1])
+    found = origin_of(stream_of(log), stream_of(flown))
+    assert found is not None
+    assert abs(found.time - origin) <= np.timedelta64(150, "ms")
+
+
+def test_no_origin_for_another_track_or_a_hover() -> None:
+    flown = track("2025-03-02T15:00:00")
+    other = track("1970-01-01T00:00:00", turn=2.3)
+    assert origin_of(stream_of(other), stream_of(flown)) is None
+    still = flown.assign(latitude_deg=35.73, longitude_deg=-78.7, altitude_m=30.0)
+    hover = still.assign(time=np.datetime64(0, "ns") + np.arange(len(still)) * np.timedelta64(1, "s"))
+    assert origin_of(stream_of(hover), stream_of(still)) is None, "every origin fits a hover"

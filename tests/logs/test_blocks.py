@@ -1,0 +1,109 @@
+"""A log read in blocks says what it says in one piece, wherever it is cut."""
+
+from __future__ import annotations
+
+import gzip
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import blocks
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import by_name
+from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.writers import format_power_log
+from tests.parsers import samples
+
+OPTIONS = samples.OPTIONS
+TIMES = np.datetime64("2025-03-02T15:00:00", "ns") + np.arange(400) * np.timedelta64(32_760_000, "ns")
+
+
+def sounder(*, odd: bool) -> bytes:
+    """A power log; with ``odd``: suppressed runs, lost samples, clock steps, torn and blank lines."""
+    lines = format_power_log(TIMES, np.random.default_rng(3).normal(-40, 9, 400), "America/New_York").splitlines(
+        keepends=True
+    )
+    if odd:
+        for i in (40, 41, 42, 200, 333):
+            lines[i] = lines[i][:29] + b"*\n"
+        del lines[100:107], lines[250:251]
+        lines[300], lines[310] = lines[310], lines[300]
+        lines[120] = b"torn\n"
+        lines[121] = b"\n"
+    return b"".join(lines)
+
+
+def same(one: ReadResult, other: ReadResult) -> None:
+    assert (one.lines, one.accepted, one.blank, one.rejected) == (
+        other.lines,
+        other.accepted,
+        other.blank,
+        other.rejected,
+    )
+    assert one.warnings == other.warnings
+    for a, b in zip(one.streams, other.streams, strict=True):
+        pd.testing.assert_frame_equal(a.frame, b.frame)
+        assert dict(a.attributes) == dict(b.attributes)
+
+
+CASES = {
+    "plain": ("sounder_log", sounder(odd=False)),
+    "odd": ("sounder_log", sounder(odd=True)),
+    "torn": ("sounder_log", sounder(odd=True)[:-9]),
+    "csi": ("quectel_csv", samples.QUECTEL_CSI * 40),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+@given(block=st.integers(600, 6000), chunk=st.integers(300, 3000))
+@settings(max_examples=6, deadline=None)
+def test_blocks_say_what_one_piece_says(
+    tmp_path_factory: pytest.TempPathFactory, case: str, block: int, chunk: int
+) -> None:
+    reader, data = CASES[case]
+    place = tmp_path_factory.mktemp("blocks") / "x_power_log.txt"
+    place.write_bytes(data)
+    options = replace(OPTIONS, file_name=place.name)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocks, "BLOCK_BYTES", block)
+        patch.setattr(blocks, "_CHUNK", chunk)
+        result, digest = blocks.read(place, by_name(reader), options)
+    same(result, by_name(reader).read(data, options))
+    assert digest == hashlib.sha256(data).hexdigest()
+
+
+def test_large_logs_go_through_blocks_packed_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = sounder(odd=True)
+    (tmp_path / "a_power_log.txt").write_bytes(data)
+    (tmp_path / "b_power_log.txt.gz").write_bytes(gzip.compress(data))
+    whole = ingest(tmp_path, options=OPTIONS)
+    monkeypatch.setattr(blocks, "FROM_BYTES", 1000)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 3000)
+    monkeypatch.setattr(blocks, "_CHUNK", 1000)
+    for one, other in zip(ingest(tmp_path, options=OPTIONS), whole, strict=True):
+        same(one.result, other.result)
+        assert one.sha256 == other.sha256
+    (tmp_path / "b_power_log.txt.gz").write_bytes(gzip.compress(data)[:-3000])
+    assert "too early" in ingest(tmp_path, options=OPTIONS).skipped[0].reason
+    (tmp_path / "b_power_log.txt.gz").write_bytes(gzip.compress(b"\0" * 300_000))
+    with pytest.raises(InputError):
+        ingest(tmp_path / "b_power_log.txt.gz", options=OPTIONS, reader="sounder_log")
+
+
+def test_an_hour_that_came_twice_is_read_in_one_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    times = np.datetime64("2025-11-02T05:30:00", "ns") + np.arange(400) * np.timedelta64(10, "s")
+    data = format_power_log(times, np.linspace(-40.0, -50.0, 400), "America/New_York")
+    place = tmp_path / "a_power_log.txt"
+    place.write_bytes(data)
+    monkeypatch.setattr(blocks, "FROM_BYTES", 1000)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 3000)
+    monkeypatch.setattr(blocks, "_CHUNK", 1000)
+    (file,) = ingest(place, options=OPTIONS)
+    assert file.result.streams[0].frame["time"].tolist() == [pd.Timestamp(t) for t in times]

@@ -1,0 +1,84 @@
+"""The same pose from every autopilot's log, and what peers' libraries say of the same bytes."""
+
+from __future__ import annotations
+
+import struct
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from tests.parsers import autopilots
+from tests.parsers.autopilots import COUNT, START_US
+
+LOGS = {
+    "ardupilot_bin": autopilots.dataflash(),
+    "mavlink_tlog": autopilots.tlog(2),
+    "px4_ulog": autopilots.ulog(),
+}
+
+
+@pytest.mark.parametrize("reader", LOGS)
+def test_the_same_pose_from_each(reader: str) -> None:
+    (stream,) = by_name(reader).read(LOGS[reader], ReadOptions()).streams
+    frame = stream.frame
+    assert frame["time"].tolist() == [pd.Timestamp((START_US + i * 10**6) * 1000) for i in range(COUNT)]
+    assert frame["latitude_deg"].tolist() == pytest.approx([35.73 + i * 1e-7 for i in range(COUNT)], abs=1e-9)
+    assert frame["altitude_m"].tolist() == pytest.approx(range(COUNT)), "above home"
+    first = frame.iloc[0]
+    assert first[["roll_deg", "pitch_deg", "yaw_deg"]].tolist() == pytest.approx([1.5, -2.5, 90.0], abs=1e-3)
+    velocity = ["velocity_north_mps", "velocity_east_mps", "velocity_down_mps"]
+    assert first[velocity].tolist() == pytest.approx([1.5, 2.5, -0.5])
+    assert (first["fix"], first["satellites"]) == (4, 14)
+
+
+def test_mavlink_1_and_2_tell_the_same() -> None:
+    one, two = (by_name("mavlink_tlog").read(autopilots.tlog(version), ReadOptions()) for version in (1, 2))
+    pd.testing.assert_frame_equal(one.streams[0].frame, two.streams[0].frame)
+
+
+def test_damage_costs_a_message_and_not_the_log() -> None:
+    data = bytearray(LOGS["mavlink_tlog"])
+    data[30] ^= 0xFF  # inside the first position: its checksum no longer fits
+    result = by_name("mavlink_tlog").read(bytes(data), ReadOptions())
+    assert result.accepted == COUNT - 1
+    assert len(result.rejected) == 1
+    torn = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"][:-7], ReadOptions())
+    assert (torn.accepted, len(torn.rejected)) == (COUNT, 1)
+    hole = LOGS["ardupilot_bin"].replace(struct.pack("<i", 357_300_002), b"", 1)
+    assert len(by_name("ardupilot_bin").read(hole, ReadOptions()).rejected) >= 1
+
+
+def test_without_utc_the_times_are_relative() -> None:
+    silent = LOGS["px4_ulog"].replace(b"time_utc_usec", b"time_xxx_usec")
+    result = by_name("px4_ulog").read(silent, ReadOptions())
+    assert result.streams[0].attributes["clock"] == "relative"
+    given = by_name("px4_ulog").read(silent, ReadOptions(time_origin="2025-03-02T15:00:00Z"))
+    assert given.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:30")
+
+
+def test_pymavlink_reads_the_same_dataflash_log(tmp_path: object) -> None:
+    dfreader = pytest.importorskip("pymavlink.DFReader")
+    path = f"{tmp_path}/flight.bin"
+    with open(path, "wb") as file:  # noqa: PTH123
+        file.write(LOGS["ardupilot_bin"])
+    log = dfreader.DFReader_binary(path, zero_time_base=False)
+    rows = []
+    while (message := log.recv_match(type="POS")) is not None:
+        rows.append((message.Lat, message.Lng, message.RelHomeAlt))
+    log.data_map.close()
+    log.filehandle.close()
+    frame = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"], ReadOptions()).streams[0].frame
+    assert np.allclose(frame[["latitude_deg", "longitude_deg", "altitude_m"]].to_numpy(), rows, atol=1e-9)
+
+
+def test_pyulog_reads_the_same_px4_log(tmp_path: object) -> None:
+    pyulog = pytest.importorskip("pyulog")
+    path = f"{tmp_path}/flight.ulg"
+    with open(path, "wb") as file:  # noqa: PTH123
+        file.write(LOGS["px4_ulog"])
+    place = pyulog.ULog(path).get_dataset("vehicle_global_position").data
+    frame = by_name("px4_ulog").read(LOGS["px4_ulog"], ReadOptions()).streams[0].frame
+    assert np.array_equal(frame["latitude_deg"].to_numpy(), place["lat"])
+    assert np.array_equal(frame["longitude_deg"].to_numpy(), place["lon"])

@@ -1,0 +1,124 @@
+"""Base stations, UEs, SigMF, bursts and our own exports: base and averaging of RI, and what each value means."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
+from aerpaw_cmp.logs.records import ReadResult
+from tests.parsers import samples
+
+PLAIN = ReadOptions(timezone="America/New_York")
+
+
+def read(reader: str, data: bytes, options: ReadOptions = PLAIN) -> ReadResult:
+    return by_name(reader).read(data, options)
+
+
+@pytest.mark.parametrize(
+    ("reader", "data", "ranks", "means"),
+    [
+        ("srsran_gnb", samples.SRSRAN_GNB, [2.0, None, None], [2.0, 2.2, None]),
+        ("srsran_gnb", samples.SRSRAN_GNB_OLD, [1.0], [1.0]),
+        ("srsran_gnb", samples.SRSRAN_LOG, [2.0], [2.0]),
+        ("srsran_json", samples.SRSRAN_JSON, [2.0, None], [2.0, 1.5]),
+        ("amarisoft", samples.AMARISOFT, [2.0, None], [2.0, 1.5]),
+        ("amarisoft_json", samples.AMARISOFT_JSON, [2.0, None], [2.0, 1.25]),
+    ],
+)
+def test_a_mean_of_ranks_is_no_rank(
+    reader: str, data: bytes, ranks: list[float | None], means: list[float | None]
+) -> None:
+    (stream,) = read(reader, data).streams
+    assert stream.attributes["ri_base"] == "one"
+    assert "mean" in str(stream.attributes["source"])
+    assert [None if np.isnan(v) else v for v in stream.frame["rank"]] == ranks
+    assert [None if np.isnan(v) else v for v in stream.frame["rank_mean"]] == means
+    assert stream.frame["time"][0].floor("s") == pd.Timestamp("2025-03-02T15:00:00")
+
+
+def test_oai_layouts() -> None:
+    gnb = read("oai_log", samples.OAI_GNB)
+    rank = next(one for one in gnb.streams if one.kind == "rank")
+    assert rank.frame["rank"].tolist() == [2.0, 1.0], "the old layout and the new"
+    assert rank.frame["rnti"].tolist() == [0x1F4D] * 2
+    assert next(one for one in gnb.streams if one.kind == "rss").frame["rss_db"].tolist() == [-78.0]
+    frames = read("oai_log", samples.OAI_GNB_FRAMES).streams[0]
+    assert frames.attributes["clock"] == "relative"
+    assert (frames.frame["time"][1] - frames.frame["time"][0]).total_seconds() == 1.28, "128 frames of 10 ms"
+    ue = read("oai_log", samples.OAI_UE)
+    assert ue.streams[0].frame[["rank", "sinr_db"]].values.tolist() == [[2.0, 20.0], [1.0, 19.0]]
+    assert ue.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
+
+
+def test_sigmf_of_dataset_12() -> None:
+    result = read("sigmf", samples.SIGMF)
+    track, one, two = result.streams
+    assert track.frame["longitude_deg"].tolist() == [-78.7, -78.71]
+    assert one.frame["rss_db"].tolist() == [-40.5, -41.5]
+    assert two.frame["flag"].tolist() == ["", "out_of_coverage"]
+    assert one.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
+
+
+def test_sigmf_of_single_bursts_and_the_sounder() -> None:
+    meta = {
+        "global": {"core:datatype": "cf32_le", "gps:position": {"x": -78.7, "y": 35.73, "z": 30}},
+        "captures": [
+            {"core:sample_start": 0, "core:timestamp": 1740927600.25, "core:rx_location": {"latitude": 35.5, "longitude": -78.5},
+             "core:rotation": {"pitch": 1, "roll": 2, "yaw": 3}},
+        ],
+    }  # fmt: skip
+    (track,) = read("sigmf", json.dumps(meta).encode()).streams
+    assert track.frame.iloc[0][["yaw_deg", "roll_deg"]].tolist() == [3.0, 2.0]
+
+
+def test_power_of_sigmf_samples() -> None:
+    """A carrier of amplitude a has the power 20 log10 a, whatever the data type."""
+    rate = 10_000
+    phase = np.exp(2j * np.pi * 0.01 * np.arange(600))
+    amplitude = np.repeat([0.5, 0.05, 0.005], 200)
+    wave = phase * amplitude
+    meta = {
+        "global": {"core:datatype": "", "core:sample_rate": rate},
+        "captures": [{"core:sample_start": 0, "core:datetime": "2025-03-02T15:00:00Z"}],
+    }
+    for kind, data in (
+        ("cf32_le", np.stack([wave.real, wave.imag], axis=1).astype("<f4").tobytes()),
+        ("ci16_le", np.round(np.stack([wave.real, wave.imag], axis=1) * 2**15).astype("<i2").tobytes()),
+    ):
+        meta["global"]["core:datatype"] = kind  # type: ignore[index]
+        options = replace(PLAIN, file_name="b.sigmf-meta", beside={"b.sigmf-data": data}.get)
+        (stream,) = read("sigmf", json.dumps(meta).encode(), options).streams
+        assert stream.frame["rss_db"].tolist() == pytest.approx([-6.0206, -26.0206, -46.0206], abs=0.01)
+        assert (stream.frame["time"].diff().dropna().dt.total_seconds() == 0.02).all()
+    with pytest.raises(InputError, match="samples cannot be read"):
+        read("sigmf", json.dumps(meta).encode())
+
+
+def test_power_of_a_burst_is_that_of_its_samples() -> None:
+    result = read("iq_burst", samples.iq_mat(), replace(PLAIN, file_name=samples.IQ_NAME))
+    assert [one.frame["rss_db"][0] for one in result.streams] == pytest.approx([-20.0, -40.0], abs=1e-4)
+    assert result.streams[0].frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00.250")
+    assert result.streams[0].attributes["frequency_hz"] == 3.32e9
+    with pytest.raises(InputError, match="name of the burst"):
+        read("iq_burst", samples.iq_mat(), replace(PLAIN, file_name="burst.mat"))
+
+
+def test_our_own_exports_are_read_back() -> None:
+    rss = read("own_csv", samples.RSS_EXPORT)
+    assert [(one.attributes["node"], one.attributes["channel"]) for one in rss.streams] == [
+        ("LW1", "USRP1"),
+        ("LW2", "USRP1"),
+    ]
+    assert rss.streams[0].frame["flag"].tolist() == ["", "out_of_coverage"]
+    rank = read("own_csv", samples.RANK_EXPORT).streams[0]
+    assert rank.attributes["clock"] == "relative"
+    assert rank.frame["rank"].tolist()[0] == 2.0
+    tap = read("own_csv", samples.TAP_EXPORT)
+    assert [(one.kind, one.name) for one in tap.streams] == [("rank", "nr5g"), ("rss", "nr5g_rsrp")]

@@ -719,7 +719,7 @@ def run_calibrate(
     from ..flight.settings import load_flight
     from ..report.calibration_html import calibration_metrics
     from .calibrate import calibrate, load_calibration
-    from .calibration_files import MARK, write_files
+    from .calibration_files import write_files
 
     settings = load_calibration(path)
     target = out or Path(f"{settings.calibration}.calibrated.yaml")
@@ -729,17 +729,14 @@ def run_calibrate(
     for name in settings.flights:
         inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
 
-    def own(file: Path) -> bool:
-        return file.read_bytes().startswith(MARK.encode())
-
     folder = target.with_suffix("")
     stages = Stages(progress)
     with (
-        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFile(target, own=is_sealed, inputs=inputs, force=force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
     ):
         found = calibrate(path, logs_root=logs_root, stages=stages)
         with output.filling() as place:
             record, text = write_files(found, place, folder.name, stages.seconds)
-        file.write(text.encode())
+        file.write(sealed(text))
     return CalibrateOutcome(target, folder, calibration_metrics(record))

@@ -419,6 +419,8 @@ class RankSettings(Settings):
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    receiver: str | None = None
+    """Receiver file of ``calibrate``: gives a probability of each rank."""
 
     @field_validator("k")
     @classmethod

@@ -32,6 +32,7 @@ from ..flight.data import FlightData, RssSeries, gather, read_logs
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
+from .calibrate_rank import RankFitSettings
 
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 """Heights of roughness that are tried [m]; infinite is no ground ray."""
@@ -66,8 +67,8 @@ class CalibrationFile(Settings):
     flights: Annotated[list[str], Field(min_length=1)]
     patterns: PatternsSettings = PatternsSettings()
     fit: FitSettings = FitSettings()
-    rank: dict[str, Any] | None = None
-    """Settings of the receiver's rank."""
+    rank: RankFitSettings | None = None
+    """Also learn how the receiver decides its rank."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -13,10 +13,12 @@ from typing import Any
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
+from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.result import (
     Censored,
     ExpectedOffset,
@@ -35,6 +37,7 @@ from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
+from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
 from .replay import FlightReplay, Replayed, direct_foliage_m
 from .what_if import (
@@ -449,6 +452,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma = ranks.singular_values(h)
+    probability, forecast = _receiver_forecast(data, series)
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
@@ -466,9 +470,30 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             commonest=ranks.commonest_rank(series.rank[rows]),
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
+            receiver=forecast,
             foliage=foliage_rank_difference(paired) or None,
         ),
+        probability=probability,
     )
+
+
+def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray | None, ForecastScore | None]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, and its score; None without one."""
+    named = data.settings.rank.receiver
+    if named is None:
+        return None, None
+    receivers = read_receiver(data.folder / named)
+    if series.tower not in receivers:
+        raise InputError(
+            f"no receiver at {series.tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    samples, receiver = rank_samples(data, series), receivers[series.tower]
+    probability, said = receiver.forecast(samples)
+    constant = receiver.mixture.members[0].constant
+    replicates = max(data.settings.rank.bootstrap, 2)
+    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates)
 
 
 def _repeated_rank(

@@ -304,6 +304,11 @@ def rank_panel(result: RankResult) -> record.RankPanel:
         values={
             "level_dbm": result.level_dbm,
             **{f"sigma{i + 2}_over_sigma1_db": ratio_db[:, i] for i in range(ratio_db.shape[1])},
+            **(
+                {}
+                if result.probability is None
+                else {f"probability_rank{r + 1}": result.probability[:, r] for r in range(result.probability.shape[1])}
+            ),
         },
         per_sample={
             f"rank_{name.replace(' ', '_')}_k{k:g}": rank.astype(np.float64)

@@ -123,11 +123,120 @@ def measure_folder() -> dict[str, Any] | None:
     return {"files": len(found), "lines": sum(file.result.lines for file in found), "seconds": spent}
 
 
+SCALE_LINES = 5_000_000
+SCALE_HELP = "time and peak memory of a file of so many lines (a power log, made here), each contestant in a process"
+
+
+def write_large(place: Path, lines: int) -> None:
+    """A power log of so many lines, 500 000 at a time; its octal offsets run through."""
+    rng, step = np.random.default_rng(5), 500_000
+    start = np.datetime64("2025-03-02T15:00:00", "ns")
+    with place.open("wb") as file:
+        for first in range(0, lines, step):
+            count = min(step, lines - first)
+            times = start + (first + np.arange(count)) * np.timedelta64(3_276_000, "ns")
+            block = format_power_log(times, rng.normal(-40, 9, count), ZONE).split(b"\n")[:-1]
+            for i, line in enumerate(block):
+                file.write(b"%s%07o%s\n" % (line[:29], 4 * (first + i), line[36:]))
+
+
+def _peak_mib() -> float:
+    """Peak of the resident memory of this process alone: getrusage would hand down that of its parent."""
+    status = Path("/proc/self/status").read_text()
+    return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1024
+
+
+def contest(who: str, place: Path) -> dict[str, float]:
+    """CPU seconds, peak MiB above the imports, and MiB of the records of one contestant, in this process."""
+    run = {"ours": _ours, "pandas": _pandas, "pyarrow": _pyarrow, "polars": _polars}[who]
+    prepare = place.with_suffix(".small")
+    with place.open("rb") as file:
+        prepare.write_bytes(b"".join(file.readlines(100_000)))
+    run(prepare)  # imports and first-call costs do not count
+    before = _peak_mib()
+    start = time.process_time()
+    kept = run(place)
+    spent = time.process_time() - start
+    peak = _peak_mib()
+    records = sum(column.nbytes for column in kept) / 2**20
+    return {"cpu_s": spent, "peak_mib": peak - before, "records_mib": records}
+
+
+def _ours(place: Path) -> list[Any]:
+    (file,) = ingest(place, options=ReadOptions(timezone=ZONE), reader="sounder_log")
+    frame = file.result.streams[0].frame
+    return [frame[name].to_numpy() for name in frame]
+
+
+def _pandas(place: Path) -> list[Any]:
+    frame = pd.read_csv(place, engine="c", header=None, sep=r"\s+")
+    clock = pd.to_datetime(frame[0].str[1:] + " " + frame[1].str[:-1], format="%Y-%m-%d %H:%M:%S.%f")
+    return [clock.dt.tz_localize(ZONE).dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(), frame[3].to_numpy()]
+
+
+def _pyarrow(place: Path) -> list[Any]:
+    import pyarrow.compute as pc
+    from pyarrow import csv
+
+    pa_table = csv.read_csv(
+        place,
+        read_options=csv.ReadOptions(column_names=["line"], use_threads=False),
+        parse_options=csv.ParseOptions(delimiter="\x01", quote_char=False),
+    )
+    line = pa_table["line"]
+    clock = pc.cast(pc.utf8_slice_codeunits(line, 1, 27), "timestamp[us]")
+    level = pc.cast(pc.utf8_ltrim_whitespace(pc.utf8_slice_codeunits(line, -16)), "float64")
+    return [pc.assume_timezone(clock, ZONE).to_numpy(), level.to_numpy()]
+
+
+def _polars(place: Path) -> list[Any]:
+    import polars as pl
+
+    line = pl.col("line").str
+    clock = line.slice(1, 26).str.to_datetime("%Y-%m-%d %H:%M:%S%.f", time_zone=ZONE)
+    level = line.tail(16).str.strip_chars().cast(pl.Float64)
+    table = pl.read_csv(place, has_header=False, new_columns=["line"], separator="\x01", quote_char=None)
+    made = table.select(clock.dt.convert_time_zone("UTC").alias("time"), level.alias("level"))
+    return [made["time"].to_numpy(), made["level"].to_numpy()]
+
+
+def scale(lines: int) -> None:
+    """The table of peers."""
+    import subprocess
+    import sys
+    import tempfile
+
+    with tempfile.TemporaryDirectory() as folder:
+        place = Path(folder) / "x_power_log.txt"
+        write_large(place, lines)
+        print(f"{lines} lines, {place.stat().st_size / 1e6:.0f} MB; CPU seconds and peak above the imports")
+        found = {}
+        for who in ("ours", "pandas", "pyarrow", "polars"):
+            command = [sys.executable, __file__, "--contest", who, str(place)]
+            answer = subprocess.run(command, capture_output=True, text=True, check=False)
+            if answer.returncode:
+                print(f"  {who:8} not run: {(answer.stderr.strip().splitlines() or ['?'])[-1][:90]}")
+                continue
+            found[who] = json.loads(answer.stdout)
+            one = found[who]
+            ratio = found["ours"]["cpu_s"] / one["cpu_s"]
+            memory = f"peak {one['peak_mib']:7.0f} MiB, of which records {one['records_mib']:5.0f}"
+            print(f"  {who:8} {one['cpu_s']:8.2f} s   {memory}   ours takes {ratio:.2f} x its time")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true", help="a tenth of the lines, few rounds")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--scale", type=int, nargs="?", const=SCALE_LINES, metavar="LINES", help=SCALE_HELP)
+    parser.add_argument("--contest", nargs=2, metavar=("WHO", "FILE"), help=argparse.SUPPRESS)
     given = parser.parse_args()
+    if given.contest:
+        print(json.dumps(contest(given.contest[0], Path(given.contest[1]))))
+        return
+    if given.scale:
+        scale(given.scale)
+        return
     answer = measure(LINES // 10 if given.quick else LINES, 5 if given.quick else 31)
     folder = None if given.quick else measure_folder()
     if folder:

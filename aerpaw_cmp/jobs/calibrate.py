@@ -28,7 +28,7 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, FlightData, RssSeries, gather, read_logs
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
@@ -185,6 +185,9 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     for data in flights:
         name = data.settings.flight.name
         for series in data.rss:
+            if series.channel.lower() in RATIOS:
+                warnings.append(f"{name}: {series.channel} is a ratio, no level: left out")
+                continue
             one, guessed = _observe(data, series)
             if not np.isfinite(one.samples.residual_db).any():
                 warnings.append(f"{name}: {series.tower} {series.channel} has no level at a known pose and is left out")

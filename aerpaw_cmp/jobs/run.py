@@ -730,13 +730,10 @@ def run_calibrate(
     for name in settings.flights:
         inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
 
-    def own(file: Path) -> bool:
-        return file.read_bytes().startswith(MARK.encode())
-
     folder = target.with_suffix("")
     stages = Stages(progress)
     with (
-        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFile(target, own=is_sealed, inputs=inputs, force=force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
     ):
         ranked, has_rss = _calibrated_rank(settings, path, logs_root, stages)
@@ -757,7 +754,7 @@ def run_calibrate(
             metrics = calibration_metrics(record)
         if ranked is not None:
             text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
-        file.write(text.encode())
+        file.write(sealed(text))
     return CalibrateOutcome(target, folder, metrics)
 
 

@@ -86,6 +86,8 @@ class FittedReceiver:
     tower: str
     geometries: tuple[Geometry, ...]
     tied: int
+    flights: tuple[str, ...]
+    """It was fitted on: no score there is worth anything."""
     mixture: ReceiverMixture
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
@@ -98,6 +100,7 @@ class FittedReceiver:
         return {
             "geometries": [dataclasses.asdict(g) for g in self.geometries],
             "tied": self.tied,
+            "flights": list(self.flights),
             "members": [one.as_dict() for one in self.mixture.members],
             "decision_weight": self.mixture.decision_weight.tolist(),
         }
@@ -141,6 +144,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
                 tower=tower,
                 geometries=tuple(_geometry(g) for g in one["geometries"]),
                 tied=int(one["tied"]),
+                flights=tuple(str(name) for name in one["flights"]),
                 mixture=ReceiverMixture(
                     members=tuple(Receiver.from_dict(m) for m in one["members"]),
                     decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
@@ -289,7 +293,13 @@ class _Tried:
             _groups(whole),
             penalties=(3.0, 10.0, 30.0),
         )
-        return FittedReceiver(tower=whole[0].tower, geometries=kept, tied=len(choice.tied), mixture=mixture)
+        return FittedReceiver(
+            tower=whole[0].tower,
+            geometries=kept,
+            tied=len(choice.tied),
+            flights=tuple(one.flight for one in whole),
+            mixture=mixture,
+        )
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:

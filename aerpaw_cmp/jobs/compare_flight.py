@@ -491,6 +491,8 @@ def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray
         )
     samples, receiver = rank_samples(data, series), receivers[series.tower]
     probability, said = receiver.forecast(samples)
+    if samples.flight in receiver.flights:  # nothing is scored where it was fitted
+        return probability, None
     constant = receiver.mixture.members[0].constant
     replicates = max(data.settings.rank.bootstrap, 2)
     return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates)

@@ -65,6 +65,7 @@ def test_a_receiver_survives_its_file(tried: _Tried, tmp_path: Path) -> None:
     path.write_text(RankCalibration(receivers={"T": fitted}, scores={}, warnings=()).text(), encoding="utf-8")
     again = read_receiver(path)["T"]
     assert again.geometries == fitted.geometries
+    assert again.flights == ("f1", "f2")
     np.testing.assert_array_equal(again.forecast(tried.samples[0])[0], fitted.forecast(tried.samples[0])[0])
 
 

@@ -667,13 +667,25 @@ def calibrate(
         means = [sum(s[key] for s in scores) / len(scores) if scores else None
                  for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
         rows.append([name.replace("_", " "), *(_number(v, "{:.2f}") for v in means), str(len(scores))])
-    _table(
-        ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"], rows, "Scores on what was left out, means"
-    )
+    if rows:
+        heads = ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"]
+        _table(heads, rows, "Scores on what was left out, means")
+    rows = [
+        [split.replace("_", " "), one["flight"], one["tower"], _number(one["kappa"], "{:.3f}"),
+         _number(one["agreement"], "{:.3f}"), _number(one["majority_agreement"], "{:.3f}"),
+         _number(one["log_score"], "{:.3f}"), _number(one["constant_log_score"], "{:.3f}"),
+         _number(one["total_variation_expected"], "{:.3f}")]
+        for split, scores in m["rank"].items()
+        for one in scores
+    ]  # fmt: skip
+    if rows:
+        heads = ["left out", "flight", "tower", "kappa", "agree", "commonest", "log score", "constant", "TV"]
+        _table(heads, rows, "Rank on what was left out")
     for text in [*m["words"], *m["warnings"]]:
         print(text)
     print(outcome.file)
-    print(outcome.folder / "calibration.html")
+    page = outcome.folder / "calibration.html"
+    print(page if page.exists() else outcome.folder)
 
 
 @app.command(help=COMMANDS["campaign"])

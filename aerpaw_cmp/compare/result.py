@@ -14,6 +14,7 @@ from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .field_difference import FieldAudit
+from .forecast import ForecastScore
 from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
@@ -230,6 +231,7 @@ class RankFurther:
     kappa_ci95: Mapping[str, Interval]
     commonest: CommonestRank
     repeat: Mapping[str, RankRepeat]
+    receiver: ForecastScore | None = None
     foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 
 
@@ -251,6 +253,8 @@ class RankResult:
         Singular values of the simulated channels, falling, relative to a scale of each channel.
     level_dbm : (n,)
         Simulated level, NaN without a path.
+    probability : (n, 4), optional
+        Of rank 1 to 4, by the fitted receiver that ``rank.receiver`` names.
     rank : mapping of float to (n,) int
         Simulated, per K; 0: no path.
     foliage_rank : mapping of str to mapping of float to (n,) int
@@ -271,6 +275,7 @@ class RankResult:
     foliage_rank: Mapping[str, Mapping[float, IntArray]]
     score: RankComparison
     further: RankFurther
+    probability: FloatArray | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

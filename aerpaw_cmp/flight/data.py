@@ -20,7 +20,7 @@ from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
 from ..logs.limits import UNSCORED, flagged
 from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
-from ..site.site import Site
+from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
 from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
@@ -96,6 +96,63 @@ def choose_site(choice: SiteChoice, folder: Path) -> Site:
     return site
 
 
+STANDS_STILL_M = 3.0
+"""A ground node whose positions stay within this of their median stands still: that is the noise of its GNSS."""
+
+
+def with_ground_nodes(site: Site, settings: FlightFile, folder: Path) -> Site:
+    """The site with the flight's own nodes as towers.
+
+    Raises
+    ------
+    UsageError
+        A name that the site has already; a node that moves.
+    InputError
+        A track without positions.
+    """
+    towers = dict(site.towers)
+    for name, node in settings.towers.items():
+        if name in site.towers:
+            raise UsageError(
+                f"towers.{name}: site {site.name!r} has a tower of this name", expected="a name of its own"
+            )
+        if node.track is None:
+            assert node.latitude_deg is not None
+            assert node.longitude_deg is not None
+            latitude, longitude, source = node.latitude_deg, node.longitude_deg, "flight.yaml"
+        else:
+            latitude, longitude = _still(name, folder / node.track, settings.timezone, site)
+            source = node.track
+        east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
+        towers[name] = Tower(
+            name, latitude, longitude, float(east[0]), float(north[0]), node.antenna_height_m, source=source
+        )
+    return dataclasses.replace(site, towers=towers)
+
+
+def _still(name: str, path: Path, timezone: str | None, site: Site) -> tuple[float, float]:
+    """Median position [deg] of a node that stands still."""
+    if not path.is_file():
+        raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
+    (file,) = ingest([path], options=LogSettings(path=str(path)).options(timezone))
+    frames = [s.frame for s in file.result.streams if {"latitude_deg", "longitude_deg"} <= set(s.frame.columns)]
+    known = [f[["latitude_deg", "longitude_deg"]].dropna().to_numpy(np.float64) for f in frames]
+    if not any(map(len, known)):
+        raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
+    places = next(k for k in known if len(k))
+    latitude, longitude = (float(v) for v in np.median(places, axis=0))
+    east, north = site.frame.to_local(places[:, 0], places[:, 1])
+    middle = site.frame.to_local(np.array([latitude]), np.array([longitude]))
+    away = float(np.hypot(east - middle[0], north - middle[1]).max())
+    if away > STANDS_STILL_M:
+        raise UsageError(
+            f"towers.{name} moves: its track leaves {away:.0f} m from the middle",
+            expected=f"a node that stands still within {STANDS_STILL_M:g} m; nodes in motion are not replayed",
+            path=path,
+        )
+    return latitude, longitude
+
+
 def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
     """Every log of the flight file, in its order.
 
@@ -159,7 +216,7 @@ def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
     """Sort the streams into track, RSS and rank, and check that they belong together."""
-    site = choose_site(settings.site, folder)
+    site = with_ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder)
     warnings: list[str] = []
     telemetry: list[tuple[str, Stream]] = []
     rss: list[tuple[str, RssSeries]] = []
@@ -455,14 +512,14 @@ def _check_overlap(data: FlightData) -> None:
             raise InputError(
                 f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
                 expected="logs of the same flight",
-                cause=_clock_cause(data, time, start, end),
+                cause=_clock_cause(data.settings.timezone, time, start, end),
             )
 
 
-def _clock_cause(data: FlightData, time: Times, start: np.datetime64, end: np.datetime64) -> str:
+def _clock_cause(timezone: str | None, time: Times, start: np.datetime64, end: np.datetime64) -> str:
     trap = None
     if len(time):
-        trap = clock_trap((time.min(), time.max()), (start, end), data.settings.timezone)
+        trap = clock_trap((time.min(), time.max()), (start, end), timezone)
     if trap is None:
         return "logs of different flights, or a wrong 'timezone' or 'clock'"
     return f"{trap.explanation}; try 'clock: local_as_utc', 'clock: local' or 'clock: utc' beside the log"

@@ -314,6 +314,23 @@ class SiteChoice(Settings):
     without_buildings: bool = False
 
 
+class GroundNode(Settings):
+    """A node of this flight that the site does not list, such as a rover: a place, or a log of its positions."""
+
+    latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
+    longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
+    track: str | None = None
+    """Log with its positions; a node that stands still within ``STANDS_STILL_M`` is at their median."""
+    antenna_height_m: Positive = 1.5
+
+    @model_validator(mode="after")
+    def _a_place_or_a_track(self) -> GroundNode:
+        given = (self.latitude_deg is not None, self.longitude_deg is not None)
+        if given not in ((True, True), (False, False)) or all(given) == (self.track is not None):
+            raise ValueError("a tower needs latitude_deg and longitude_deg, or a track")
+        return self
+
+
 class RtSettings(Settings):
     """How the flight is replayed."""
 
@@ -419,6 +436,8 @@ class RankSettings(Settings):
     minimum_height_m: float | None = None
     """Samples below this height are left out, and counted (the README of a data set may ask for it)."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    receiver: str | None = None
+    """Receiver file of ``calibrate``: gives a probability of each rank."""
 
     @field_validator("k")
     @classmethod
@@ -441,6 +460,8 @@ class FlightFile(Settings):
 
     flight: FlightSettings
     site: SiteChoice = SiteChoice()
+    towers: dict[str, GroundNode] = Field(default_factory=dict)
+    """Nodes of this flight beside those of the site (a rover)."""
     timezone: str | None = None
     logs: Annotated[list[LogSettings], Field(min_length=1)]
     link: LinksSettings = LinksSettings()

@@ -316,7 +316,15 @@ class Track:
             raised[valid] = position[valid, 2] < floor
             position[raised, 2] = floor
         reason = np.asarray(REASONS)[code]
-        return TrackPoses(position, rotation, valid, reason, known, raised, velocity)
+        return TrackPoses(
+            position_m=position,
+            rotation=rotation,
+            valid=valid,
+            reason=reason,
+            attitude_known=known,
+            raised=raised,
+            velocity_mps=velocity,
+        )
 
     def _codes(self, t: FloatArray) -> AnyArray:
         """Index into :data:`REASONS` for every instant."""

@@ -28,10 +28,11 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, FlightData, RssSeries, gather, read_logs
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
+from .calibrate_rank import RankFitSettings
 
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 """Heights of roughness that are tried [m]; infinite is no ground ray."""
@@ -66,8 +67,8 @@ class CalibrationFile(Settings):
     flights: Annotated[list[str], Field(min_length=1)]
     patterns: PatternsSettings = PatternsSettings()
     fit: FitSettings = FitSettings()
-    rank: dict[str, Any] | None = None
-    """Settings of the receiver's rank."""
+    rank: RankFitSettings | None = None
+    """Also learn how the receiver decides its rank."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -184,6 +185,9 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     for data in flights:
         name = data.settings.flight.name
         for series in data.rss:
+            if series.channel.lower() in RATIOS:
+                warnings.append(f"{name}: {series.channel} is a ratio, no level: left out")
+                continue
             one, guessed = _observe(data, series)
             if not np.isfinite(one.samples.residual_db).any():
                 warnings.append(f"{name}: {series.tower} {series.channel} has no level at a known pose and is left out")

@@ -8,14 +8,17 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from itertools import combinations
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
+from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.result import (
     Censored,
     ExpectedOffset,
@@ -31,9 +34,10 @@ from ..compare.result import (
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.settings import RssSettings, RtSettings
+from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
+from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
 from .replay import FlightReplay, Replayed, direct_foliage_m
 from .what_if import (
@@ -164,7 +168,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
-            expected_offset=_expected(data, series, score.offset_db),
+            expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
@@ -247,8 +251,10 @@ def _averaged(
     }
 
 
-def _expected(data: FlightData, series: RssSeries, offset_db: float) -> ExpectedOffset | None:
-    found = expected_offset(data.settings.rss.reference_powers, data.folder, series)
+def _expected(
+    budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
+) -> ExpectedOffset | None:
+    found = expected_offset(budget, folder, series)
     if found is None:
         return None
     expected, received, sent = found
@@ -446,6 +452,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma = ranks.singular_values(h)
+    probability, forecast = _receiver_forecast(data, series)
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
@@ -463,9 +470,32 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             kappa_ci95={f"{k:g}": fit.kappa_ci95 for k, fit in score.simulated.items()},
             commonest=ranks.commonest_rank(series.rank[rows]),
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
+            receiver=forecast,
             foliage=foliage_rank_difference(paired) or None,
         ),
+        probability=probability,
     )
+
+
+def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray | None, ForecastScore | None]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, and its score; None without one."""
+    named = data.settings.rank.receiver
+    if named is None:
+        return None, None
+    receivers = read_receiver(data.folder / named)
+    if series.tower not in receivers:
+        raise InputError(
+            f"no receiver at {series.tower}",
+            expected="a receiver fitted at one of the flight's towers; it has " + ", ".join(receivers),
+            path=data.folder / named,
+        )
+    samples, receiver = rank_samples(data, series), receivers[series.tower]
+    probability, said = receiver.forecast(samples)
+    if samples.flight in receiver.flights:  # nothing is scored where it was fitted
+        return probability, None
+    constant = receiver.mixture.members[0].constant
+    replicates = max(data.settings.rank.bootstrap, 2)
+    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates)
 
 
 def _repeated_rank(

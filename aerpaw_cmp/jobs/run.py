@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -729,17 +730,45 @@ def run_calibrate(
     for name in settings.flights:
         inputs += input_files(load_flight(path.parent / name), path.parent / name, logs_root)
 
-    def own(file: Path) -> bool:
-        return file.read_bytes().startswith(MARK.encode())
-
     folder = target.with_suffix("")
     stages = Stages(progress)
     with (
-        OutputFile(target, own=own, inputs=inputs, force=force) as file,
+        OutputFile(target, own=is_sealed, inputs=inputs, force=force) as file,
         OutputFolder(folder, job="calibrate", inputs=inputs, force=force) as output,
     ):
-        found = calibrate(path, logs_root=logs_root, stages=stages)
-        with output.filling() as place:
-            record, text = write_files(found, place, folder.name, stages.seconds)
-        file.write(text.encode())
-    return CalibrateOutcome(target, folder, calibration_metrics(record))
+        ranked, has_rss = _calibrated_rank(settings, path, logs_root, stages)
+        if not has_rss and ranked is not None:
+            text, metrics = MARK + "\n", {**_RANK_ALONE, "calibration": settings.calibration}
+            with output.filling() as place:
+                metrics |= {"rank": ranked.metrics(), "warnings": list(ranked.warnings), "flights": settings.flights}
+                (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
+                (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+        else:
+            found = calibrate(path, logs_root=logs_root, stages=stages)
+            if ranked is not None:
+                found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
+            with output.filling() as place:
+                record, text = write_files(found, place, folder.name, stages.seconds)
+                if ranked is not None:
+                    (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
+            metrics = calibration_metrics(record)
+        if ranked is not None:
+            text += f"rank:\n  receiver: {folder.name}/receiver.json\n"
+        file.write(sealed(text))
+    return CalibrateOutcome(target, folder, metrics)
+
+
+_RANK_ALONE: dict[str, Any] = {"scores": {}, "controls": {}, "words": [], "antennas": []}
+"""What a calibration of flights without RSS has instead of antennas."""
+
+
+def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: Stages) -> tuple[Any, bool]:
+    """The receiver, where calibration.yaml asks for one, and whether there is RSS to learn antennas from."""
+    if settings.rank is None:
+        return None, True
+    from .calibrate import read_flights
+    from .calibrate_rank import fit_rank
+
+    with stages("rank"):
+        flights = read_flights(settings, path.parent, logs_root)
+        return fit_rank(flights, settings.rank), any(data.rss for data in flights)

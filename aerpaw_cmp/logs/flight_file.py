@@ -233,13 +233,13 @@ def _read_file(group: Any) -> IngestedFile:
     shelf = group["streams"]
     streams = tuple(_read_stream(shelf[name]) for name in sorted(shelf))
     result = ReadResult(
-        meta["reader"],
-        streams,
-        meta["lines"],
-        meta["accepted"],
-        meta["blank"],
-        rejected,
-        tuple(meta["warnings"]),
+        reader=meta["reader"],
+        streams=streams,
+        lines=meta["lines"],
+        accepted=meta["accepted"],
+        blank=meta["blank"],
+        rejected=rejected,
+        warnings=tuple(meta["warnings"]),
     )
     return IngestedFile(meta["path"], meta["sha256"], result)
 

@@ -17,7 +17,8 @@ from ..compare.rank import RankFit
 from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, LogSettings
+from ..logs.ingest import IngestedFile
 from . import data as record
 from .export import merge
 
@@ -68,7 +69,7 @@ def report_data(
         site=data.site,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         versions=versions(),
-        inputs=(*inputs_of(data), *other_inputs),
+        inputs=(*inputs_of(settings.logs, data.files), *other_inputs),
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(
@@ -303,6 +304,11 @@ def rank_panel(result: RankResult) -> record.RankPanel:
         values={
             "level_dbm": result.level_dbm,
             **{f"sigma{i + 2}_over_sigma1_db": ratio_db[:, i] for i in range(ratio_db.shape[1])},
+            **(
+                {}
+                if result.probability is None
+                else {f"probability_rank{r + 1}": result.probability[:, r] for r in range(result.probability.shape[1])}
+            ),
         },
         per_sample={
             f"rank_{name.replace(' ', '_')}_k{k:g}": rank.astype(np.float64)
@@ -352,7 +358,7 @@ def rank_warnings(result: RankResult) -> tuple[str, ...]:
 # --- the flight ----------------------------------------------------------------------------------------------------
 
 
-def inputs_of(data: FlightData) -> tuple[record.InputFile, ...]:
+def inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tuple[record.InputFile, ...]:
     """The account of every log."""
     return tuple(
         record.InputFile(
@@ -367,7 +373,7 @@ def inputs_of(data: FlightData) -> tuple[record.InputFile, ...]:
             warnings=file.result.warnings,
             rejected_lines=file.result.rejected,
         )
-        for log, file in zip(data.settings.logs, data.files, strict=True)
+        for log, file in zip(logs, files, strict=True)
     )
 
 

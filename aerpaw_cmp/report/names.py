@@ -37,7 +37,8 @@ RANK_COLUMNS: dict[str, str] = {
     "measured_rank": "reported rank 1 to 4; empty: no CSI",
 }
 """Columns of rank.csv, followed by one ``simulated_rank_k<K>`` per K (0: no path), then what a receiver decides by:
-``level_dbm`` and ``sigma<i>_over_sigma1_db``, 20 log10 of the ratio of singular values (empty: no path, or zero)."""
+``level_dbm`` and ``sigma<i>_over_sigma1_db``, 20 log10 of the ratio of singular values (empty: no path, or zero);
+with ``rank.receiver`` also ``probability_rank<r>``."""
 
 
 k_key = number_key

@@ -5,6 +5,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import subprocess
+import sys
+import zipfile
 from pathlib import Path
 from typing import Any
 
@@ -192,3 +195,41 @@ def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.Mon
         assert main(command) == 3
     assert digests(out) == before
     assert [path.name for path in out.parent.iterdir()] == ["r"]
+
+
+def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:
+    """HDF5 ended the process here, without a word and with its part left."""
+    out = logs.parent / "out"
+    out.mkdir()
+    script = 'ulimit -f 20; exec "$@"'
+    command = [sys.executable, "-m", "aerpaw_cmp", "ingest", str(logs), *ZONE, "-o", str(out / "flight.h5")]
+    done = subprocess.run(["bash", "-c", script, "bash", *command], capture_output=True, text=True, check=False)
+    assert done.returncode == 3, done
+    assert [line for line in done.stderr.splitlines() if line.startswith("aerpaw-cmp: ")] == done.stderr.splitlines()[
+        -1:
+    ]
+    assert f"{out}/flight.h5: cannot be written (File too large)" in done.stderr
+    assert "ulimit -f" in done.stderr
+    assert list(out.iterdir()) == []
+
+
+def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Exports were written in place: a cut maps.kmz stood under its final name."""
+    from aerpaw_cmp.report import maps_figures
+
+    monkeypatch.setattr(maps_figures, "plates", lambda _data: [])  # drawing is the slow part
+    out = tmp_path / "map"
+    small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
+    command = ["map", *small, "--max-depth", "0", "--no-study", "-o", str(out)]
+    assert main(command) == 0
+    before = digests(out)
+    assert zipfile.is_zipfile(out / "maps.kmz")
+
+    def cut(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    with monkeypatch.context() as patched:
+        patched.setattr(zipfile.ZipFile, "writestr", cut)
+        assert main(command) == 3
+    assert digests(out) == before
+    assert [path.name for path in tmp_path.iterdir()] == ["map"]

@@ -1,0 +1,79 @@
+"""A receiver and the geometry of its antennas, planted and learned again."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.compare.receiver import rank_by_thresholds
+from aerpaw_cmp.jobs.calibrate_rank import (
+    RankCalibration,
+    RankFitSettings,
+    RankSamples,
+    _Tried,
+    features_of,
+    read_receiver,
+)
+from aerpaw_cmp.propagation.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
+
+SETTINGS = RankFitSettings(
+    yaw_step_deg=45, uav_slant_deg=[[45, -45, -45, 45], [0, 90, 0, 90]], ground=[0.2], thin=2, members=3
+)
+
+
+def flight(seed: int) -> RankSamples:
+    """Zigzag around the tower at 30 m; ranks are still to be planted."""
+    rng = np.random.default_rng(seed)
+    azimuth, far = rng.uniform(0, 2 * np.pi, 400), rng.uniform(60, 350, 400)
+    at = np.column_stack([far * np.cos(azimuth), far * np.sin(azimuth), rng.uniform(25, 35, 400)])
+    link = Link(3.4e9, {"T": tower_comparison_array()}, uav_comparison_array(0.0882), uav_transmits=False)
+    poses = Poses(at, np.tile(np.eye(3), (400, 1, 1)))
+    return RankSamples(
+        flight=f"f{seed}", tower="T", tower_m=np.array([0.0, 0.0, 12.0]), poses=poses, rank=np.zeros(400), link=link
+    )
+
+
+@pytest.fixture(scope="module")
+def tried() -> _Tried:
+    flights = [flight(1), flight(2)]
+    truth = _Tried.of(flights, SETTINGS).geometries[5]
+    planted = []
+    for one in flights:
+        ratio = features_of([truth], one)[0][:, :3]
+        rank = rank_by_thresholds(ratio, tuple(np.median(ratio, axis=0))).astype(float)
+        flip = np.random.default_rng(7).random(400) < 0.05
+        planted.append(dataclasses.replace(one, rank=np.where(flip, 1.0 + (rank % 4), rank)))
+    return _Tried.of(planted, SETTINGS)
+
+
+def test_the_planted_geometry_is_found_and_forecasts_the_other_flight(tried: _Tried) -> None:
+    fitted = tried.fit([0])
+    assert tried.geometries[5] in fitted.geometries
+    other = tried.samples[1]
+    p, said = fitted.forecast(other)
+    assert p.sum(axis=1) == pytest.approx(1.0)
+    assert np.mean(said == other.rank) > 0.7
+
+
+def test_a_receiver_survives_its_file(tried: _Tried, tmp_path: Path) -> None:
+    fitted = tried.fit([0, 1])
+    path = tmp_path / "receiver.json"
+    path.write_text(RankCalibration(receivers={"T": fitted}, scores={}, warnings=()).text(), encoding="utf-8")
+    again = read_receiver(path)["T"]
+    assert again.geometries == fitted.geometries
+    assert again.flights == ("f1", "f2")
+    np.testing.assert_array_equal(again.forecast(tried.samples[0])[0], fitted.forecast(tried.samples[0])[0])
+
+
+@pytest.mark.parametrize("text", ["", "[]", '{"format": "other"}', '{"format": "aerpaw-cmp receiver 1"}'])
+def test_another_file_is_one_message(text: str, tmp_path: Path) -> None:
+    path = tmp_path / "receiver.json"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(InputError, match="no receiver"):
+        read_receiver(path)
+    with pytest.raises(InputError, match="cannot be read"):
+        read_receiver(tmp_path / "nowhere.json")

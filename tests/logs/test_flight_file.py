@@ -18,6 +18,7 @@ from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
+from tests.parsers import samples
 from tests.parsers.samples import OPTIONS, SAMPLES
 
 TEXT = st.text(st.characters(exclude_categories=("Cs",)), max_size=12)  # NUL included: torn logs have it
@@ -80,9 +81,10 @@ def test_round_trip(tmp_path_factory: pytest.TempPathFactory, content: list[Inge
 
 def all_samples(folder: Path) -> list[IngestedFile]:
     made = []
-    for reader, samples in SAMPLES.items():
-        for name, (data, _, _) in samples.items():
-            path = folder / f"{reader}_{name}"
+    for reader, kinds in SAMPLES.items():
+        for name, (data, _, _) in kinds.items():
+            own = samples.IQ_NAME if reader == "iq_burst" else f"{reader}_{name}"  # the burst's position is its name
+            path = folder / own
             path.write_bytes(data)
             made += ingest(path, options=OPTIONS, reader=reader)
     return made

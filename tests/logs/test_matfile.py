@@ -46,7 +46,8 @@ def test_text_and_what_is_left_out(compressed: bool) -> None:
     rows = np.array(["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1  "])
     data = saved(compressed, clock=rows, pair={"a": 1.0}, cells=np.array([[1, "x"]], dtype=object), z=np.array([[1j]]))
     found = read_arrays(data, None)
-    assert set(found) == {"clock"}
+    assert set(found) == {"clock", "z"}, "structures and cells are left out"
+    assert found["z"].tolist() == [[1j]]
     assert found["clock"].tolist() == ["2024-07-15 11:48:16.776", "2024-07-15 11:48:17.1"]
 
 

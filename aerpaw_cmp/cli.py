@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Optional
 
@@ -256,6 +257,23 @@ _WARNINGS = 10
 """Warnings of a report that are also said here."""
 
 
+def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
+    """One line per model; over several channels the range of its errors, which the page has one by one."""
+    models = dict.fromkeys(m["model"] for m in ladder)
+    rows = []
+    for model in models:
+        mine = [m for m in ladder if m["model"] == model]
+        errors = [m["rmse_heldout_db"] for m in mine if m["rmse_heldout_db"] is not None]
+        shown = (
+            f"{min(errors):.2f}" if len(errors) == 1 else f"{min(errors):.2f} .. {max(errors):.2f}" if errors else "-"
+        )
+        star = "* " if any(m["recommended"] for m in mine) else ""
+        rows.append([star + model, shown, _number(sum(m["seconds"] for m in mine), "{:.1f}")])
+    if rows:
+        heads = ["model", "RMSE dB", "s"]
+        _table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")
+
+
 def _print_report_summary(outcome: Any) -> None:
     rows = []
     for tower, channels in outcome.metrics["rss"].items():
@@ -281,20 +299,7 @@ def _print_report_summary(outcome: Any) -> None:
             rows,
             "RSS, measured against replayed",
         )
-    rows = [
-        [
-            ("* " if m["recommended"] else "") + m["model"],
-            m["tower"],
-            m["channel"],
-            _number(m["rmse_heldout_db"], "{:.2f}"),
-            _number(m["difference_to_best_db"], "{:+.2f}"),
-            _number(m["seconds"], "{:.1f}"),
-        ]
-        for m in outcome.metrics.get("ladder", ())
-    ]
-    if rows:
-        heads = ["model", "tower", "channel", "RMSE dB", "to the best", "s"]
-        _table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")
+    _print_ladder(outcome.metrics.get("ladder", ()))
     rows = []
     for tower, m in outcome.metrics["rank"].items():
         for k, s in m["simulated"].items():

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..compare.result import AuditResult
 from .data import Baseline, RankAtK, RankPanel, ReportData, RssPanel
 from .words import count, pretty
 
@@ -129,6 +130,8 @@ def _trust(data: ReportData) -> str:
         doubts.append("the engine was not audited")
     if audit is not None and audit.missing_paths:
         doubts.append(f"the audit misses {count(audit.missing_paths)} paths")
+    if audit is not None and audit.fields is not None and audit.fields.failures:
+        doubts.append(f"the audit of the field failed {count(len(audit.fields.failures))} times")
     if any(panel.lag_verdict in ("ambiguous", "failed") for panel in data.rss):
         doubts.append("the radio clock could not be confirmed")
     if data.synthetic:
@@ -153,15 +156,26 @@ def headlines(data: ReportData) -> list[Headline]:
             break
     audit = None if data.engine is None else data.engine.audit
     if audit is not None:
-        found.append(
-            Headline(
-                label="Audit of the engine",
-                value=f"{count(audit.missing_paths)} paths missing",
-                interval=f"{count(audit.extra_paths)} invented, {audit.rss_max_error_db:.2f} dB at most",
-                beside=f"{count(audit.links)} links against {audit.reference}",
-            )
-        )
+        found.append(_audit(audit))
     return found[:4]
+
+
+def _audit(audit: AuditResult) -> Headline:
+    """What the audit of paths and fields found wrong; what the other engine's sampling misses is no fault of ours."""
+    fields = audit.fields
+    if fields is None:
+        return Headline(
+            label="Audit of the engine",
+            value=f"{count(audit.missing_paths)} paths missing",
+            interval=f"{count(audit.extra_paths)} that only we have, {audit.rss_max_error_db:.2f} dB at most",
+            beside=f"{count(audit.links)} links against {audit.reference}",
+        )
+    return Headline(
+        label="Audit of paths and fields",
+        value=f"{count(len(fields.failures))} failed",
+        interval=f"worst: {fields.power_max_db:.3f} dB, {fields.phase_max_rad:.4f} rad, {count(fields.paths)} paths",
+        beside=f"against {audit.reference}'s own coefficients, {count(audit.links)} links",
+    )
 
 
 def _error(panels: Sequence[RssPanel]) -> Headline:

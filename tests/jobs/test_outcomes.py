@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -111,6 +113,38 @@ def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkey
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))
     campaign.run_tasks(tasks, 1, None, lambda *_: None)
     assert len(asked) == 9, "nothing is kept unless asked for"
+
+
+KILLED = """
+import os, signal, sys
+from pathlib import Path
+from aerpaw_cmp.jobs import campaign
+from aerpaw_cmp.report.campaign_data import FlownTrack
+import numpy as np
+
+def one(task):
+    if task.flight == "f2":
+        os.kill(os.getpid(), signal.SIGKILL)
+    number = float(task.flight[1:])
+    return campaign.Outcome(track=FlownTrack(flight=task.flight, time_s=np.arange(3.0), position_m=np.full((3, 3), number)))
+
+campaign.run_task = one
+flight = Path(sys.argv[1])
+tasks = [campaign.Task(flight, f"f{i}", "as written", {"rt.max_depth": 1 + i % 2}, None) for i in range(4)]
+campaign.run_tasks(tasks, 1, None, lambda *_: None, Path(sys.argv[2]))
+"""
+
+
+def test_after_sigkill_only_what_is_missing_is_computed(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    done = subprocess.run([sys.executable, "-c", KILLED, str(flight), str(tmp_path)], check=False)
+    assert done.returncode == -signal.SIGKILL
+    asked: list[str] = []
+    monkeypatch.setattr(campaign, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:])))
+    found = campaign.run_tasks(tasks_of(flight), 1, None, lambda *_: None, tmp_path)
+    assert asked == ["f2", "f3"]
+    assert all(equal(one, track(float(i))) for i, one in enumerate(found))
 
 
 def lethal(task: campaign.Task) -> campaign.Outcome:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import hashlib
 import os
 import tempfile
 import time
@@ -58,6 +59,36 @@ def _clear_old_parts(folder: Path, prefix: str) -> None:
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600:
                 part.unlink()
+
+
+def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
+    """Write an entry of a cache whole or not at all, with a mark and the SHA-256 of its content behind it.
+
+    A cache that cannot be written is no reason to fail: then there is no entry.
+    """
+    with contextlib.suppress(OSError):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with whole(path) as part:
+            part.write_bytes(content + mark + hashlib.sha256(content).digest())
+
+
+def read_sealed(path: Path, mark: bytes) -> bytes | None:
+    """The content of an entry that :func:`write_sealed` wrote; None where there is none.
+
+    Raises
+    ------
+    ValueError
+        If the entry is damaged, or another kind of file: seen before any of it is parsed, since damaged archives make
+        their readers fail in a dozen ways.
+    """
+    try:
+        entry = path.read_bytes()
+    except OSError:
+        return None
+    content, seal = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
+    if seal != mark + hashlib.sha256(content).digest():
+        raise ValueError(f"the seal of {path} does not fit its content")
+    return content
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

@@ -17,7 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from ..common.files import whole
+from ..common.files import read_sealed, write_sealed
+from ..common.outputs import file_digest
 from ..flight.settings import FlightFile
 from .manifest import other_inputs
 
@@ -52,12 +53,11 @@ class OutcomeStore:
         """The outcome of a key, or None where there is no sound entry."""
         place = self.folder / f"{key}.npz"
         try:
-            content = place.read_bytes()
-        except OSError:
-            return None
-        entry, seal = content[: -len(_SEAL) - 32], content[-len(_SEAL) - 32 :]
-        if seal != _SEAL + hashlib.sha256(entry).digest():
+            entry = read_sealed(place, _SEAL)
+        except ValueError:
             self.told.append(f"a damaged outcome was not used, its task is computed anew: {place}")
+            return None
+        if entry is None:
             return None
         with np.load(io.BytesIO(entry), allow_pickle=False) as arrays:
             return self._decode(json.loads(str(arrays["content"])), arrays)
@@ -72,10 +72,7 @@ class OutcomeStore:
         content = json.dumps(self._encode(outcome, arrays))
         entry = io.BytesIO()
         np.savez_compressed(entry, content=np.array(content), **arrays)
-        with contextlib.suppress(OSError):
-            self.folder.mkdir(parents=True, exist_ok=True)
-            with whole(self.folder / f"{key}.npz") as part:
-                part.write_bytes(entry.getvalue() + _SEAL + hashlib.sha256(entry.getvalue()).digest())
+        write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)
 
     def __contains__(self, key: str) -> bool:
         return (self.folder / f"{key}.npz").is_file()
@@ -149,10 +146,7 @@ def _content(path: Path) -> str:
 
 @cache
 def _digest_of(path: Path, _size: int, _mtime_ns: int) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest() if hasattr(hashlib, "file_digest") else hashlib.sha256(
-            file.read()
-        ).hexdigest()  # fmt: skip
+    return file_digest(path)
 
 
 @cache

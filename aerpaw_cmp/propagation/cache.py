@@ -5,7 +5,6 @@ Paths depend on the faces, the ends and the search, not on arrays, attitude or p
 
 from __future__ import annotations
 
-import contextlib
 import hashlib
 import io
 from dataclasses import asdict
@@ -15,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from .. import __version__
-from ..common.files import whole
+from ..common.files import read_sealed, write_sealed
 from ..common.units import FloatArray
 from .paths import PathSet
 from .scene import Scene, Settings
@@ -65,28 +64,21 @@ class PathCache:
         return digest.hexdigest()
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
-        """Paths and the seconds that their search took; None when the entry is missing or damaged (see ``told``).
-
-        The seal is checked before any of it is parsed: damaged archives make their readers fail in a dozen ways.
-        """
+        """Paths and the seconds that their search took; None when the entry is missing or damaged (see ``told``)."""
         place = self.folder / f"{key}.npz"
         try:
-            content = place.read_bytes()
-        except OSError:
+            entry = read_sealed(place, _SEAL)
+        except ValueError:
+            self.told.append(f"a damaged entry of the path cache was not used, the paths were searched anew: {place}")
             return None
-        entry, seal = content[: -len(_SEAL) - 32], content[-len(_SEAL) - 32 :]
-        if seal == _SEAL + hashlib.sha256(entry).digest():
-            with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
-                return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
-        self.told.append(f"a damaged entry of the path cache was not used, the paths were searched anew: {place}")
-        return None
+        if entry is None:
+            return None
+        with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
+            return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
-        with contextlib.suppress(OSError):  # a cache that cannot be written is no reason to fail
-            self.folder.mkdir(parents=True, exist_ok=True)
-            columns = {column: getattr(paths, column) for column in _COLUMNS}
-            entry = io.BytesIO()
-            np.savez(entry, seconds=np.float64(seconds), **columns)
-            with whole(self.folder / f"{key}.npz") as part:
-                part.write_bytes(entry.getvalue() + _SEAL + hashlib.sha256(entry.getvalue()).digest())
+        columns = {column: getattr(paths, column) for column in _COLUMNS}
+        entry = io.BytesIO()
+        np.savez(entry, seconds=np.float64(seconds), **columns)
+        write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

@@ -138,16 +138,8 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
-
-    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
-    svg, png = io.BytesIO(), io.BytesIO()
-    fig.set_dpi(RASTER_DPI)
-    FigureCanvasAgg(fig).print_png(png, pil_kwargs={"compress_level": 2})
-    fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
-    FigureCanvasSVG(fig).print_svg(svg, metadata={"Date": None})
-    return svg.getvalue(), png.getvalue()
+    found = save_as(fig, ("svg", "png"))
+    return found["svg"], found["png"]
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
@@ -161,6 +153,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         fig.set_size_inches(IEEE_WIDTH_IN, height * IEEE_WIDTH_IN / width)
     fig.set_dpi(300.0 if kind == "paper" else RASTER_DPI)
     found = {name: io.BytesIO() for name in formats}
+    # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     agg = FigureCanvasAgg(fig)
     if "png" in found:
         agg.print_png(found["png"], pil_kwargs={"compress_level": 2})

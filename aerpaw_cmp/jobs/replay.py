@@ -20,7 +20,7 @@ from ..flight.settings import RtSettings
 from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
-from ..propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
 from ..propagation.tracer import Engine, Loss, Replay, replay
 from ..site.site import Site, Trees
@@ -416,7 +416,7 @@ def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str,
         gamma_db_per_m=rt.gamma_db_per_m if own else None,
         maximum_db=rt.maximum_loss_db if own else None,
     )
-    index = CrownIndex(trees)
+    index = crown_index(trees)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]

@@ -1,8 +1,8 @@
 """Reports of ever longer flights: seconds (wall, processor) and peak memory of each stage, with fitted powers.
 
 The flight circles one tower on laps of the sample flight's route: two channels, telemetry at 10 Hz, rank twice a
-second, planted offsets and fading, logs of the real formats made by ``aerpaw-cmp simulate``. At ``--hours 10`` a channel has
-1 000 000 samples and the track 360 000 poses. A size is one process; a stage's peak is that of the process while the
+second, planted offsets and fading, logs of the real formats made by ``aerpaw-cmp simulate``. At ``--hours 10`` a
+channel has 1 000 000 samples and the track 360 000 poses. A size is one process; a stage's peak is that of the process while the
 stage ran (VmHWM of Linux, reset at its begin), so it holds what earlier stages keep.
 
     python benchmarks/long_flight.py [--hours 10] [--shares 0.0333 0.1 0.3333 1] [--rank] [--json]
@@ -13,6 +13,7 @@ Without audit and speed table, whose cost does not depend on the length (``aerpa
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import os
 import subprocess
@@ -53,7 +54,7 @@ def flight_file(hours: float, *, rank: bool) -> dict:
 def _seconds(points: list[dict], plan: dict) -> float:
     """How long a planned route takes [s]."""
     total = sum(p.get("hold_s", 0.0) for p in points[:-1])
-    for a, b in zip(points, points[1:], strict=False):
+    for a, b in itertools.pairwise(points):
         far = np.hypot(b["east_m"] - a["east_m"], b["north_m"] - a["north_m"])
         total += max(far / plan["speed_mps"], abs(b["height_m"] - a["height_m"]) / plan["climb_mps"])
     return float(total)

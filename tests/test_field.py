@@ -98,7 +98,7 @@ def test_snr_of_four_towers_is_scored_per_tower(report: Report) -> None:
         found, snr = channels["snr"], channels["snr"]["snr"]
         assert snr["noise_dbm"] == pytest.approx(-93.96, abs=0.01)
         assert snr["n"] == found["n"]
-        assert snr["rmse_db"] ** 2 - snr["mean_error_db"] ** 2 == pytest.approx(found["rmse_db"] ** 2, rel=0.3)
+        assert snr["rmse_db"] ** 2 - snr["mean_error_db"] ** 2 == pytest.approx(found["rmse_db"] ** 2, rel=1e-3)
 
 
 MOUNTED = ("dataset12_40m_mount", "dataset12_70m_mount")

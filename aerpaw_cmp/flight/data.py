@@ -282,9 +282,9 @@ def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
     return [
-        f"{log.path}: {shown} to the noise, no level: compared as RSS as if the noise were constant ('bandwidth_hz' and "
-        f"'noise_figure_db' of link.rss make a signal-to-noise ratio absolute; 'skip: [{', '.join(blind)}]' beside the "
-        "path leaves it out)"
+        f"{log.path}: {shown} to the noise, no level: compared as RSS as with constant noise ('bandwidth_hz' and "
+        f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
+        "it out)"
     ]
 
 

@@ -282,7 +282,7 @@ def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
     return [
-        f"{log.path}: {shown} to the noise, no level: compared as RSS as with constant noise ('bandwidth_hz' and "
+        f"{log.path}: {shown} to the noise, no level: compared as RSS over constant noise ('bandwidth_hz' and "
         f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
         "it out)"
     ]

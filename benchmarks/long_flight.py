@@ -1,9 +1,9 @@
 """Reports of ever longer flights: seconds (wall, processor) and peak memory of each stage, with fitted powers.
 
-The flight circles one tower on laps of the sample flight's route: two channels, telemetry at 10 Hz, rank twice a
-second, planted offsets and fading, logs of the real formats made by ``aerpaw-cmp simulate``. At ``--hours 10`` a
-channel has 1 000 000 samples and the track 360 000 poses. A size is one process; a stage's peak is that of the process while the
-stage ran (VmHWM of Linux, reset at its begin), so it holds what earlier stages keep.
+The flight circles one tower on laps of the sample flight's route: two channels, telemetry at 10 Hz, planted offsets
+and fading, with ``--rank`` a rank twice a second; logs of the real formats made by ``aerpaw-cmp simulate``. At
+``--hours 10`` a channel has 1 000 000 samples and the track 360 000 poses. A size is one process; a stage's peak is
+that of the process while the stage ran (VmHWM of Linux, reset at its begin), so it holds what earlier stages keep.
 
     python benchmarks/long_flight.py [--hours 10] [--shares 0.0333 0.1 0.3333 1] [--rank] [--json]
 

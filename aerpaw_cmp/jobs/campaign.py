@@ -41,6 +41,7 @@ from ..report import campaign_data
 from ..report.campaign_data import (
     CampaignData,
     Failure,
+    FlownRank,
     FlownTrack,
     PooledOffset,
     RankPairing,
@@ -144,17 +145,7 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
-    flown: tuple[RankFlown, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankFlown:
-    """Reported ranks (n,), NaN where none, and where: ``position_m`` (n, 3)."""
-
-    flight: str
-    tower: str
-    position_m: FloatArray
-    rank: FloatArray
+    flown: tuple[FlownRank, ...] = ()
 
 
 @lru_cache(maxsize=2)
@@ -202,7 +193,15 @@ def run_task(task: Task) -> Outcome:
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
         flown=tuple(
-            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
             for one in found.result.rank
             if task.reference
         ),
@@ -212,6 +211,10 @@ def run_task(task: Task) -> Outcome:
 def _flown(task: Task, result: FlightResult) -> FlownTrack:
     first = result.rss[0] if result.rss else result.rank[0]
     return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
 
 
 def _elapsed_s(time: AnyArray) -> FloatArray:
@@ -245,6 +248,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         measured_db=found.measured_db,
         simulated_dbm=found.simulated_dbm,
         time_s=_elapsed_s(found.time) if task.reference else np.zeros(0),
+        start_ns=_start_ns(found.time),
         position_m=found.position_m if task.reference else np.zeros((0, 3)),
         distance_m=found.geometry["distance_m"] if task.reference else np.zeros(0),
         heading_deg=found.geometry.get("heading_deg") if task.reference else None,
@@ -535,7 +539,7 @@ def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
     )
 
 
-def rank_repeats(flown: Sequence[RankFlown], radius_m: float) -> list[RankPairing]:
+def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairing]:
     """Every pair of flights that reported ranks to one tower at the same places."""
     out = []
     for first, second in combinations(flown, 2):
@@ -660,6 +664,7 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
+        flown_ranks=tuple(one for o in outcomes for one in o.flown),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),

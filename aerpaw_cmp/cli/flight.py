@@ -9,7 +9,7 @@ from typing import Annotated, Any, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, command
 from .shown import number, print_json, say, table
 
 
@@ -32,6 +32,7 @@ def report(
     style: Annotated[
         str, typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded).")
     ] = "screen",
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -46,6 +47,7 @@ def report(
         audit=audit,
         recommend=recommend,
         force=force,
+        export=export or (),
         figures=figures,
         style=style,
         progress=say,

@@ -95,6 +95,8 @@ class CampaignFile(Settings):
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
+    export: list[str] = Field(default_factory=list)
+    """Formats of the samples: those of ``report.export`` of a flight."""
 
 
 def load_campaign(path: Path) -> CampaignFile:

@@ -105,6 +105,7 @@ def _write_times(book: Any, export: Export, samples: SampleSet) -> None:
             "long_name": "instant of the sample",
             "units": f"seconds since {text} UTC" if " " in text else f"seconds since {text} 00:00:00 UTC",
             "calendar": "standard",
+            "units_metadata": "leap_seconds: none",
             "axis": "T",
         }
     )

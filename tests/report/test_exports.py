@@ -32,13 +32,9 @@ def thinned(panel, every, **change):
         for f in dataclasses.fields(panel)
         if isinstance(value := getattr(panel, f.name), np.ndarray) and len(value) == n
     }
-    cut["baselines"] = (
-        tuple(dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for b in panel.baselines)
-        if hasattr(panel, "baselines")
-        else ()
-    )
-    if not hasattr(panel, "baselines"):
-        cut.pop("baselines")
+    if hasattr(panel, "baselines"):
+        cut["baselines"] = tuple(dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for b in panel.baselines)
+    if hasattr(panel, "simulated"):
         cut["simulated"] = tuple(dataclasses.replace(at, rank=at.rank[::every]) for at in panel.simulated)
     return dataclasses.replace(panel, **cut, **change)
 
@@ -58,7 +54,10 @@ def data(report_data):
         per_sample={"simulated_sd_db": np.full(len(first.time), 2.5)},
     )
     rank = thinned(report_data.rank[0], 10, values={"level_dbm": np.linspace(-90, -50, 100)})
-    return dataclasses.replace(report_data, rss=(first, last), rank=(rank,), synthetic=True, title="Flight <1> & more")
+    track = thinned(report_data.track, 30)
+    return dataclasses.replace(
+        report_data, track=track, rss=(first, last), rank=(rank,), synthetic=True, title="Flight <1> & more"
+    )
 
 
 @pytest.fixture(scope="module")
@@ -351,7 +350,7 @@ SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_
 @pytest.mark.parametrize(("name", "fault"), SHOWN)
 def test_a_planted_fault_is_seen(name, fault, data, frames, tmp_path, monkeypatch):
     export = fault(monkeypatch, data)
-    monkeypatch.setattr(kmz, "_legend", lambda scale: b"")
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     write.write_exports(export, tmp_path, [name])
     with pytest.raises((AssertionError, KeyError, IndexError)):
         checked(name, tmp_path, frames, data)
@@ -404,7 +403,7 @@ def messages(result):
 
 
 def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(kmz, "_legend", lambda scale: b"")
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     epoch = np.datetime64(0, "ns")
 
     def moved(panel):
@@ -426,7 +425,7 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
 
 
 def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypatch):
-    monkeypatch.setattr(kmz, "_legend", lambda scale: b"")
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     alone = dataclasses.replace(data, rss=())
     (tmp_path / "a").mkdir()
     names = {p.name for p in write.write_exports(samples.of_report(alone), tmp_path / "a", write.FORMATS)}

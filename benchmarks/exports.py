@@ -63,15 +63,17 @@ def main() -> None:
         one(given.one, given.samples)
         return
     print(
-        f"{given.samples} samples of one link, six numbers each; Python {sys.version.split()[0]}, NumPy {np.__version__}"
+        f"{given.samples} samples of one link, six numbers each; Python {sys.version.split()[0]}, "
+        f"NumPy {np.__version__}"
     )
     base = None
     for name in ["none", *given.formats.split(",")]:
         command = [sys.executable, __file__, "--one", name, "--samples", str(given.samples)]
         found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
         base = base or found["peak_mib"]
-        print(f"{name:11s} {found['cpu_s']:7.1f} s CPU {found['bytes'] / 2**20:8.1f} MiB, peak {found['peak_mib']:6.0f} MiB "
-              f"({found['peak_mib'] - base:+.0f} beyond the samples)")  # fmt: skip
+        size, peak = found["bytes"] / 2**20, found["peak_mib"]
+        print(f"{name:11s} {found['cpu_s']:7.1f} s CPU {size:8.1f} MiB, peak {peak:6.0f} MiB ({peak - base:+.0f})")
+    print("in brackets: beyond a process that makes the samples and no file")
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray, IntArray
+from ..compare.passes import cell_means
 from ..compare.result import Repeated
 from ..site.site import Site
 from .data import Interval
@@ -77,15 +78,8 @@ class RssRow:
 def place_means(row: RssRow, cell_m: float) -> dict[tuple[int, int], tuple[float, float]]:
     """Mean residual [dB] and mean height [m] of each square cell of the plan that has a scored sample."""
     good = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
-    cells = np.floor(row.position_m[good, :2] / cell_m).astype(np.int64)
-    found, which = np.unique(cells, axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    count = np.bincount(which, minlength=len(found))
-    residual = np.bincount(which, weights=row.residual_db[good], minlength=len(found)) / np.maximum(count, 1)
-    height = np.bincount(which, weights=row.position_m[good, 2], minlength=len(found)) / np.maximum(count, 1)
-    return {
-        (int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(found, residual, height, strict=True)
-    }  # fmt: skip
+    cells, residual, height = cell_means(row.position_m, row.residual_db, good, cell_m)
+    return {(int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(cells, residual, height, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -200,7 +200,7 @@ _TRACKS_KEPT = 4
 
 
 def _digest(times: Any) -> bytes:
-    return sha256(np.ascontiguousarray(times)).digest()
+    return sha256(np.asarray(times).tobytes()).digest()
 
 
 def _in_blocks(times: Any) -> list[Any]:

@@ -7,8 +7,8 @@ the UAV element, ``B_i = M_d .. M_i`` and ``n_i`` the normals, reflection ``i`` 
     -r_tm w + (r_te + r_tm) s (s . w) / |s|^2,    s = k x (B_i n_i),    cos theta = |k . B_i n_i|
 
 and the tower's frame becomes ``M_1 .. M_d`` seen from its device axes, so that normals and frames are constants of a
-path and only ``k`` is one of a pair. Each path is evaluated alone and added in the order of the path set: results do not
-depend on chunks and threads, to the last bit.
+path and only ``k`` is one of a pair. Each path is evaluated alone and added in the order of the path set: results do
+not depend on chunks and threads, to the last bit.
 
 Scalar functions are leaves (they call :mod:`math` only): :mod:`aerpaw_cmp.propagation.cuda` compiles the same ones for
 a GPU.
@@ -16,6 +16,7 @@ a GPU.
 
 from __future__ import annotations
 
+import inspect
 import math
 from typing import Any
 
@@ -23,6 +24,7 @@ import numpy as np
 from numba import njit
 
 from ..common.units import FloatArray, IntArray
+from ..site.antennas import HALF_WAVE_DIPOLE_GAIN
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": False}
 
@@ -34,6 +36,7 @@ ISOTROPIC, DIPOLE, TR38901, GAIN_GRID, FIELD_GRID, GIVEN = range(6)
 
 _ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and taking it off rounds to an integer, ties to even
 _TWO_PI = 2.0 * math.pi
+_DIPOLE = math.sqrt(HALF_WAVE_DIPOLE_GAIN)
 
 
 @njit(**OPTIONS)
@@ -66,7 +69,8 @@ def turn_sine_cosine(turns: float) -> tuple[float, float]:
                 + z
                 * (
                     2.48015872894767294178e-05
-                    + z * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11))
+                    + z
+                    * (-2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11))
                 )
             )
         )
@@ -124,11 +128,11 @@ def element_amplitude(kind: int, x: float, y: float, z: float) -> float:
     """E_theta of the patterns that are real formulas; ``x, y, z`` is the unit direction in the device frame."""
     across = math.sqrt(x * x + y * y)
     if kind == DIPOLE:
-        return 1.2809849244542 * math.cos(0.5 * math.pi * z) / across if across >= 1e-9 else 0.0
+        return _DIPOLE * math.cos(0.5 * math.pi * z) / across if across >= 1e-9 else 0.0
     theta = math.atan2(across, z) * (180.0 / math.pi)
     phi = math.atan2(y, x) * (180.0 / math.pi)
     down = min(12.0 * ((theta - 90.0) / 65.0) ** 2, 30.0) + min(12.0 * (phi / 65.0) ** 2, 30.0)
-    return 10.0 ** ((8.0 - min(down, 30.0)) / 20.0)
+    return float(10.0 ** ((8.0 - min(down, 30.0)) / 20.0))
 
 
 @njit(**OPTIONS)
@@ -273,7 +277,7 @@ def patterns(
         if kind == GIVEN:
             for row in range(4):
                 w[(out + row) * LANES + p] = given[given_row + row, first + p]
-        elif kind == DIPOLE or kind == TR38901:
+        elif kind in (DIPOLE, TR38901):
             w[out * LANES + p] = element_amplitude(kind, x, y, z)
         else:
             start, rows, columns = starts[first + p, 0], starts[first + p, 1], starts[first + p, 2]
@@ -421,11 +425,12 @@ def fields(
 ) -> None:
     """Channel matrices (links, pairs, 2) and path powers of paths ``start`` to ``stop``, added path by path.
 
-    Columns of elements are spread over pairs: ``tower_m`` (towers, 3, pairs), ``tower_slants`` (towers, 2, pairs: cosine,
-    sine), ``tower_kinds`` (towers, pairs), ``tower_starts`` (towers, pairs, 3: start, rows, columns in ``grids``), and
-    those of the UAV without the first axis. ``out`` (pairs,) is the place of each pair in H. ``eta`` (faces, 3) has real
-    and imaginary part of the permittivity and the thickness in wavelengths. ``given`` (paths, 8, pairs) holds the fields
-    of ``GIVEN`` patterns, or takes the directions in which they are wanted (``only_directions``).
+    Columns of elements are spread over pairs: ``tower_m`` (towers, 3, pairs), ``tower_slants`` (towers, 2, pairs:
+    cosine, sine), ``tower_kinds`` (towers, pairs), ``tower_starts`` (towers, pairs, 3: start, rows, columns in
+    ``grids``), and those of the UAV without the first axis. ``out`` (pairs,) is the place of each pair in H. ``eta``
+    (faces, 3) has real and imaginary part of the permittivity and the thickness in wavelengths. ``given``
+    (paths, 8, pairs) holds the fields of ``GIVEN`` patterns, or takes the directions in which they are wanted
+    (``only_directions``).
     """
     towers, total = len(sources_m), tower_m.shape[2]
     w = np.empty(ROWS * LANES)
@@ -460,7 +465,7 @@ def fields(
                     for p in range(pairs):
                         given[path - start, row, first + p] = w[(_TOWER + row) * LANES + p]
                 continue
-            at = path - start if len(given) else 0
+            at = min(path - start, len(given) - 1)
             patterns(pairs, first, _TOWER, _E_TOWER, tower_kinds[source], tower_starts[source], grids, given[at], 0, w)
             patterns(pairs, first, _UAV, _E_UAV, uav_kinds, uav_starts, grids, given[at], 4, w)
             radiate(pairs, first, _TOWER, _E_TOWER, _WAVE, real, tower_slants[source], frame, w)
@@ -476,3 +481,28 @@ def fields(
                 h[link, out[first + p], 1] += im
         if not only_directions:
             path_power[path] = power / total
+
+
+FIELD_ARGUMENTS = tuple(inspect.signature(fields.py_func).parameters)
+
+
+def try_out() -> None:
+    """Compile, or read what was compiled before, and evaluate one path.
+
+    Raises
+    ------
+    RuntimeError
+        If its amplitude is not that of free space.
+    """
+    none, one, row = np.zeros(0), np.ones((1, 1)), np.zeros((1, 3, 1))
+    number, kinds, starts = np.zeros(1, np.int64), np.zeros((1, 1), np.int64), np.zeros((1, 1, 3), np.int64)
+    h, slants = np.zeros((1, 1, 2)), np.array([[[1.0], [0.0]]])
+    fields(
+        0, 1, number, number, number, np.zeros((1, 0), np.int64), none, np.zeros((0, 3)), none, np.zeros((1, 3)), 0.1,
+        np.zeros((1, 3)), np.eye(3)[None].copy(), row, slants, kinds, starts, np.array([[30.0, 40.0, 0.0]]),
+        np.eye(3)[None].copy(), np.eye(3), row[0], slants[0], kinds[0], starts[0], np.zeros(1), np.zeros((1, 8, 1)),
+        True, False, number, h, one[0],
+    )  # fmt: skip
+    size = math.hypot(h[0, 0, 0], h[0, 0, 1])
+    if not abs(size * 4.0 * math.pi * 500.0 - 1.0) < 1e-12:
+        raise RuntimeError(f"a compiled line of sight of 500 wavelengths has the amplitude {size:g}")

@@ -9,7 +9,7 @@ import typer
 
 from ..common.errors import UsageError
 from . import campaign, flight, live, logs, machine, site
-from .app import app
+from .app import Interrupted, app
 from .shown import say
 
 GROUPS = (logs, flight, campaign, live, site, machine)
@@ -18,8 +18,11 @@ GROUPS = (logs, flight, campaign, live, site, machine)
 
 def main(arguments: list[str]) -> int:
     """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
+    say.quiet = False
     try:
         result = app(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
+    except Interrupted as interrupted:
+        raise interrupted.error from None
     except typer.Abort as error:
         raise KeyboardInterrupt from error
     except Exception as error:

@@ -7,11 +7,18 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, command
 from .shown import number, print_json, say, table
 
 
-@command("campaign")
+@command(
+    "campaign",
+    examples=[
+        "aerpaw-cmp campaign campaign.yaml --workers 4",
+        "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
+        "aerpaw-cmp campaign campaign.yaml --cluster tcp://scheduler:8786 --json",
+    ],
+)
 def campaign(
     campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
     out: Out = None,
@@ -26,6 +33,7 @@ def campaign(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -40,6 +48,7 @@ def campaign(
         cluster=cluster,
         keep=None if fresh else keep or run.outcomes_folder(),
         force=force,
+        export=export or (),
         progress=say,
     )
     if as_json:
@@ -47,7 +56,7 @@ def campaign(
     else:
         _print_campaign_summary(outcome)
     for check in outcome.failed_checks:
-        say(f"failed: {check}")
+        say.warn(f"failed: {check}")
     if outcome.nothing_done:
         return 3
     return 1 if strict and outcome.failed_checks else 0

@@ -4,29 +4,39 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 
 class ProgressLines:
     """Progress on standard error, so that standard output stays clean.
 
-    On a terminal a share is a bar with the time left; elsewhere every quarter is a line.
+    On a terminal a share is a bar with the time left; elsewhere every quarter is a line. With ``quiet`` nothing is
+    said but what :meth:`warn` gets.
     """
 
     def __init__(self) -> None:
         self._bar: Any = None
         self._quarters: dict[str, int] = {}
+        self.quiet = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
         """Show a line, or how far something is."""
+        if self.quiet:
+            return
         if fraction is None:
-            self.end()
-            print(text, file=sys.stderr, flush=True)
+            self.warn(text)
         elif sys.stderr.isatty():
             self._draw(text, fraction)
         elif int(4 * fraction) > self._quarters.get(text, 0):
             self._quarters[text] = int(4 * fraction)
             print(f"{text} {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Show a line, also where all else is quiet."""
+        self.end()
+        print(text, file=sys.stderr, flush=True)
 
     def _draw(self, text: str, fraction: float) -> None:
         if self._bar is None or self._bar.tasks[0].description != text:
@@ -64,7 +74,16 @@ say = ProgressLines()
 
 def print_json(value: dict[str, Any]) -> None:
     """One object on standard output."""
-    print(json.dumps(value, indent=1, allow_nan=False))
+    print(json.dumps(value, indent=1, allow_nan=False), flush=True)
+
+
+def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
+    """What was written: a line each, or one object."""
+    if as_json:
+        print_json({"files": [str(path) for path in paths]})
+        return
+    for path in paths:
+        print(path)
 
 
 _FIXED = 20

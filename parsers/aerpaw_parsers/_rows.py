@@ -50,6 +50,8 @@ class Rows:
         Do the times count from an origin that nobody named?
     at : int array, shape (n,)
         Index of each row among those that were given to :func:`built`.
+    data : bytes
+        The text itself, for what stands between the rows.
     """
 
     reader: str
@@ -64,6 +66,7 @@ class Rows:
     warnings: list[str] = field(default_factory=list)
     relative: bool = False
     at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    data: bytes = field(default=b"", repr=False)
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -274,6 +277,7 @@ def built(
         warnings,
         relative,
         np.flatnonzero(~comment)[valid],
+        lines.data,
     )
 
 

@@ -97,7 +97,7 @@ def version() -> str:
 def run_one(name: str, command: list[str]) -> dict[str, Any]:
     """The JSON of one benchmark, its seconds and the load before it; its last words where it fails."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "parsers")])}
-    environment |= {key: "1" for key in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
+    environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
     load, start = os.getloadavg()[0], time.perf_counter()
     print(f"{name} ...", file=sys.stderr, flush=True)
     try:

@@ -96,7 +96,8 @@ def faces(count: int) -> dict[str, float]:
     position = some.position_m * [side / 600.0, side / 600.0, 1.0]
     replay(*random_scene(10))  # warm
     scene = change(site, buildings=tuple(built))
-    return timed(lambda: replay(scene, link, Poses(position, some.rotation), max_depth=2)) | {"faces": 1 + 5 * len(built)}
+    found = timed(lambda: replay(scene, link, Poses(position, some.rotation), max_depth=2))
+    return {**found, "faces": 1 + 5 * len(built)}
 
 
 def samples(count: int) -> dict[str, float]:

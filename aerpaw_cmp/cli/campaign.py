@@ -7,7 +7,7 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, command
 from .shown import number, print_json, say, table
 
 
@@ -33,6 +33,7 @@ def campaign(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -47,6 +48,7 @@ def campaign(
         cluster=cluster,
         keep=None if fresh else keep or run.outcomes_folder(),
         force=force,
+        export=export or (),
         progress=say,
     )
     if as_json:

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, command
 from .shown import number, print_files, print_json, say, table
 
 
@@ -19,6 +19,7 @@ from .shown import number, print_files, print_json, say, table
         "aerpaw-cmp report sample_logs/flight.yaml",
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
         "aerpaw-cmp report flight.yaml --figures all --style paper",
+        "aerpaw-cmp report flight.yaml --export geopackage,kmz",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
     ],
 )
@@ -44,6 +45,7 @@ def report(
         Literal["screen", "paper"],
         typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
     ] = "screen",
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -58,6 +60,7 @@ def report(
         audit=audit,
         recommend=recommend,
         force=force,
+        export=export or (),
         figures=figures,
         style=style,
         progress=say,

@@ -36,6 +36,7 @@ from ..report import campaign_data
 from ..report.campaign_data import (
     CampaignData,
     Failure,
+    FlownRank,
     FlownTrack,
     RankRow,
     RssRow,
@@ -44,7 +45,7 @@ from . import over_flights
 from .campaign_fit import fit_all
 from .flight_run import run_flight
 from .outcomes import OutcomeStore, records_of, task_key
-from .over_flights import RankFlown, RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
+from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 
 Stage = Callable[[str], Any]
 
@@ -77,6 +78,8 @@ class CampaignFile(Settings):
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
+    export: list[str] = Field(default_factory=list)
+    """Formats of the samples: those of ``report.export`` of a flight."""
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -127,7 +130,7 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
-    flown: tuple[RankFlown, ...] = ()
+    flown: tuple[FlownRank, ...] = ()
 
 
 @lru_cache(maxsize=2)
@@ -175,7 +178,15 @@ def run_task(task: Task) -> Outcome:
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
         flown=tuple(
-            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
             for one in found.result.rank
             if task.reference
         ),
@@ -185,6 +196,10 @@ def run_task(task: Task) -> Outcome:
 def _flown(task: Task, result: FlightResult) -> FlownTrack:
     first = result.rss[0] if result.rss else result.rank[0]
     return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
 
 
 def _elapsed_s(time: AnyArray) -> FloatArray:
@@ -218,6 +233,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         measured_db=found.measured_db,
         simulated_dbm=found.simulated_dbm,
         time_s=_elapsed_s(found.time) if task.reference else np.zeros(0),
+        start_ns=_start_ns(found.time),
         position_m=found.position_m if task.reference else np.zeros((0, 3)),
         distance_m=found.geometry["distance_m"] if task.reference else np.zeros(0),
         heading_deg=found.geometry.get("heading_deg") if task.reference else None,
@@ -469,6 +485,7 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
+        flown_ranks=tuple(one for o in outcomes for one in o.flown),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),

@@ -172,6 +172,8 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         for axis, value in layer.axes.items():
             if value not in axes.setdefault(axis, []):
                 axes[axis].append(value)
+    for axis, values in axes.items():
+        values.sort(key=lambda value: _place(axis, value))
     kind = CLASSES if layers[0].classes else DIFFERENCE if layers[0].difference else LEVEL
     every = np.concatenate([layer.values[np.isfinite(layer.values)] for layer in layers])
     step = 1.0 if kind == CLASSES else step_for(every, FINEST_DB)
@@ -191,6 +193,13 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
         "axes": [{"name": axis, "values": values} for axis, values in axes.items()],
         "layers": stored,
     }
+
+
+def _place(axis: str, value: str) -> float:
+    """Order of the values of an axis: all towers together first, heights and K rising, others as they came."""
+    if axis == "Tower":
+        return 0.0 if value == JOINT else 1.0
+    return float(value.removesuffix(" m")) if axis in ("Height", "K") else 0.0
 
 
 def _codes(values: FloatArray) -> Any:

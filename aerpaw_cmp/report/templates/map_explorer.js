@@ -39,7 +39,7 @@
       const counts = q.classes.map(() => 0);
       for (const v of finite) counts[v]++;
       if (q.classes[0] === "Z") counts[0] = total - finite.length;
-      found.share = Object.fromEntries(q.classes.map((name, i) => [name, counts[i] / total]));
+      found.share = counts.map(c => c / total); // by class: an object would put "1" before "Z"
       return found;
     }
     let sum = 0, square = 0;
@@ -213,7 +213,7 @@
     const s = statistics(), out = [], percent = v => number(100 * v, 1, "%"), q = quantity();
     const none = !a ? "A" : state.difference && !b ? "B" : "";
     if (none) out.push(["Layer", `there is no layer ${none} of this choice`]);
-    else if (s.share) for (const [name, share] of Object.entries(s.share)) out.push([q.classes[0] === "Z" ? (name === "Z" ? "No path" : `Rank ${name}`) : name, percent(share)]);
+    else if (s.share) s.share.forEach((share, i) => out.push([q.classes[0] === "Z" ? (i ? `Rank ${q.classes[i]}` : "No path") : q.classes[i], percent(share)]));
     else {
       out.push([state.difference ? "Cells with both" : "Covered", `${percent(s.covered)} of ${s.cells} cells`]);
       if (s.n) out.push(["Median", words(s.median, 1)], ["Mean", q.kind === "classes" ? number(s.mean, 2) : words(s.mean, 1)], ["10 % and 90 %", `${words(s.p10, 1)}; ${words(s.p90, 1)}`], ["Least and most", `${words(s.min, 1)}; ${words(s.max, 1)}`]);
@@ -265,7 +265,7 @@
     if (!shown) return;
     const finite = shown.filter(Number.isFinite);
     let bars;
-    if (asClasses()) { const s = statistics(); bars = q.classes.map((name, i) => [i - 0.4, i + 0.4, s.share[name]]); }
+    if (asClasses()) { const s = statistics(); bars = q.classes.map((name, i) => [i - 0.4, i + 0.4, s.share[i]]); }
     else {
       const y = classAxis(finite), whole = q.kind === "classes" || finite.every(Number.isInteger) && y.high - y.low < 40, n = whole ? Math.round(y.high - y.low) + 1 : 40;
       const low = whole ? y.low - 0.5 : y.low, wide = whole ? 1 : (y.high - y.low) / n, counts = new Array(n).fill(0);

@@ -453,6 +453,8 @@ class ReportSettings(Settings):
     title: str | None = None
     waypoints: list[Waypoint] = []
     speed_table: bool = True
+    export: list[Literal["geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet", "all"]] = []
+    """Formats of the samples besides rss.csv and rank.csv."""
 
 
 class FlightFile(Settings):

@@ -89,7 +89,8 @@ def replay_rss(
         tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
-        progress(f"replay RSS {tower}: {len(joined)} poses")
+        channels = ", ".join(data.rss[i].channel for i in members)
+        progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
         whole = replay_poses(data.site, rt, link, joined, progress=progress)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):

@@ -179,9 +179,9 @@ def _quantity(name: str, layers: Sequence[MapLayer], arrays: PackedArrays, strid
     step = 1.0 if kind == CLASSES else step_for(every, FINEST_DB)
     stored = {}
     for layer in layers:
-        values = layer.values[::stride, ::stride].ravel()
+        cells = layer.values[::stride, ::stride].ravel()
         key = ",".join(str(axes[axis].index(layer.axes[axis])) if axis in layer.axes else "0" for axis in axes)
-        stored[key] = arrays.add_steps(values, step) if kind != CLASSES else arrays.add(_codes(values), "u1")
+        stored[key] = arrays.add_steps(cells, step) if kind != CLASSES else arrays.add(_codes(cells), "u1")
     return {
         "name": name,
         "unit": layers[0].unit,

@@ -20,7 +20,8 @@
     if (!kept.has(key)) { if (kept.size > 40) kept.clear(); kept.set(key, common.values(arrays[i], q.kind === "classes" ? 1 : q.step)); }
     return kept.get(key);
   }
-  const named = choice => quantity().axes.map((axis, i) => axis.values[choice[i]]).join(", ");
+  const named = choice => quantity().axes.map((axis, i) => (axis.name === "K" ? "K = " : "") + (axis.values[choice[i]] === data.joint ? "nearest tower" : axis.values[choice[i]])).join(", ");
+  const unit = () => state.difference ? (quantity().unit === "dBm" ? "dB" : quantity().kind === "classes" ? "ranks" : quantity().unit) : quantity().unit;
 
   let shown = null, a = null, b = null;
   function compute() {
@@ -79,7 +80,7 @@
     if (!Number.isFinite(v)) return asClasses() && q.classes[0] === "Z" || q.unit === "dBm" ? "no path" : "–";
     if (q.kind === "classes" && !state.difference) return q.classes[v];
     if (q.kind === "classes") return number(v, 0);
-    return number(v, Math.min(4, (q.step < 1 ? 1 : 0) + more), q.unit);
+    return number(v, Math.min(4, (q.step < 1 ? 1 : 0) + more), unit());
   }
 
   // --- the map ----------------------------------------------------------------------------------------------------------
@@ -144,7 +145,7 @@
   function drawLegend() {
     const [pen, w] = frame(legend), q = quantity(), ends = limits();
     pen.textAlign = "left"; pen.fillStyle = css("--ink");
-    const name = state.difference ? `A − B: ${q.name}` : q.name, unit = q.kind === "classes" && state.difference ? "ranks" : q.unit;
+    const name = state.difference ? `A − B: ${q.name}` : q.name, said = unit();
     let x = 46;
     pen.fillStyle = css("--band"); pen.fillRect(x, 6, 26, 14); pen.fillStyle = hatch(pen); pen.fillRect(x, 6, 26, 14); pen.strokeStyle = css("--soft"); pen.strokeRect(x, 6, 26, 14);
     pen.fillStyle = css("--ink"); pen.fillText(state.difference ? "missing in A or B" : "no value: no path", x + 32, 17);
@@ -166,7 +167,7 @@
     const marks = ticks(ends[0], ends[1], Math.max(2, Math.floor((right - left) / 70))), d = digits(marks);
     pen.fillStyle = css("--ink"); pen.textAlign = "center";
     for (const v of marks) { const X = left + (v - ends[0]) / (ends[1] - ends[0]) * (right - left); pen.fillText(number(v, d), X, 54); pen.fillRect(X, 40, 1, 3); }
-    pen.textAlign = "right"; pen.fillText(`${name}${unit ? ` [${unit}]` : ""}`, right, 17); pen.textAlign = "left";
+    pen.textAlign = "right"; pen.fillText(`${name}${said ? ` [${said}]` : ""}`, right, 17); pen.textAlign = "left";
   }
 
   // --- words and numbers --------------------------------------------------------------------------------------------
@@ -206,7 +207,8 @@
   }
   function cellWords(values, i) {
     const q = quantity(), v = values ? values[i] : NaN;
-    return q.kind === "classes" ? (Number.isFinite(v) ? q.classes[v] : "no path") : words(v, 1);
+    if (q.kind === "classes") return Number.isFinite(v) ? q.classes[v] : "no path";
+    return Number.isFinite(v) ? number(v, q.step < 1 ? 2 : 0, q.unit) : "no value";
   }
 
   function summarise() {
@@ -244,7 +246,7 @@
     let low = Infinity, high = -Infinity;
     for (const v of values) if (Number.isFinite(v)) { low = Math.min(low, v); high = Math.max(high, v); }
     if (!(high > low)) { low = (Number.isFinite(low) ? low : 0) - 1; high = low + 2; }
-    return { low, high, label: (state.difference ? "A − B" : q.name.length > 22 ? "" : q.name) + (q.unit ? ` [${q.unit}]` : "") };
+    return { low, high, label: (state.difference ? "A − B" : q.name.length > 22 ? "" : q.name) + (unit() ? ` [${unit()}]` : "") };
   }
   function drawProfile() {
     const [pen, w, h] = frame(at("profile")), along = profile(), up = along.length ? [] : column(state.cell);

@@ -326,6 +326,7 @@ def replay_poses(
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         visibility=rt.visibility if engine == "image" else "centre",
+        threads=rt.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
     )

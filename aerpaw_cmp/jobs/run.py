@@ -724,6 +724,19 @@ def run_calibrate(
 ) -> CalibrateOutcome:
     """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
 
+    Parameters
+    ----------
+    path : Path
+        calibration.yaml.
+    out : Path, optional
+        The file to write; the folder lies beside it.
+    logs_root : Path, optional
+        Where the paths of logs and antennas resolve.
+    force : bool
+        Replace also what this tool did not write; never an input.
+    progress : Progress
+        Stage and share done.
+
     Raises
     ------
     UsageError, InputError

@@ -7,6 +7,7 @@ COMMANDS: dict[str, str] = {
     "formats": "List the log formats that can be read, with a sample line of each.",
     "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
     "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
+    "diff": "What changed between two reports of a flight: settings, inputs, numbers with intervals.",
     "calibrate": "Learn antennas from several flights; score them on what was left out.",
     "tap": "Log the rank indicator live from the modem's serial port.",
     "modem-sim": "A pseudo-terminal that behaves like the modem, to try the tap without hardware.",

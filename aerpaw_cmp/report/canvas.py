@@ -341,9 +341,9 @@ def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
     if n <= limit:
         return np.arange(n)
     per = -(-n // 600)  # about two pixels of a figure
-    table = np.full(-(-n // per) * per, np.nan)
-    table[:n] = values
-    table = table.reshape(-1, per)
+    padded = np.full(-(-n // per) * per, np.nan)
+    padded[:n] = values
+    table = padded.reshape(-1, per)
     base = np.arange(len(table)) * per
     ends = [np.where(np.isnan(table), fill, table) for fill in (np.inf, -np.inf)]
     extremes = np.concatenate([base + ends[0].argmin(axis=1), base + ends[1].argmax(axis=1)])

@@ -6,26 +6,14 @@ tree is conservative; what decides is computed on the items themselves, in float
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 from numba import njit
 
-from ..common.units import FloatArray, IntArray
+from ..common.units import FloatArray
+from .surfaces import BoxTree
 
 DEEPEST = 64
 """Nodes that wait while a tree is walked: twice its depth for 4e9 items."""
-
-
-class BoxTree(NamedTuple):
-    """Nodes of a tree: ``lower``, ``upper`` (nodes, 3), ``child`` (nodes,), ``start``, ``count`` into ``items``."""
-
-    lower: FloatArray
-    upper: FloatArray
-    child: IntArray
-    start: IntArray
-    count: IntArray
-    items: IntArray
 
 
 def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
@@ -84,7 +72,14 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
         todo[waiting], todo[waiting + 1] = nodes, nodes + 1
         waiting += 2
         nodes += 2
-    return low[:nodes].copy(), high[:nodes].copy(), child[:nodes].copy(), start[:nodes].copy(), count[:nodes].copy(), items
+    return (
+        low[:nodes].copy(),
+        high[:nodes].copy(),
+        child[:nodes].copy(),
+        start[:nodes].copy(),
+        count[:nodes].copy(),
+        items,
+    )
 
 
 @njit(cache=True, nogil=True)

@@ -23,10 +23,11 @@ from numba import njit
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
-from .boxtree import BoxTree, box_missed, box_outside, box_tree, within_planes
+from .boxtree import box_missed, box_outside, box_tree, within_planes
 from .image import MINIMUM_LENGTH_M, merge
+from .merging import WINDOW
 from .paths import PathSet
-from .surfaces import WINDOW, Surfaces
+from .surfaces import Surfaces
 
 SIDE_M = 1e-6
 """Closer to a plane than this [m] is on it."""
@@ -358,7 +359,74 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
     return paths.select(~gone)
 
 
+def reflection_points(
+    surfaces: Surfaces, sequence: IntArray, sources_m: FloatArray, targets_m: FloatArray, *, edge_m: float
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Where paths over stated faces reflect, in float64.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    sequence : (paths, depth) int
+        Faces; one of the same plane takes the place of a face that the reflection point misses.
+    sources_m, targets_m : (paths, 3)
+    edge_m : float
+        How far outside its face a point may lie.
+
+    Returns
+    -------
+    sequence : (paths, depth) int
+    vertices_m : (paths, depth, 3)
+    good : (paths,) bool
+        Every point in a face, and the ends of each reflection on one side.
+    """
+    order = np.argsort(surfaces.plane, kind="stable")
+    start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
+    sequence = np.ascontiguousarray(sequence).copy()
+    vertices, good = _points_of(
+        tuple(_mirrors(surfaces, None)), order, start, sequence,
+        np.ascontiguousarray(sources_m), np.ascontiguousarray(targets_m), edge_m,
+    )  # fmt: skip
+    return sequence, vertices, good
+
+
 # ---------------------------------------------------------------- compiled
+
+
+@njit(cache=True, nogil=True)
+def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
+    normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
+    count, depth = sequence.shape
+    vertices = np.zeros((count, depth, 3))
+    good = np.ones(count, np.bool_)
+    images = np.zeros((depth + 1, 3))
+    for row in range(count):
+        images[0] = sources[row]
+        for step in range(depth):
+            f = sequence[row, step]
+            images[step + 1] = images[step] - 2.0 * _height(normal, offset, f, images[step]) * normal[f]
+        point = targets[row]
+        for step in range(depth - 1, -1, -1):
+            f = sequence[row, step]
+            low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
+            if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
+                good[row] = False
+                break
+            share = abs(low) / (abs(low) + abs(top))
+            vertices[row, step] = images[step + 1] + share * (point - images[step + 1])
+            point = vertices[row, step]
+            if _in_face(first, flat, along, across, f, point, edge):
+                continue
+            moved = False
+            for k in range(start[plane[f]], start[plane[f] + 1]):
+                if _in_face(first, flat, along, across, order[k], point, edge):
+                    sequence[row, step] = order[k]
+                    moved = True
+                    break
+            if not moved:
+                good[row] = False
+                break
+    return vertices, good
 
 
 @njit(cache=True, nogil=True)
@@ -461,7 +529,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
 @njit(cache=True, nogil=True)
 def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
     """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
-    normal, offset, _, _, window, convex, plane, _, _, _, _ = mirrors
+    _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
     lower, upper, child, start, count, items = face_tree
     aim = np.zeros(3)
     for k in range(WINDOW):
@@ -579,7 +647,7 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True, nogil=True)
-def _in_face(first, flat, along, across, f, p):  # type: ignore[no-untyped-def]
+def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
     """Whether a point of the plane of face ``f`` lies in one of its triangles."""
     a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
     b = across[f, 0] * p[0] + across[f, 1] * p[1] + across[f, 2] * p[2]
@@ -591,7 +659,7 @@ def _in_face(first, flat, along, across, f, p):  # type: ignore[no-untyped-def]
         for k in range(3):
             e0, e1 = c[(k + 1) % 3, 0] - c[k, 0], c[(k + 1) % 3, 1] - c[k, 1]
             side = sign * (e0 * (b - c[k, 1]) - e1 * (a - c[k, 0]))
-            if side < -EDGE_M * np.sqrt(e0 * e0 + e1 * e1):
+            if side < -edge * np.sqrt(e0 * e0 + e1 * e1):
                 good = False
                 break
         if good:
@@ -602,7 +670,7 @@ def _in_face(first, flat, along, across, f, p):  # type: ignore[no-untyped-def]
 @njit(cache=True, nogil=True)
 def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
     """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
-    normal, offset, along, across, window, convex, plane, front_only, usable, first, flat = mirrors
+    normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
     t_lower, t_upper, t_child, t_start, t_count, t_items = target_tree
     max_depth, side, beams, longest = rules[0], rules[4], rules[5], rules[6]
     faces_n = len(normal)
@@ -669,14 +737,22 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
         if beams and level > 0:
             # plane 0 of the level before is the face itself: behind it nothing is lost, and it is no side of the beam
             for p in range(1, many[level - 1]):
-                b0, b1, b2, b3 = planes[level - 1, p, 0], planes[level - 1, p, 1], planes[level - 1, p, 2], planes[level - 1, p, 3]
+                b0, b1, b2, b3 = (
+                    planes[level - 1, p, 0],
+                    planes[level - 1, p, 1],
+                    planes[level - 1, p, 2],
+                    planes[level - 1, p, 3],
+                )
                 dot = b0 * n0 + b1 * n1 + b2 * n2
-                mine[number, 0], mine[number, 1], mine[number, 2] = b0 - 2.0 * dot * n0, b1 - 2.0 * dot * n1, b2 - 2.0 * dot * n2
+                mine[number, 0], mine[number, 1], mine[number, 2] = (
+                    b0 - 2.0 * dot * n0,
+                    b1 - 2.0 * dot * n1,
+                    b2 - 2.0 * dot * n2,
+                )
                 mine[number, 3] = b3 + 2.0 * dot * offset[f]
                 number += 1
-        if beams and not flatwise:
-            if not box_outside(t_lower, t_upper, 0, mine, number) or level + 1 < max_depth:
-                number = _side_planes(mine, number, image, window[f])
+        if beams and not flatwise and (level + 1 < max_depth or not box_outside(t_lower, t_upper, 0, mine, number)):
+            number = _side_planes(mine, number, image, window[f])
         many[level] = number if beams else 0
         # receivers
         stack[0] = 0
@@ -701,7 +777,12 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     g = chain[step]
                     top = signs[step] * _height(normal, offset, g, point)
                     low = signs[step] * _height(normal, offset, g, images[step])
-                    if top < -side or low < -side or top + low <= side or (step < level and top <= (side if rules[3] == 0.0 else -side)):
+                    if (
+                        top < -side
+                        or low < -side
+                        or top + low <= side
+                        or (step < level and top <= (side if rules[3] == 0.0 else -side))
+                    ):
                         good = False
                         break
                     share = low / (low + top)
@@ -709,7 +790,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     for axis in range(3):
                         points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
                     point = points[step]
-                    if not _in_face(first, flat, along, across, g, point):
+                    if not _in_face(first, flat, along, across, g, point, EDGE_M):
                         good = False
                         break
                 if not good:
@@ -719,7 +800,9 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                 cut = False
                 for step in range(level + 1):
                     g = chain[step]
-                    if segment_cut(corners, tree, start, points[step], start_normal, start_offset, normal[g], offset[g], rules):
+                    if segment_cut(
+                        corners, tree, start, points[step], start_normal, start_offset, normal[g], offset[g], rules
+                    ):
                         cut = True
                         break
                     start, start_normal, start_offset = points[step], normal[g], offset[g]
@@ -744,4 +827,4 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
     return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), counts
 
 
-__all__ = ["BoxTree", "Effort", "grow_paths", "segment_cut", "usable_cores", "without_coincident"]
+__all__ = ["Effort", "grow_paths", "reflection_points", "segment_cut", "usable_cores", "without_coincident"]

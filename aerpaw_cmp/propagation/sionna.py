@@ -16,6 +16,7 @@ Guards against what Sionna RT 2.2.0 does silently:
 from __future__ import annotations
 
 import gc
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -31,6 +32,7 @@ from .arrays import Array, Link, Poses
 from .faces import inside, triangles
 from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .paths import Faces, PathSet
+from .surfaces import Surfaces
 
 SPECULAR_TABLE_SLOTS = 2**24
 MAXIMUM_PATHS = 1_000_000
@@ -102,27 +104,36 @@ class _Scene:
     """object id -> face of each triangle"""
 
 
-def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float, *, own_table: bool = False) -> _Scene:
+def _build(
+    faces: Faces,
+    chosen: IntArray,
+    reach_m: float,
+    carrier_hz: float,
+    *,
+    own_table: bool = False,
+    surfaces: Surfaces | None = None,
+) -> _Scene:
     """Scene of the faces ``chosen``: one mesh per material; ``own_table`` takes Sionna's own constants of P.2040."""
     import mitsuba as mi
     import sionna.rt as rt
 
     scene = rt.load_scene()
     scene.frequency = carrier_hz
-    vertices, triangle, owner = triangles(faces, reach_m)
+    vertices, triangle, owner = triangles(faces, reach_m) if surfaces is None else surfaces.mesh()
     objects = []
     owners = []
     for name in dict.fromkeys(faces.material[i] for i in chosen):
         members = [i for i in chosen if faces.material[i] == name]
         rows = np.flatnonzero(np.isin(owner, members))
         corners, place = np.unique(triangle[rows], return_inverse=True)
-        mesh = mi.Mesh(f"faces-{name}", vertex_count=len(corners), face_count=len(rows))
+        plain = re.sub(r"[^a-z0-9_]+", "-", name)
+        mesh = mi.Mesh(f"faces-{plain}", vertex_count=len(corners), face_count=len(rows))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices[corners], np.float32).ravel())
         parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
         parameters.update()
         objects.append(
-            rt.SceneObject(mi_mesh=mesh, name=f"faces-{name}", radio_material=_material(name, carrier_hz, own_table))
+            rt.SceneObject(mi_mesh=mesh, name=f"faces-{plain}", radio_material=_material(name, carrier_hz, own_table))
         )
         owners.append(owner[rows])
     scene.add(objects)
@@ -135,14 +146,15 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
     what = material(name)
     eta = what.relative_permittivity(carrier_hz)
     thick = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m
+    plain = re.sub(r"[^a-z0-9_]+", "-", name)
     if own_table:
         from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-        if name in ITU_MATERIALS_PROPERTIES:
-            return rt.ITURadioMaterial(f"m-{name}", name, thickness=thick)
+        if name.partition(" with ")[0] in ITU_MATERIALS_PROPERTIES:
+            return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
-        f"m-{name}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
+        f"m-{plain}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
     )
 
 
@@ -313,6 +325,7 @@ def find_paths(
     batch: int = 50,
     usable: BoolArray | None = None,
     excluded: BoolArray | None = None,
+    surfaces: Surfaces | None = None,
     variant: str | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
@@ -328,6 +341,8 @@ def find_paths(
         Rays per tower and batch.
     batch : int
         Poses per call, at most 100; bounds the memory.
+    surfaces : Surfaces, optional
+        What the faces are made of, where they are open surfaces.
     variant : {"cuda", "llvm"}, optional
 
     Returns
@@ -347,18 +362,22 @@ def find_paths(
         if not len(poses):
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        built = _build(faces, chosen, reach, carrier_hz)
+        built = _build(faces, chosen, reach, carrier_hz, surfaces=surfaces)
         with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch) as finder:
             for start in range(0, len(poses), batch):
                 some = poses[start : start + batch]
                 raw = finder.solve(targets_m[some], max_depth, samples)
                 _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
                 pose, tower, sequence = _sequences(raw, built.face_of, some, towers, max_depth)
-                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m))
+                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces))
                 if progress:
                     progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
         del built
-    found = merge(pieces, max_depth, faces)
+    found = merge(pieces, max_depth, faces if surfaces is None else None)
+    if surfaces is not None:
+        from .growth import without_coincident
+
+        found = without_coincident(found, surfaces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
 
 
@@ -393,6 +412,7 @@ def own_coefficients(
     max_depth: int = 2,
     samples: int = 1_000_000,
     batch: int = 50,
+    surfaces: Surfaces | None = None,
 ) -> Coefficients:
     """Sionna's complex coefficient of each path, for the audit of the field.
 
@@ -401,7 +421,7 @@ def own_coefficients(
 
     Parameters
     ----------
-    faces, sources_m, usable, excluded, max_depth, samples, batch
+    faces, sources_m, usable, excluded, max_depth, samples, batch, surfaces
         As in :func:`find_paths`.
     poses : Poses
     probe : Link
@@ -421,7 +441,7 @@ def own_coefficients(
     for sharing, chosen in _groups(faces, sources_m, usable):
         for name in dict.fromkeys(arrays[t].patterns[0].name for t in sharing):
             towers = np.array([t for t in sharing if arrays[t].patterns[0].name == name])
-            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True)
+            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True, surfaces=surfaces)
             ends = _Ends(sources_m[towers], turns[0][towers], np.zeros((1, 3)))
             patterns = (name, probe.uav_array.patterns[0].name)
             with _Finder(built, ends, np.zeros((1, 3)), batch, patterns=patterns) as finder:
@@ -497,12 +517,13 @@ def own_channels(
     samples: int = 1_000_000,
     batch: int = 50,
     usable: BoolArray | None = None,
+    surfaces: Surfaces | None = None,
 ) -> ComplexArray:
     """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
 
     Parameters
     ----------
-    faces, sources_m, max_depth, samples, batch, usable
+    faces, sources_m, max_depth, samples, batch, usable, surfaces
         As in :func:`find_paths`.
     poses : Poses
     link : Link
@@ -524,7 +545,7 @@ def own_channels(
     for towers, chosen in _groups(faces, sources_m, usable):
         mounts = np.stack([arrays[t].mount for t in towers])
         sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
-        built = _build(faces, chosen, reach, link.carrier_hz)
+        built = _build(faces, chosen, reach, link.carrier_hz, surfaces=surfaces)
         with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
             for start in range(0, len(poses), batch):
                 rows = slice(start, start + batch)
@@ -599,6 +620,7 @@ def _refine(
     tower: IntArray,
     sequence: IntArray,
     tolerance_m: float,
+    surfaces: Surfaces | None = None,
 ) -> PathSet:
     """Reflection points in float64; paths whose points miss their faces are dropped."""
     rows = np.column_stack([pose, tower, sequence])
@@ -609,6 +631,15 @@ def _refine(
     good = np.linalg.norm(targets_m[pose] - sources_m[tower], axis=1) >= MINIMUM_LENGTH_M
     for number in np.unique(depth[depth > 0]):
         some = np.flatnonzero(depth == number)
+        if surfaces is not None:
+            from .growth import reflection_points
+
+            ends = (sources_m[tower[some]], targets_m[pose[some]])
+            sequence[some, :number], vertices[some, :number], fits = reflection_points(
+                surfaces, sequence[some, :number], *ends, edge_m=EDGE_TOLERANCE_M
+            )
+            good[some] &= fits
+            continue
         part = _relocate(faces, sources_m[tower[some]], targets_m[pose[some]], sequence[some, :number], tolerance_m)
         sequence[some, :number] = part
         images = images_of(faces, part, sources_m[tower[some]])

@@ -228,7 +228,7 @@ def _stated(plain: str, said: str, name: str) -> Material:
     if not good or (plain == CONSTANT and not values.get("permittivity", 0.0) >= 1.0):
         raise UsageError(
             f"unknown material '{name}'",
-            expected="'concrete with thickness=0.1' or 'constant with permittivity=3.5 conductivity=0.02 thickness=0.1'",
+            expected="'concrete with thickness=0.1' or 'constant with permittivity=3.5 conductivity=0.02'",
         )
     thickness = values.get("thickness")
     if plain != CONSTANT:

@@ -128,7 +128,9 @@ def _header(data: bytes, path: Path) -> tuple[str, list[_Element], int]:
                 item = (words[4], _TYPES[words[3]], _TYPES[words[2]]) if listed else (words[2], _TYPES[words[1]], "")
                 elements[-1] = _Element(last.name, last.count, (*last.properties, item))
         except (IndexError, KeyError, ValueError):
-            raise InputError(f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number) from None
+            raise InputError(
+                f"the header says '{line.strip()[:60]}'", expected="a PLY header", path=path, line=number
+            ) from None
     if kind not in ("ascii", "binary_little_endian", "binary_big_endian") or any(e.count < 0 for e in elements):
         raise InputError(f"a PLY of format '{kind}'", expected="ascii or binary", path=path)
     return kind, elements, start
@@ -193,9 +195,7 @@ def _polygons(
     return [np.array(group, dtype=np.int64) for group in found.values()], place
 
 
-def _even_polygons(
-    element: _Element, data: bytes, place: int, order: str, which: str
-) -> tuple[IntArray, int] | None:
+def _even_polygons(element: _Element, data: bytes, place: int, order: str, which: str) -> tuple[IntArray, int] | None:
     """All polygons at once where all have as many corners as the first, as nearly every file has it."""
     first = place
     record: list[tuple[str, str] | tuple[str, str, tuple[int]]] = []
@@ -217,9 +217,7 @@ def _even_polygons(
     return rows["corners"].astype(np.int64).reshape(element.count, -1), place + what.itemsize * element.count
 
 
-def _one(
-    data: bytes, words: list[bytes], place: int, kind: str, element: _Element, path: Path
-) -> tuple[int, int]:
+def _one(data: bytes, words: list[bytes], place: int, kind: str, element: _Element, path: Path) -> tuple[int, int]:
     values, place = _several(data, words, place, kind, 1, element, path)
     return values[0], place
 

@@ -31,7 +31,7 @@ _SHAPES = ("ply", "obj", "rectangle", "cube", "merge")
 _IGNORED = ("sensor", "emitter", "integrator", "sampler", "film", "texture", "default", "medium")
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, eq=False)
 class TriangleScene:
     """A scene as triangles.
 
@@ -114,7 +114,7 @@ def read_scene(path: str | Path, materials: Mapping[str, str] | None = None) -> 
     reading = _Reading(path, path.parent.resolve(), radio)
     reading.digest.update(data)
     for shape in _shapes(root):
-        _add(reading, shape, unknown, given)
+        _add(reading, shape, unknown)
     if not reading.triangles:
         raise InputError("the scene has no triangle", expected="shapes of type " + ", ".join(_SHAPES), path=path)
     return _gathered(reading, notes)
@@ -265,7 +265,7 @@ def _shapes(root: ElementTree.Element) -> Iterator[ElementTree.Element]:
             yield shape
 
 
-def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str], given: Mapping[str, str]) -> None:
+def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, str]) -> None:
     kind = shape.get("type", "?")
     if kind not in _SHAPES:
         reading.skipped[kind] = reading.skipped.get(kind, 0) + 1
@@ -285,13 +285,11 @@ def _add(reading: _Reading, shape: ElementTree.Element, unknown: Mapping[str, st
     reading.vertices.append(vertices)
     reading.triangles.append(mesh.triangles)
     reading.names.append(name)
-    reading.materials.append(_of_shape(reading, shape, name, unknown, given))
+    reading.materials.append(_of_shape(reading, shape, name, unknown))
     reading.bent += mesh.bent
 
 
-def _of_shape(
-    reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str], given: Mapping[str, str]
-) -> str:
+def _of_shape(reading: _Reading, shape: ElementTree.Element, name: str, unknown: Mapping[str, str]) -> str:
     """Radio material of a shape."""
     inner = shape.find("bsdf")
     refs = [item.get("id", "") for item in shape.findall("ref") if item.get("name", "bsdf") == "bsdf"]
@@ -299,7 +297,9 @@ def _of_shape(
     if which in reading.radio:
         return reading.radio[which]
     if not which:
-        raise InputError(f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>', path=reading.path)
+        raise InputError(
+            f"the shape '{name}' has no material", expected='<ref id="..." name="bsdf"/>', path=reading.path
+        )
     if which in unknown:
         others = "" if len(unknown) == 1 else f" and {len(unknown) - 1} more ({', '.join(list(unknown)[:6])})"
         raise UsageError(
@@ -324,7 +324,9 @@ def _mesh(reading: _Reading, shape: ElementTree.Element, kind: str, name: str) -
     item = shape.find("string[@name='filename']")
     wanted = "" if item is None else item.get("value", "")
     if not wanted:
-        raise InputError(f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path)
+        raise InputError(
+            f"the shape '{name}' names no file", expected='<string name="filename" .../>', path=reading.path
+        )
     place = (reading.folder / wanted.replace("\\", "/")).resolve()
     if Path(wanted).is_absolute() or ":" in wanted[:3] or not place.is_relative_to(reading.folder):
         raise InputError(
@@ -358,7 +360,9 @@ def _to_world(shape: ElementTree.Element, path: Path) -> FloatArray:
     for item in () if transform is None else transform:
         total = _step(item, path) @ total
     if not abs(np.linalg.det(total[:3, :3])) > 0.0:
-        raise InputError(f"the to_world of '{shape.get('id')}' is singular", expected="a matrix with an inverse", path=path)
+        raise InputError(
+            f"the to_world of '{shape.get('id')}' is singular", expected="a matrix with an inverse", path=path
+        )
     return total
 
 
@@ -385,9 +389,7 @@ def _step(item: ElementTree.Element, path: Path) -> FloatArray:
         cross = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
         matrix[:3, :3] += math.sin(angle) * cross + (1.0 - math.cos(angle)) * cross @ cross
     else:
-        raise InputError(
-            f"the transform '{item.tag}'", expected="matrix, translate, scale or rotate", path=path
-        )
+        raise InputError(f"the transform '{item.tag}'", expected="matrix, translate, scale or rotate", path=path)
     return matrix
 
 

@@ -141,7 +141,7 @@ def test_bench_json(capsys: pytest.CaptureFixture[str]) -> None:
 
 
 def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys: pytest.CaptureFixture[str]) -> None:
-    from aerpaw_cmp.cli import _table
+    from aerpaw_cmp.cli.shown import table
     from aerpaw_cmp.logs.ingest import ACCOUNT
 
     file = "a_rather_long_name_of_a_power_log.txt"
@@ -158,7 +158,7 @@ def test_a_table_too_wide_for_the_terminal_is_text_without_broken_numbers(capsys
         "711.5",
     ]
     for width in (40, 80, 100, 160):
-        _table(list(ACCOUNT), [row, row], "files below x", width=width)
+        table(list(ACCOUNT), [row, row], "files below x", width=width)
         shown = capsys.readouterr().out
         assert max(map(len, shown.splitlines())) <= width
         assert all(shown.count(cell) == 2 for cell in (file, "sounder_log", "123450"))

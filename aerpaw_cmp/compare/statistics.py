@@ -376,9 +376,9 @@ def error_intervals(
     def drawn(columns: list[FloatArray], of: Autocorrelation) -> FloatArray:
         return bootstrap_means(np.column_stack(columns), of.block_length, replicates=replicates, seed=seed)
 
-    of_squares = _of_spread(known, autocorrelation(squared))
+    of_squares = of_spread(known, autocorrelation(squared))
     mean, square = drawn([d, squared], of_squares).T
-    of_correlation = _of_spread(known, autocorrelation(_correlation_influence(spread, crossed, squared)))
+    of_correlation = of_spread(known, autocorrelation(_correlation_influence(spread, crossed, squared)))
     again, with_residual, residual = drawn([d, crossed, squared], of_correlation).T
     return ErrorIntervals(
         interval(float(difference.mean()), drawn([d], known)[:, 0] + difference.mean(), known),
@@ -401,7 +401,7 @@ def error_intervals(
     )
 
 
-def _of_spread(residual: Autocorrelation, influence: Autocorrelation) -> Autocorrelation:
+def of_spread(residual: Autocorrelation, influence: Autocorrelation) -> Autocorrelation:
     """Of a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
     return Autocorrelation(
         residual.n,

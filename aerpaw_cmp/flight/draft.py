@@ -124,6 +124,19 @@ def drafts(
 
     Where one flight alone is complete (levels or ranks, and positions) all logs stand in its draft, those that do not
     belong to it as left out.
+
+    Parameters
+    ----------
+    files : sequence of IngestedFile
+        Logs of one or of several flights.
+    folder : Path
+        Against which the paths are written.
+    timezone : str, optional
+        Of clocks without a zone.
+    time_origin : str, optional
+        Of relative times.
+    mapping : mapping, optional
+        Keys of a log that ``--map`` gave.
     """
     found = [flight for flight in flights(files) if flight.complete]
     told = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}

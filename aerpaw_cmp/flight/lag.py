@@ -264,7 +264,23 @@ def sample(
     resolution_s: float,
     origin_ns: int | None = None,
 ) -> Sampled | str:
-    """Samples that have a level, and the prediction sampled around them; a reason where they are too few."""
+    """Samples that have a level, and the prediction sampled around them; a reason where they are too few.
+
+    Parameters
+    ----------
+    times : (n,)
+        datetime64; NaT does not count.
+    measured_db : (n,)
+        NaN does not count [dB].
+    predictor : callable
+        Level (m,) [dB] at instants (m,).
+    window_s : float
+        Largest lag [s].
+    resolution_s : float
+        Step of the prediction [s].
+    origin_ns : int, optional
+        Zero of the seconds; by default the first instant.
+    """
     stamp, levels = nanoseconds(times).ravel(), np.asarray(measured_db, dtype=np.float64).ravel()
     if stamp.shape != levels.shape:
         raise ValueError(f"{len(stamp)} times and {len(levels)} levels")
@@ -301,7 +317,18 @@ def symmetric(window: float, step: float) -> FloatArray:
 
 
 def no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
-    """A failed fit."""
+    """A failed fit.
+
+    Parameters
+    ----------
+    reason : str
+    n : int
+        Samples there were.
+    window_s : float
+        Largest lag [s]: all the interval says.
+    lags : (m,)
+        Lags that would have been tried [s].
+    """
     nan = float("nan")
     return LagFit(
         radio_minus_telemetry_s=nan,
@@ -387,7 +414,21 @@ def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_d
 def fit_lag(
     t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
 ) -> LagFit:
-    """Search, refine, judge."""
+    """Search, refine, judge.
+
+    Parameters
+    ----------
+    t, m : (n,)
+        Times [s] and levels [dB].
+    prediction : callable
+        Level (n,) [dB] at times (n,) [s].
+    lags : (m,)
+        Lags to try first [s].
+    limit_s : float
+        Largest lag [s].
+    drifting : bool
+        Fit a drift, too.
+    """
     middle = 0.5 * float(t[0] + t[-1])
     few = slice(None, None, -(-len(t) // _SCANNED))
     ts, ms = t[few], m[few]

@@ -6,7 +6,6 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import tempfile
 from collections import Counter
@@ -16,7 +15,6 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass
 from datetime import datetime, timezone
 from functools import lru_cache
-from itertools import combinations
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -30,29 +28,24 @@ from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare import rank, result, rss, statistics
-from ..compare.offset import Pooling, pooled_offsets
-from ..compare.rank import repeat_rank
 from ..compare.result import FlightResult, RankResult, RssResult
-from ..compare.statistics import correlation, repeatability
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
-from ..flight.settings import FlightFile, Positive, RssSettings, Settings, load_flight
+from ..flight.settings import FlightFile, RssSettings, Settings, load_flight
 from ..report import campaign_data
 from ..report.campaign_data import (
     CampaignData,
     Failure,
+    FlownRank,
     FlownTrack,
-    PooledOffset,
-    RankPairing,
     RankRow,
-    RankTransfer,
-    Repeat,
     RssRow,
-    place_means,
 )
+from . import over_flights
 from .campaign_fit import fit_all
 from .flight_run import run_flight
 from .outcomes import OutcomeStore, records_of, task_key
+from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 
 Stage = Callable[[str], Any]
 
@@ -75,15 +68,6 @@ class HeldOutSettings(Settings):
     """Search between the values, too."""
 
 
-class RepeatSettings(Settings):
-    """When two samples count as taken at the same place, and how residuals are gathered by place."""
-
-    radius_m: Positive = 3.0
-    heading_within_deg: Positive | None = 20.0
-    """Headings of a pair agree within this; null: any heading."""
-    cell_m: Positive = 20.0
-
-
 class CampaignFile(Settings):
     """The whole campaign.yaml."""
 
@@ -94,6 +78,8 @@ class CampaignFile(Settings):
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
+    export: list[str] = Field(default_factory=list)
+    """Formats of the samples: those of ``report.export`` of a flight."""
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -144,17 +130,7 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
-    flown: tuple[RankFlown, ...] = ()
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankFlown:
-    """Reported ranks (n,), NaN where none, and where: ``position_m`` (n, 3)."""
-
-    flight: str
-    tower: str
-    position_m: FloatArray
-    rank: FloatArray
+    flown: tuple[FlownRank, ...] = ()
 
 
 @lru_cache(maxsize=2)
@@ -202,7 +178,15 @@ def run_task(task: Task) -> Outcome:
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
         flown=tuple(
-            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
             for one in found.result.rank
             if task.reference
         ),
@@ -212,6 +196,10 @@ def run_task(task: Task) -> Outcome:
 def _flown(task: Task, result: FlightResult) -> FlownTrack:
     first = result.rss[0] if result.rss else result.rank[0]
     return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
 
 
 def _elapsed_s(time: AnyArray) -> FloatArray:
@@ -245,6 +233,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         measured_db=found.measured_db,
         simulated_dbm=found.simulated_dbm,
         time_s=_elapsed_s(found.time) if task.reference else np.zeros(0),
+        start_ns=_start_ns(found.time),
         position_m=found.position_m if task.reference else np.zeros((0, 3)),
         distance_m=found.geometry["distance_m"] if task.reference else np.zeros(0),
         heading_deg=found.geometry.get("heading_deg") if task.reference else None,
@@ -358,7 +347,9 @@ def _kept(tasks: Sequence[Task], keep: Path) -> tuple[OutcomeStore, dict[int, st
             settings = overridden(load_flight(task.path), task.overrides)
             more = (task.flight, task.setting, task.reference)
             keys[number] = task_key(settings, task.path, task.logs_root, *more)
-    return OutcomeStore(keep, records_of(sys.modules[__name__], campaign_data, rank, result, rss, statistics)), keys
+    return OutcomeStore(
+        keep, records_of(sys.modules[__name__], over_flights, campaign_data, rank, result, rss, statistics)
+    ), keys
 
 
 def _collect(pool: Executor, tasks: Sequence[Task], todo: Sequence[int], done: Callable[[int, Outcome], None]) -> None:
@@ -420,172 +411,6 @@ def _marked(task: Task, mark: str) -> Outcome:
     """Run a task; its mark stands from its beginning on."""
     Path(mark).touch()
     return run_task(task)
-
-
-# --- over all flights -----------------------------------------------------------------------------------------------
-
-
-def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
-    """Shared offsets of each setting, entered into the rows and listed by group."""
-    done: list[RssRow] = []
-    groups: list[PooledOffset] = []
-    for setting in dict.fromkeys(row.setting for row in rows):
-        members = [row for row in rows if row.setting == setting]
-        span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
-        fits = pooled_offsets(
-            {row.key: (row.measured_db, row.simulated_dbm) for row in members},
-            per,
-            step_db=min(r.step_db for r in members),
-            span_db=span,
-        )
-        pooled = [
-            dataclasses.replace(
-                row, pooled_offset_db=fits[row.key].offset_db, pooled_rmse_db=fits[row.key].rmse_db
-            )
-            for row in members
-        ]  # fmt: skip
-        done += pooled
-        by_group: dict[str, list[RssRow]] = {}
-        for row in pooled:
-            by_group.setdefault(_group(row, per), []).append(row)
-        groups += [_pooled(setting, name, some, fits) for name, some in by_group.items()]
-    return done, groups
-
-
-def _group(row: RssRow, per: Pooling) -> str:
-    names = {
-        "link": f"{row.flight} {row.link}",
-        "tower": row.tower,
-        "channel": row.channel,
-        "flight": row.flight,
-        "all": "all",
-    }
-    return names[per]
-
-
-def _pooled(setting: str, name: str, rows: list[RssRow], fits: Mapping[Any, Any]) -> PooledOffset:
-    own = np.array([row.offset_db for row in rows])
-    own = own[np.isfinite(own)]
-    nan = float("nan")
-    return PooledOffset(
-        setting=setting,
-        group=name,
-        members=tuple(f"{row.flight} {row.link}" for row in rows),
-        offset_db=rows[0].pooled_offset_db,
-        spread_db=float(own.std(ddof=1)) if len(own) > 1 else nan,
-        range_db=(float(own.min()), float(own.max())) if len(own) else (nan, nan),
-        own_rmse_db=_mean(row.rmse_db for row in rows),
-        pooled_rmse_db=_mean(row.pooled_rmse_db for row in rows),
-        at_search_edge=any(fits[row.key].at_edge for row in rows),
-        units=tuple(dict.fromkeys(row.unit for row in rows)),
-    )
-
-
-def _mean(values: Any) -> float:
-    known = [v for v in values if np.isfinite(v)]
-    return float(np.mean(known)) if known else float("nan")
-
-
-def repeats(rows: Sequence[RssRow], settings: RepeatSettings) -> list[Repeat]:
-    """Every pair of flights that share a tower and channel."""
-    out = []
-    for first, second in combinations(rows, 2):
-        if (first.tower, first.channel) != (second.tower, second.channel) or first.flight == second.flight:
-            continue
-        out.append(_repeat(first, second, settings))
-    return out
-
-
-def _repeat(first: RssRow, second: RssRow, settings: RepeatSettings) -> Repeat:
-    within = settings.heading_within_deg
-    headings: dict[str, Any] = {}
-    if within is not None and first.heading_deg is not None and second.heading_deg is not None:
-        headings = {
-            "heading_deg": first.heading_deg,
-            "other_heading_deg": second.heading_deg,
-            "heading_within_deg": within,
-        }
-
-    def between(one: FloatArray, two: FloatArray) -> Any:
-        return repeatability(
-            first.position_m, one, second.position_m, two, radius_m=settings.radius_m, **headings
-        )  # fmt: skip
-
-    level = between(first.measured_db, second.measured_db)
-    residual = between(first.residual_db, second.residual_db)
-    here, there = (place_means(row, settings.cell_m) for row in (first, second))
-    both = sorted(set(here) & set(there))
-    pairs = np.array([(*here[c], *there[c]) for c in both]).reshape(-1, 4)
-    return Repeat(
-        tower=first.tower,
-        channel=first.channel,
-        first=first.flight,
-        second=second.flight,
-        n=level.n,
-        share=level.n / max(int(np.isfinite(first.measured_db).sum()), 1),
-        rmse_db=level.rmse_db,
-        rmse_ci95_db=level.interval_db,
-        offset_db=level.offset_db,
-        single_db=level.rmse_db / 2.0**0.5,
-        residual_rmse_db=residual.rmse_db,
-        place_rmse_db=float((pairs[:, 2] - pairs[:, 0]).std()) if len(both) else float("nan"),
-        place_correlation=correlation(pairs[:, 0], pairs[:, 2]),
-        cells=len(both),
-        height_difference_m=float(np.median(pairs[:, 3] - pairs[:, 1])) if len(both) else float("nan"),
-    )
-
-
-def rank_repeats(flown: Sequence[RankFlown], radius_m: float) -> list[RankPairing]:
-    """Every pair of flights that reported ranks to one tower at the same places."""
-    out = []
-    for first, second in combinations(flown, 2):
-        if first.tower != second.tower or first.flight == second.flight:
-            continue
-        found = repeat_rank(first.position_m, first.rank, second.position_m, second.rank, radius_m=radius_m)
-        if found.n:
-            out.append(
-                RankPairing(
-                    tower=first.tower,
-                    first=first.flight,
-                    second=second.flight,
-                    n=found.n,
-                    agreement=found.agreement,
-                    kappa=found.kappa,
-                    kappa_ci95=found.kappa_ci95,
-                )
-            )
-    return out
-
-
-def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:
-    """K chosen on the other flights, for every flight that has others with the same tower and K."""
-    out = []
-    for setting, tower in dict.fromkeys((row.setting, row.tower) for row in rows):
-        by: dict[str, dict[float, RankRow]] = {}
-        for row in rows:
-            if (row.setting, row.tower) == (setting, tower) and np.isfinite(row.total_variation):
-                by.setdefault(row.flight, {})[row.k] = row
-        for flight, own in by.items():
-            others = [at for name, at in by.items() if name != flight]
-            common = [k for k in own if others and all(k in at for at in others)]
-            if not common:
-                continue
-            chosen = min(common, key=lambda k: _mean(at[k].total_variation for at in others))
-            best = min(own, key=lambda k: own[k].total_variation)
-            out.append(
-                RankTransfer(
-                    setting=setting,
-                    flight=flight,
-                    tower=tower,
-                    chosen_on=tuple(name for name in by if name != flight),
-                    k=chosen,
-                    total_variation=own[chosen].total_variation,
-                    kappa=own[chosen].kappa,
-                    own_k=best,
-                    own_total_variation=own[best].total_variation,
-                )
-            )
-    return out
 
 
 def run(
@@ -660,6 +485,7 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
+        flown_ranks=tuple(one for o in outcomes for one in o.flown),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),

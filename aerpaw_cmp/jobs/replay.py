@@ -89,7 +89,8 @@ def replay_rss(
         tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
-        progress(f"replay RSS {tower}: {len(joined)} poses")
+        channels = ", ".join(data.rss[i].channel for i in members)
+        progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
         whole = replay_poses(data.site, rt, link, joined, progress=progress)
         start = 0
         for index, track, part in zip(members, tracks, poses, strict=True):
@@ -325,6 +326,7 @@ def replay_poses(
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         visibility=rt.visibility if engine == "image" else "centre",
+        threads=rt.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
     )

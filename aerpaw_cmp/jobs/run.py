@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -154,6 +154,7 @@ def run_report(
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
+    export: Sequence[str] = (),
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
@@ -174,6 +175,8 @@ def run_report(
     figures : {"page", "none", "svg", "png", "pdf", "all"}
         What is drawn: what the page shows, nothing, or every figure in one format or in all.
     style : {"screen", "paper"}
+    export : sequence of str
+        Formats of the samples besides those of ``report.export``.
     progress : Progress
 
     Raises
@@ -183,12 +186,14 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
+    from ..report.exports.write import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
+    formats = chosen_formats([*settings.report.export, *export])
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -204,7 +209,7 @@ def run_report(
 
             target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
-            record = write_report(record, place, drawn=figures, style=style, stages=stages).data
+            record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
@@ -631,6 +636,7 @@ def run_campaign(
     cluster: str | None = None,
     keep: Path | None = None,
     force: bool = False,
+    export: Sequence[str] = (),
     progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
@@ -651,6 +657,8 @@ def run_campaign(
         Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
     force : bool
         Write into a folder that holds files of others.
+    export : sequence of str
+        Formats of the samples of the first setting, besides those that campaign.yaml names.
     progress : Progress
 
     Raises
@@ -662,11 +670,13 @@ def run_campaign(
 
     from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
+    from ..report.exports.write import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
 
     stages = Stages(progress)
     campaign = load_campaign(path)
+    formats = chosen_formats([*campaign.export, *export])
     inputs = input_files(campaign, path)
     for entry in campaign.flights:
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
@@ -684,7 +694,8 @@ def run_campaign(
             progress=progress,
         )
         with stages("report"), output.filling() as place:
-            write_campaign(replace(data, stages_s=dict(stages.seconds)), place)
+            finished = replace(data, stages_s=dict(stages.seconds))
+            write_campaign(finished, place, exports=formats, progress=progress)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:
@@ -711,6 +722,19 @@ def run_calibrate(
     progress: Progress = silent,
 ) -> CalibrateOutcome:
     """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+
+    Parameters
+    ----------
+    path : Path
+        calibration.yaml.
+    out : Path, optional
+        The file to write; the folder lies beside it.
+    logs_root : Path, optional
+        Where the paths of logs and antennas resolve.
+    force : bool
+        Replace also what this tool did not write; never an input.
+    progress : Progress
+        Stage and share done.
 
     Raises
     ------

@@ -285,6 +285,13 @@ def smaller_than_fresnel_zone(
     named only when it is smaller for the nearest source and the nearest target it can have. ``area_m2`` (faces,) is
     that of faces that do not fill their bounds; left out, it is that of their polygons.
 
+    Parameters
+    ----------
+    faces : Faces
+    sources_m, targets_m : (s, 3), (n, 3)
+        Ends of the links [m].
+    frequency_hz : float
+
     Returns
     -------
     (faces,) bool

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import FloatArray
+from ..common.units import FloatArray, IntArray
+from ..compare.passes import cell_means
 from ..compare.result import Repeated
 from ..site.site import Site
 from .data import Interval
@@ -52,6 +53,8 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
+    start_ns: int = 0
+    """Instant of ``time_s`` = 0, nanoseconds after 1970-01-01."""
     within: Mapping[str, Repeated] = field(default_factory=dict)
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
@@ -75,15 +78,8 @@ class RssRow:
 def place_means(row: RssRow, cell_m: float) -> dict[tuple[int, int], tuple[float, float]]:
     """Mean residual [dB] and mean height [m] of each square cell of the plan that has a scored sample."""
     good = np.isfinite(row.residual_db) & np.isfinite(row.position_m).all(axis=1)
-    cells = np.floor(row.position_m[good, :2] / cell_m).astype(np.int64)
-    found, which = np.unique(cells, axis=0, return_inverse=True)
-    which = which.reshape(-1)
-    count = np.bincount(which, minlength=len(found))
-    residual = np.bincount(which, weights=row.residual_db[good], minlength=len(found)) / np.maximum(count, 1)
-    height = np.bincount(which, weights=row.position_m[good, 2], minlength=len(found)) / np.maximum(count, 1)
-    return {
-        (int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(found, residual, height, strict=True)
-    }  # fmt: skip
+    cells, residual, height = cell_means(row.position_m, row.residual_db, good, cell_m)
+    return {(int(e), int(n)): (float(r), float(h)) for (e, n), r, h in zip(cells, residual, height, strict=True)}
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -106,6 +102,23 @@ class RankRow:
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
     """Agreement of always saying the commonest rank: what a model has to beat."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownRank:
+    """Samples of the rank of one flight and tower under the first setting.
+
+    ``rank`` (n,) as reported, NaN where none; ``simulated`` by K (n,), 0 where there is no path; ``position_m`` (n, 3);
+    ``time_s`` (n,) after ``start_ns``, nanoseconds after 1970-01-01.
+    """
+
+    flight: str
+    tower: str
+    position_m: FloatArray
+    rank: FloatArray
+    simulated: Mapping[float, IntArray] = field(default_factory=dict)
+    time_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    start_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -283,6 +296,7 @@ class CampaignData:
     held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
+    flown_ranks: tuple[FlownRank, ...] = ()
     radius_m: float = 3.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0

@@ -123,7 +123,18 @@ def rss_verdict(panel: RssPanel) -> str:
         return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
     words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
     words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
-    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
+    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB.{_snr_words(panel)}"
+
+
+def _snr_words(panel: RssPanel) -> str:
+    """What a ratio to the noise adds: its error with nothing fitted."""
+    snr = panel.extra.get("snr")
+    if not snr:
+        return ""
+    return (
+        f" As a signal-to-noise ratio over {snr['noise_dbm']:.1f} dBm of noise, nothing fitted, it is "
+        f"{signed(snr['mean_error_db'])} dB from the replay in the mean ({snr['rmse_db']:.1f} dB RMSE)."
+    )
 
 
 def rank_verdict(panel: RankPanel) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,8 @@ from . import figures, html
 from .canvas import FORMATS, STYLES, write_plates
 from .data import ReportData
 from .export import metrics, rank_frame, rss_frame, write_file
+from .exports.samples import of_report
+from .exports.write import FOLDER, write_exports
 
 PAGE = "page"
 FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
@@ -34,6 +37,7 @@ def write_report(
     *,
     drawn: str = PAGE,
     style: str = "screen",
+    exports: Sequence[str] = (),
     stages: Stages | None = None,
 ) -> WrittenReport:
     """Write the files of a report.
@@ -46,6 +50,8 @@ def write_report(
     drawn : str
         One of :data:`FIGURES`.
     style : {"screen", "paper"}
+    exports : sequence of str
+        Formats of :data:`aerpaw_cmp.report.exports.write.FORMATS` for the samples, besides the CSVs.
     stages : Stages, optional
         Times the stage "report"; all its seconds are then those of the record.
 
@@ -69,8 +75,12 @@ def write_report(
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
         pictures, paths = write_plates(plates, folder / "figures", formats, style, stages.progress)
     written += paths
+    if exports:
+        with stages("exports"):
+            written += write_exports(of_report(data), folder, exports, stages.progress)
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
-    files = ["metrics.json", *(str(path.relative_to(folder)) for path in written if path.parent == folder)]
+    beside = (folder, folder / FOLDER)
+    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in beside)]
     with stages("report"):
         shown = [one for one in pictures if {"png", "svg"} & set(one.formats)]
         page = write_file(folder / "report.html", html.page(data, shown, files))

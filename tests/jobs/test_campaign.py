@@ -16,17 +16,11 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_fit
-from aerpaw_cmp.jobs.campaign import (
-    RepeatSettings,
-    load_campaign,
-    overridden,
-    pool_offsets,
-    repeats,
-    run,
-    transfer_ranks,
-)
+from aerpaw_cmp.jobs.campaign import load_campaign, run
+from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 
 YAW_DEG = 110.0

@@ -1,0 +1,35 @@
+"""Arguments, exit codes, progress: the only room that prints.
+
+A module per group of commands; :mod:`aerpaw_cmp.cli.app` says how one is added.
+"""
+
+from __future__ import annotations
+
+import typer
+
+from ..common.errors import UsageError
+from . import campaign, flight, live, logs, machine, site
+from .app import Interrupted, app
+from .shown import say
+
+GROUPS = (logs, flight, campaign, live, site, machine)
+"""The modules whose commands there are: importing them registers these."""
+
+
+def main(arguments: list[str]) -> int:
+    """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
+    say.quiet = False
+    try:
+        result = app(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
+    except Interrupted as interrupted:
+        raise interrupted.error from None
+    except typer.Abort as error:
+        raise KeyboardInterrupt from error
+    except Exception as error:
+        # typer may vendor click: what counts is the shape of a usage error, not its module
+        if hasattr(error, "format_message") and hasattr(error, "exit_code"):
+            raise UsageError(error.format_message()) from error
+        raise
+    finally:
+        say.end()
+    return result if isinstance(result, int) else 0

@@ -1,0 +1,230 @@
+"""``report``, ``calibrate``, ``simulate``, ``sample``."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Annotated, Any, Literal, Optional
+
+import typer
+
+from ..common.errors import one_line
+from .app import Export, Force, Json, LogsRoot, Out, command
+from .shown import number, print_files, print_json, say, table
+
+
+@command(
+    "report",
+    examples=[
+        "aerpaw-cmp report sample_logs/flight.yaml",
+        "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
+        "aerpaw-cmp report flight.yaml --figures all --style paper",
+        "aerpaw-cmp report flight.yaml --export geopackage,kmz",
+        "aerpaw-cmp report flight.yaml --strict --json --quiet",
+    ],
+)
+def report(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    engine: Annotated[
+        Optional[Literal["image", "sionna"]],  # noqa: UP045
+        typer.Option(help="In place of rt.engine."),
+    ] = None,
+    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    recommend: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
+    ] = None,
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    figures: Annotated[
+        Literal["page", "none", "svg", "png", "pdf", "all"],
+        typer.Option(help="What is drawn: what the page shows, nothing, or every figure in one format or in all."),
+    ] = "page",
+    style: Annotated[
+        Literal["screen", "paper"],
+        typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
+    ] = "screen",
+    export: Export = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Replay a flight, calibrate, compare, report."""
+    from ..jobs import run
+
+    outcome = run.run_report(
+        flight,
+        out=out,
+        logs_root=logs_root,
+        engine=engine,
+        audit=audit,
+        recommend=recommend,
+        force=force,
+        export=export or (),
+        figures=figures,
+        style=style,
+        progress=say,
+    )
+    if as_json:
+        print_json(outcome.metrics)
+    else:
+        _print_report_summary(outcome)
+    failed = outcome.failed_checks
+    for check in failed:
+        say.warn(f"check failed: {check}")
+    return 1 if strict and failed else 0
+
+
+_WARNINGS = 10
+"""Warnings of a report that are also said here."""
+
+
+def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
+    """One line per model; over several channels the range of its errors, which the page has one by one."""
+    models = dict.fromkeys(m["model"] for m in ladder)
+    rows = []
+    for model in models:
+        mine = [m for m in ladder if m["model"] == model]
+        errors = [m["rmse_heldout_db"] for m in mine if m["rmse_heldout_db"] is not None]
+        shown = (
+            f"{min(errors):.2f}" if len(errors) == 1 else f"{min(errors):.2f} .. {max(errors):.2f}" if errors else "-"
+        )
+        star = "* " if any(m["recommended"] for m in mine) else ""
+        rows.append([star + model, shown, number(sum(m["seconds"] for m in mine), "{:.1f}")])
+    if rows:
+        heads = ["model", "RMSE dB", "s"]
+        table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")
+
+
+def _print_report_summary(outcome: Any) -> None:
+    rows = []
+    for tower, channels in outcome.metrics["rss"].items():
+        for channel, m in channels.items():
+            ci = m.get("rmse_ci95_db") or [None, None]
+            rows.append(
+                [
+                    tower,
+                    channel,
+                    number(m["offset_db"], "{:.1f}"),
+                    number(m["rmse_db"], "{:.2f}"),
+                    f"{number(ci[0], '{:.2f}')} .. {number(ci[1], '{:.2f}')}",
+                    number(m["baselines"]["free_space"]["rmse_db"], "{:.2f}"),
+                    number(m["baselines"]["two_ray"]["rmse_db"], "{:.2f}"),
+                    number(m["correlation"], "{:.2f}"),
+                    str(m["n"]),
+                    str(m["n_out_of_coverage"]),
+                ]
+            )
+    if rows:
+        table(
+            ["tower", "channel", "offset dB", "RMSE dB", "95 %", "free space", "two-ray", "corr.", "n", "out of cov."],
+            rows,
+            "RSS, measured against replayed",
+        )
+    _print_ladder(outcome.metrics.get("ladder", ()))
+    rows = []
+    for tower, m in outcome.metrics["rank"].items():
+        for k, s in m["simulated"].items():
+            rows.append(
+                [tower, k, number(s["agreement"], "{:.3f}"), number(s["total_variation"], "{:.3f}"), str(m["n"])]
+            )
+    if rows:
+        table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
+    warnings = [one_line(text) for text in outcome.metrics["warnings"]]
+    for text in warnings[:_WARNINGS]:
+        say.warn(f"warning: {text}")
+    if len(warnings) > _WARNINGS:
+        say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
+    print(f"report: {outcome.folder / 'report.html'}")
+
+
+@command(
+    "calibrate",
+    examples=[
+        "aerpaw-cmp calibrate calibration.yaml -o learned.yaml",
+        "aerpaw-cmp calibrate calibration.yaml --logs-root /data/flights --json",
+    ],
+)
+def calibrate(
+    calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Learn antennas and ground from several flights."""
+    from ..jobs import run
+
+    outcome = run.run_calibrate(calibration_yaml, out=out, logs_root=logs_root, force=force, progress=say)
+    if as_json:
+        print_json(outcome.metrics)
+        return
+    m = outcome.metrics
+    rows = []
+    for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
+        means = [sum(s[key] for s in scores) / len(scores) if scores else None
+                 for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
+        rows.append([name.replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))])
+    if rows:
+        heads = ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"]
+        table(heads, rows, "Scores on what was left out, means")
+    rows = [
+        [split.replace("_", " "), one["flight"], one["tower"], number(one["kappa"], "{:.3f}"),
+         number(one["agreement"], "{:.3f}"), number(one["majority_agreement"], "{:.3f}"),
+         number(one["log_score"], "{:.3f}"), number(one["constant_log_score"], "{:.3f}"),
+         number(one["total_variation_expected"], "{:.3f}")]
+        for split, scores in m["rank"].items()
+        for one in scores
+    ]  # fmt: skip
+    if rows:
+        heads = ["left out", "flight", "tower", "kappa", "agree", "commonest", "log score", "constant", "TV"]
+        table(heads, rows, "Rank on what was left out")
+    for text in [*m["words"], *m["warnings"]]:
+        print(text)
+    print(outcome.file)
+    page = outcome.folder / "calibration.html"
+    print(page if page.exists() else outcome.folder)
+
+
+@command(
+    "simulate",
+    examples=[
+        "aerpaw-cmp simulate plan/flight.yaml",
+        "aerpaw-cmp simulate plan/flight.yaml -o planned_logs --json",
+    ],
+)
+def simulate(
+    flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
+    out: Out = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Forward-simulate a planned flight into logs of the real formats."""
+    from ..jobs import run
+
+    print_files(run.run_simulate(flight, out=out, force=force, progress=say), as_json)
+
+
+@command(
+    "sample",
+    examples=[
+        "aerpaw-cmp sample",
+        "aerpaw-cmp sample -o try_it",
+    ],
+)
+def sample(
+    out: Annotated[Path, typer.Option("-o", "--out", help="Folder that gets flight.yaml and the logs.")] = Path(
+        "sample"
+    ),
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Copy the sample flight into a folder of your own."""
+    from ..jobs.sample import write_sample
+
+    flight = write_sample(out, force=force)
+    if as_json:
+        print_json({"flight": str(flight)})
+        return
+    print(f"flight: {flight}")
+    print(f"next: aerpaw-cmp report {flight}")

@@ -1,0 +1,90 @@
+"""``ingest``, ``formats``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+import typer
+
+from .app import Force, Json, Out, command
+from .shown import print_json, say, table
+
+
+@command(
+    "ingest",
+    examples=[
+        "aerpaw-cmp ingest my_logs/ -o flight.h5",
+        "aerpaw-cmp ingest my_logs/ --timezone America/New_York --draft flight.yaml",
+        "aerpaw-cmp ingest levels.csv --map time=time --map power_dbm=rss_db --unit dBm --json",
+    ],
+)
+def ingest(
+    paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
+    out: Out = None,
+    draft: Annotated[Optional[Path], typer.Option(help="Also write a first flight.yaml that names these logs.")] = None,  # noqa: UP045
+    reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
+    timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
+    time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
+    ri_base: Annotated[
+        Optional[Literal["zero", "one"]],  # noqa: UP045
+        typer.Option(help="What the source prints for rank 1."),
+    ] = None,
+    columns: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
+    ] = None,
+    unit: Annotated[Optional[str], typer.Option(help="Unit of levels where the file does not fix it.")] = None,  # noqa: UP045
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Read logs, account for every line, write the flight file."""
+    from ..jobs import run
+    from ..logs.ingest import ACCOUNT, account_notes, account_rows
+
+    options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
+    if columns:
+        options |= run.mapping(columns)
+        reader = reader or "generic_csv"
+    summary = run.run_ingest(paths, out=out, draft=draft, reader=reader, force=force, **options)
+    if as_json:
+        print_json(summary)
+        return
+    folder, rows = account_rows(summary)
+    table(list(ACCOUNT), rows, f"files below {folder}" if folder else None)
+    for note in account_notes(summary):
+        say(note)
+    if out is not None:
+        print(f"wrote {out}")
+    if draft is not None:
+        for remark in summary["draft"]:
+            say(remark)
+        for place in summary["drafts"]:
+            print(f"wrote {place}")
+
+
+@command(
+    "formats",
+    examples=[
+        "aerpaw-cmp formats",
+        "aerpaw-cmp formats --json",
+    ],
+)
+def formats(as_json: Json = False) -> None:
+    """List the readers with a sample line each."""
+    from ..logs.readers import catalogue
+
+    readers = sorted(catalogue(), key=lambda r: r.name)
+    if as_json:
+        print_json(
+            {
+                "readers": [
+                    {"name": r.name, "title": r.title, "kinds": list(r.kinds), "sample": r.sample} for r in readers
+                ]
+            }
+        )
+        return
+    table(
+        ["reader", "what", "streams", "a line of it"],
+        [[r.name, r.title, ", ".join(r.kinds), r.sample] for r in readers],
+    )

@@ -1,0 +1,133 @@
+"""What the commands print: progress, tables, JSON."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+class ProgressLines:
+    """Progress on standard error, so that standard output stays clean.
+
+    On a terminal a share is a bar with the time left; elsewhere every quarter is a line. With ``quiet`` nothing is
+    said but what :meth:`warn` gets.
+    """
+
+    def __init__(self) -> None:
+        self._bar: Any = None
+        self._quarters: dict[str, int] = {}
+        self.quiet = False
+
+    def __call__(self, text: str, fraction: float | None = None, /) -> None:
+        """Show a line, or how far something is."""
+        if self.quiet:
+            return
+        if fraction is None:
+            self.warn(text)
+        elif sys.stderr.isatty():
+            self._draw(text, fraction)
+        elif int(4 * fraction) > self._quarters.get(text, 0):
+            self._quarters[text] = int(4 * fraction)
+            print(f"{text} {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Show a line, also where all else is quiet."""
+        self.end()
+        print(text, file=sys.stderr, flush=True)
+
+    def _draw(self, text: str, fraction: float) -> None:
+        if self._bar is None or self._bar.tasks[0].description != text:
+            self.end()
+            self._bar = _bar()
+            self._bar.add_task(text, total=1.0)
+            self._bar.start()
+        self._bar.update(self._bar.tasks[0].id, completed=fraction)
+        if fraction >= 1.0:
+            self.end()
+
+    def end(self) -> None:
+        """Leave the bar as it stands."""
+        if self._bar is not None:
+            self._bar.stop()
+            self._bar = None
+
+
+def _bar() -> Any:
+    from rich import progress
+    from rich.console import Console
+
+    columns = (
+        progress.TextColumn("{task.description}", markup=False),
+        progress.BarColumn(),
+        progress.TaskProgressColumn(),
+        progress.TimeRemainingColumn(compact=True, elapsed_when_finished=True),
+    )
+    return progress.Progress(*columns, console=Console(stderr=True))
+
+
+say = ProgressLines()
+"""What all commands of this process say on standard error."""
+
+
+def print_json(value: dict[str, Any]) -> None:
+    """One object on standard output."""
+    print(json.dumps(value, indent=1, allow_nan=False), flush=True)
+
+
+def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
+    """What was written: a line each, or one object."""
+    if as_json:
+        print_json({"files": [str(path) for path in paths]})
+        return
+    for path in paths:
+        print(path)
+
+
+_FIXED = 20
+"""Columns up to this width (numbers, times) are never broken."""
+
+
+def table(columns: list[str], rows: list[list[str]], title: str | None = None, width: int | None = None) -> None:
+    """A table; where the terminal is too narrow for it, a paragraph per row."""
+    from rich.cells import cell_len
+    from rich.console import Console
+    from rich.table import Table
+
+    console = Console(width=width if width or sys.stdout.isatty() else 160)
+    needs = [max(map(cell_len, [*name.split(), *(row[i] for row in rows)])) for i, name in enumerate(columns)]
+    roomy = sum(max(need, cell_len(name)) + 3 for need, name in zip(needs, columns, strict=True)) < console.width
+    if sum(min(need, _FIXED) + 3 for need in needs) + 1 > console.width:
+        _paragraphs(columns, rows, title, console.width)
+        return
+    table = Table(title=title, title_justify="left")
+    for column, need in zip(columns, needs, strict=True):
+        table.add_column(column, overflow="fold", width=None if roomy or need > _FIXED else need)
+    for row in rows:
+        table.add_row(*[cell.replace("[", r"\[") for cell in row])
+    console.print(table)
+
+
+def _paragraphs(columns: list[str], rows: list[list[str]], title: str | None, width: int) -> None:
+    """Rows as text: the first cell, then names and values."""
+    import textwrap
+
+    if title:
+        print(title)
+    for row in rows:
+        lines = [""]
+        for name, cell in zip(columns[1:], row[1:], strict=True):
+            item = f"{name} {cell}"
+            if lines[-1] and len(lines[-1]) + len(item) + 7 > width:  # 7: indent and separator
+                lines.append("")
+            lines[-1] += f" | {item}" if lines[-1] else item
+        print(row[0])
+        for line in lines:
+            print(textwrap.fill(line, width, initial_indent="    ", subsequent_indent="      ", break_on_hyphens=False))
+
+
+def number(value: float | None, form: str) -> str:
+    """A number as ``form`` says, a dash where there is none."""
+    return "-" if value is None else form.format(value)

@@ -1,0 +1,157 @@
+"""``site import``, ``site show``, ``map``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal, Optional
+
+import typer
+
+from .app import Force, Json, LogsRoot, Out, command, site_app
+from .shown import print_files, print_json, say, table
+
+
+@command(
+    "import",
+    of=site_app,
+    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.",
+    examples=[
+        "aerpaw-cmp site import farm.osm -o site.yaml",
+        "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
+    ],
+)
+def site_import(
+    files: Annotated[list[Path], typer.Argument(help="Map files.")],
+    out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
+    base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
+    untagged: Annotated[
+        Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
+        typer.Option(help="What areas without a tag are."),
+    ] = None,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Import footprints."""
+    from ..jobs import run
+
+    actions = run.run_site_import(files, out, base=base, untagged=untagged, force=force)
+    if as_json:
+        print_json({"file": str(out), "base": base, "actions": actions})
+        return
+    for line in actions:
+        say(line)
+    print(out)
+
+
+@command(
+    "show",
+    of=site_app,
+    text="Plan view, 3-D picture and a standalone page of a site.",
+    examples=[
+        "aerpaw-cmp site show",
+        "aerpaw-cmp site show site.yaml -o reports/site --export",
+        "aerpaw-cmp site show --flight sample_logs/flight.yaml --pose 60",
+    ],
+)
+def site_show(
+    site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
+    out: Out = None,
+    flight: Annotated[Optional[Path], typer.Option(help="Draw the track of this flight.yaml.")] = None,  # noqa: UP045
+    logs_root: LogsRoot = None,
+    pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
+    export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Look at a site."""
+    from ..jobs import run
+
+    shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
+    print_files(shown, as_json)
+
+
+@command(
+    "map",
+    examples=[
+        "aerpaw-cmp map --quick",
+        "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
+        "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
+    ],
+)
+def map_(
+    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
+    out: Out = None,
+    quick: Annotated[bool, typer.Option("--quick", help="A coarse map in seconds: 120 m, three heights.")] = False,
+    foliage: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="none, attenuating, opaque or all; may be repeated. Default: all."),
+    ] = None,
+    crown_reflections: Annotated[
+        bool, typer.Option("--crown-reflections/--no-crown-reflections", help="Opaque crowns reflect, too.")
+    ] = True,
+    spacing: Annotated[Optional[float], typer.Option(help="Between positions [m]. Default: 30.")] = None,  # noqa: UP045
+    rss_altitude: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of RSS maps [m]; may be repeated. Default: 30, 70, 110."),
+    ] = None,
+    rank_altitude: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option(help="Height of rank maps [m]; may be repeated. Default: 3 and 30 to 110 by 10."),
+    ] = None,
+    k: Annotated[
+        Optional[list[float]],  # noqa: UP045
+        typer.Option("-k", "--k", help="Singular-value ratio; may be repeated. Default: 10, 100, 1000."),
+    ] = None,
+    carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
+    engine: Annotated[
+        Optional[Literal["image", "sionna"]],  # noqa: UP045
+        typer.Option(help="Default: image."),
+    ] = None,
+    max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
+    samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
+    flight: Annotated[
+        Optional[Path],  # noqa: UP045
+        typer.Option(help="flight.yaml whose track trains the test 'along a flight'."),
+    ] = None,
+    logs_root: LogsRoot = None,
+    threshold_dbm: Annotated[
+        Optional[float],  # noqa: UP045
+        typer.Option(help="A level below it is out of coverage. Default: only no path is."),
+    ] = None,
+    study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Coverage and rank maps of a site, Kriging of rank."""
+    from ..jobs import run
+
+    modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
+    outcome = run.run_map(
+        site,
+        out=out,
+        quick=quick,
+        flight=flight,
+        logs_root=logs_root,
+        force=force,
+        progress=say,
+        foliage=modes,
+        crown_reflections=crown_reflections,
+        spacing_m=spacing,
+        rss_altitudes_m=tuple(sorted(set(rss_altitude))) if rss_altitude else None,
+        rank_altitudes_m=tuple(sorted(set(rank_altitude))) if rank_altitude else None,
+        ks=tuple(sorted(set(k))) if k else None,
+        carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
+        engine=engine,
+        max_depth=max_depth,
+        samples=samples,
+        threshold_dbm=threshold_dbm,
+        study=study,
+    )
+    if as_json:
+        print_json(outcome.metrics)
+        return
+    rows = [[p["where"], p["what"], p["paper"], p["ours"]] for p in outcome.metrics["paper"]]
+    table(["where", "what", "paper", "here"], rows, "What the paper states, and what this run gives")
+    for path in outcome.files:
+        if path.parent == outcome.folder:
+            print(path)

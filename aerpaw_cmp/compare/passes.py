@@ -1,0 +1,319 @@
+"""Many flights over the same places: what each pair of passes differs by, every pair of a season at once.
+
+One pair by itself is :func:`~aerpaw_cmp.compare.statistics.repeatability`; of 200 flights with ten links there are
+199 000, so here each flight's places are put into one k-d tree, pairs of flights whose boxes lie apart are not
+searched, links that were sampled together share one search, and intervals come in closed form.
+"""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
+from .statistics import NO_INTERVAL, Interval, autocorrelation, correlation, of_spread
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Pass:
+    """One flight on one link.
+
+    Parameters
+    ----------
+    flight, link : str
+        Passes of one link and of two flights are compared.
+    position_m : ndarray, (n, 3)
+        East, north, up; rows with NaN pair with nothing.
+    level_db, residual_db : ndarray, (n,)
+        Measurement, and measurement minus simulation; NaN where there is none.
+    heading_deg : ndarray, (n,), optional
+        Clockwise from north.
+    """
+
+    flight: str
+    link: str
+    position_m: FloatArray = field(repr=False)
+    level_db: FloatArray = field(repr=False)
+    residual_db: FloatArray = field(repr=False)
+    heading_deg: FloatArray | None = field(repr=False, default=None)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PassPair:
+    """Two passes of one link; ``first`` and ``second`` count the passes as they were given.
+
+    Parameters
+    ----------
+    n : int
+        Samples of the first pass that have a partner.
+    rmse_db, offset_db : float
+        Standard deviation and mean of second minus first; NaN without a pair.
+    rmse_ci95_db : (low, high)
+        Of the RMSE (:func:`spread_interval`).
+    residual_rmse_db : float
+        The same of the residuals.
+    place_rmse_db, place_correlation, height_difference_m : float
+        Of the mean residuals, and the median difference of the mean heights, over the cells that both have.
+    cells : int
+        Those cells.
+    """
+
+    first: int
+    second: int
+    n: int
+    rmse_db: float
+    offset_db: float
+    rmse_ci95_db: Interval
+    residual_rmse_db: float
+    place_rmse_db: float
+    place_correlation: float
+    cells: int
+    height_difference_m: float
+
+
+def spread_interval(difference_db: FloatArray) -> Interval:
+    """95 % interval of the standard deviation of differences in time order.
+
+    Parameters
+    ----------
+    difference_db : ndarray, (n,)
+        Without NaN [dB].
+
+    Returns
+    -------
+    (low, high)
+        NaN where the samples are worth too few independent ones.
+
+    Notes
+    -----
+    What the circular block bootstrap of :func:`~aerpaw_cmp.compare.statistics.error_intervals` tends to with ever
+    more replicates, without drawing any: a resample is a sum of independent blocks, so the variances of the mean m
+    and of the mean square s are (b Var(S_L) + Var(S_l)) / n^2, with S_L the sums of blocks of length L from every
+    start, b of them, and one of the length l that is left. To second order,
+
+        log rmse = (log(s - m^2)) / 2 = (log s0 + (s - s0) / s0 - (s - s0)^2 / (2 s0^2) - m^2 / s0) / 2.
+    """
+    if len(difference_db) < 2:
+        return NO_INTERVAL
+    d = difference_db - difference_db.mean()
+    squared = d * d
+    mean_square = float(squared.mean())
+    if not mean_square > 0:
+        return NO_INTERVAL
+    known = of_spread(autocorrelation(d), autocorrelation(squared))
+    if not known.enough:
+        return NO_INTERVAL
+    of_mean, of_square = (_variance_of_mean(x, known.block_length) for x in (d, squared))
+    bias = -0.5 * (of_mean / mean_square + 0.5 * of_square / mean_square**2)
+    reach = known.half_width * 0.5 * float(np.sqrt(of_square)) / mean_square
+    value = 0.5 * float(np.log(mean_square))
+    low, high = (float(np.exp(value - bias + sign * reach)) for sign in (-1.0, 1.0))
+    rmse = float(np.sqrt(mean_square))
+    return min(low, rmse), max(high, rmse)
+
+
+def _variance_of_mean(values: FloatArray, length: int) -> float:
+    """Variance of the mean of a circular block resample."""
+    n = len(values)
+    running = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[:length]]))])
+    blocks = -(-n // length)
+    rest = n - (blocks - 1) * length
+    whole, last = running[length : length + n] - running[:n], running[rest : rest + n] - running[:n]
+    return float(((blocks - 1) * whole.var() + last.var()) / n**2)
+
+
+# --- every pair -----------------------------------------------------------------------------------------------------
+
+
+class _Places:
+    """Samples that have a place and a value, their tree and their box; ``where`` are their numbers in the pass."""
+
+    def __init__(self, position_m: FloatArray, heading_deg: FloatArray | None, where: IntArray) -> None:
+        self.where = where
+        self.position_m = np.ascontiguousarray(position_m[where])
+        self.heading_deg = None if heading_deg is None else heading_deg[where]
+        empty = not len(where)
+        self.low = np.full(3, np.inf) if empty else self.position_m.min(axis=0)
+        self.high = np.full(3, -np.inf) if empty else self.position_m.max(axis=0)
+        self._tree: Any = None
+
+    @property
+    def tree(self) -> Any:
+        if self._tree is None:
+            from scipy.spatial import cKDTree
+
+            self._tree = cKDTree(self.position_m)
+        return self._tree
+
+    def partners(self, other: _Places, radius_m: float, within_deg: float | None) -> tuple[IntArray, IntArray]:
+        """Numbers, in both passes, of samples and the nearest ones of the other pass; headings agree."""
+        near = np.flatnonzero(
+            ((self.position_m >= other.low - radius_m) & (self.position_m <= other.high + radius_m)).all(axis=1)
+        )
+        if not len(near):
+            return near, near
+        distance, nearest = other.tree.query(self.position_m[near], distance_upper_bound=radius_m)
+        paired = np.isfinite(distance)
+        here, there = near[paired], nearest[paired]
+        if within_deg is not None and self.heading_deg is not None and other.heading_deg is not None:
+            turn = wrap_degrees(other.heading_deg[there] - self.heading_deg[here])
+            same = np.abs(turn) <= within_deg
+            here, there = here[same], there[same]
+        return self.where[here], other.where[there]
+
+
+@dataclass(slots=True)
+class _Prepared:
+    """A pass ready to be paired: places of levels and of residuals (by key), and means by cell."""
+
+    one: Pass
+    level: bytes
+    residual: bytes
+    cells: IntArray
+    means: FloatArray
+    heights: FloatArray
+
+
+def pass_pairs(
+    passes: Sequence[Pass],
+    *,
+    radius_m: float,
+    heading_within_deg: float | None,
+    cell_m: float,
+    first_flights: Iterable[str] | None = None,
+) -> Iterator[PassPair]:
+    """Every pair of two flights' passes on one link.
+
+    Parameters
+    ----------
+    passes : sequence of Pass
+    radius_m : float
+        A sample of the first pass pairs with the nearest one of the second within this distance.
+    heading_within_deg : float, optional
+        Headings of a pair agree within this, where both passes have headings; None: any heading.
+    cell_m : float
+        Edge of the cells of the plan.
+    first_flights : iterable of str, optional
+        Only pairs whose first flight is one of these: shares of the work that can be done side by side.
+
+    Yields
+    ------
+    PassPair
+        By first flight, second flight and link, each in the order given.
+    """
+    places: dict[bytes, _Places] = {}
+    by_flight: dict[str, list[tuple[int, _Prepared]]] = {}
+    for number, one in enumerate(passes):
+        by_flight.setdefault(one.flight, []).append((number, _prepare(one, cell_m, places)))
+    names = list(by_flight)
+    chosen = set(names if first_flights is None else first_flights)
+    for i, first in enumerate(names):
+        for second in names[i + 1 :] if first in chosen else ():
+            found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
+            shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
+            partners: dict[str, list[tuple[int, _Prepared]]] = {}
+            for number, entry in by_flight[second]:
+                partners.setdefault(entry.one.link, []).append((number, entry))
+            for number, here in by_flight[first]:
+                for other, there in partners.get(here.one.link, ()):
+                    yield _pair(number, here, other, there, places, found, shared, (radius_m, heading_within_deg))
+
+
+def _prepare(one: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:
+    placed = np.isfinite(one.position_m).all(axis=1)
+    scored = placed & np.isfinite(one.residual_db)
+    cells, means, heights = cell_means(one.position_m, one.residual_db, scored, cell_m)
+    return _Prepared(
+        one=one,
+        level=_entered(one, placed & np.isfinite(one.level_db), places),
+        residual=_entered(one, scored, places),
+        cells=cells,
+        means=means,
+        heights=heights,
+    )
+
+
+def _entered(one: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
+    """Key of the places of some samples: links that were sampled together have one."""
+    digest = hashlib.blake2b(good.tobytes(), digest_size=16)
+    digest.update(np.ascontiguousarray(one.position_m).tobytes())
+    if one.heading_deg is not None:
+        digest.update(np.ascontiguousarray(one.heading_deg).tobytes())
+    key = digest.digest()
+    if key not in places:
+        places[key] = _Places(one.position_m, one.heading_deg, np.flatnonzero(good))
+    return key
+
+
+def cell_means(
+    position_m: FloatArray, residual_db: FloatArray, good: BoolArray, cell_m: float
+) -> tuple[IntArray, FloatArray, FloatArray]:
+    """Squares of the plan that have a sample: (c, 2) numbers east and north in order, mean residual, mean height.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+    residual_db : (n,)
+    good : (n,) bool
+        Samples that count.
+    cell_m : float
+        Side of a square [m].
+    """
+    cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
+    found, which = np.unique(cells, axis=0, return_inverse=True)
+    which = which.reshape(-1)
+    count = np.maximum(np.bincount(which, minlength=len(found)), 1)
+    residual = np.bincount(which, weights=residual_db[good], minlength=len(found)) / count
+    height = np.bincount(which, weights=position_m[good, 2], minlength=len(found)) / count
+    return found, residual, height
+
+
+def _pair(
+    first: int,
+    here: _Prepared,
+    second: int,
+    there: _Prepared,
+    places: dict[bytes, _Places],
+    found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]],
+    shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
+    rule: tuple[float, float | None],
+) -> PassPair:
+    def difference(one: bytes, two: bytes, a: FloatArray, b: FloatArray) -> FloatArray:
+        if (one, two) not in found:
+            found[one, two] = places[one].partners(places[two], *rule)
+        i, j = found[one, two]
+        return b[j] - a[i]
+
+    level = difference(here.level, there.level, here.one.level_db, there.one.level_db)
+    residual = difference(here.residual, there.residual, here.one.residual_db, there.one.residual_db)
+    cells = here.residual, there.residual  # the same places, so the same cells and heights
+    if cells not in shared:
+        i, j = _common(here.cells, there.cells)
+        height = float(np.median(there.heights[j] - here.heights[i])) if len(i) else float("nan")
+        shared[cells] = i, j, height
+    i, j, height = shared[cells]
+    change, nan = there.means[j] - here.means[i], float("nan")
+    return PassPair(
+        first=first,
+        second=second,
+        n=len(level),
+        rmse_db=float(level.std()) if len(level) else nan,
+        offset_db=float(level.mean()) if len(level) else nan,
+        rmse_ci95_db=spread_interval(level),
+        residual_rmse_db=float(residual.std()) if len(residual) else nan,
+        place_rmse_db=float(change.std()) if len(i) else nan,
+        place_correlation=correlation(here.means[i], there.means[j]),
+        cells=len(i),
+        height_difference_m=height,
+    )
+
+
+def _common(one: IntArray, two: IntArray) -> tuple[IntArray, IntArray]:
+    """Rows of both that name the same cell, in the order of the cells (both are sorted and have each cell once)."""
+    a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (one, two))
+    _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
+    return i, j

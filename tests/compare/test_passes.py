@@ -1,0 +1,135 @@
+"""Every pair of a season's passes: those of brute force, exactly; intervals as the bootstrap gives them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.passes import Pass, pass_pairs, spread_interval
+from aerpaw_cmp.compare.statistics import correlation, error_intervals
+
+RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
+FLIGHTS, LINKS, SAMPLES = 7, 3, 160
+
+
+def season(seed: int = 0) -> list[Pass]:
+    """Lawnmower routes at two heights, each flight a metre or two off; links sampled together but for NaN of their own."""
+    rng = np.random.default_rng(seed)
+    share = np.linspace(0.0, 1.0, SAMPLES)
+    leg, along = np.floor(share * 4), (share * 4) % 1
+    along = np.where(leg % 2 == 0, along, 1 - along)
+    passes = []
+    for flight in range(FLIGHTS):
+        away = rng.normal(0.0, 1.0, 3)
+        place = np.column_stack([along * 120 - 60, leg * 25, np.full(SAMPLES, 30.0 + 20.0 * (flight % 2))])
+        place = place + away + rng.normal(0.0, 0.5, place.shape)
+        place[5] = np.nan
+        heading = np.where(leg % 2 == 0, 90.0, 270.0) + rng.normal(0.0, 12.0, SAMPLES)
+        for link in range(LINKS):
+            level = -70.0 + rng.normal(0.0, 2.0, SAMPLES)
+            residual = level + 70.0
+            level[rng.random(SAMPLES) < 0.1] = np.nan
+            residual[rng.random(SAMPLES) < 0.1] = np.nan
+            passes.append(
+                Pass(
+                    flight=f"f{flight}",
+                    link=f"l{link}",
+                    position_m=place,
+                    level_db=level,
+                    residual_db=residual,
+                    heading_deg=None if flight == 3 else heading,
+                )
+            )
+    return passes
+
+
+def brute_force(one: Pass, two: Pass, first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """Second minus first, by a table of all distances."""
+    i = np.flatnonzero(np.isfinite(first) & np.isfinite(one.position_m).all(axis=1))
+    j = np.flatnonzero(np.isfinite(second) & np.isfinite(two.position_m).all(axis=1))
+    distance = np.linalg.norm(one.position_m[i][:, None] - two.position_m[j][None], axis=2)
+    out = []
+    for row, nearest in enumerate(distance.argmin(axis=1)):
+        if distance[row, nearest] >= RADIUS_M:
+            continue
+        if one.heading_deg is not None and two.heading_deg is not None:
+            turn = (two.heading_deg[j[nearest]] - one.heading_deg[i[row]] + 180.0) % 360.0 - 180.0
+            if abs(turn) > WITHIN_DEG:
+                continue
+        out.append(second[j[nearest]] - first[i[row]])
+    return np.array(out)
+
+
+def cells(one: Pass) -> dict[tuple[int, int], tuple[float, float]]:
+    found: dict[tuple[int, int], list[tuple[float, float]]] = {}
+    for place, residual in zip(one.position_m, one.residual_db, strict=True):
+        if np.isfinite(residual) and np.isfinite(place).all():
+            cell = (int(place[0] // CELL_M), int(place[1] // CELL_M))
+            found.setdefault(cell, []).append((float(residual), float(place[2])))
+    return {cell: tuple(np.mean(found[cell], axis=0)) for cell in sorted(found)}
+
+
+def test_the_pairs_are_those_of_brute_force() -> None:
+    """Numbers, not only counts: one wrong partner among the samples changes mean and deviation."""
+    passes = season()
+    found = {
+        (p.first, p.second): p
+        for p in pass_pairs(passes, radius_m=RADIUS_M, heading_within_deg=WITHIN_DEG, cell_m=CELL_M)
+    }
+    expected = [
+        (i, j)
+        for i, one in enumerate(passes)
+        for j, two in enumerate(passes)
+        if i < j and one.link == two.link and one.flight != two.flight
+    ]
+    assert sorted(found) == sorted(expected)
+    assert any(p.n == 0 for p in found.values())
+    assert sum(p.n > 50 for p in found.values()) > 10
+    for (i, j), pair in found.items():
+        one, two = passes[i], passes[j]
+        level = brute_force(one, two, one.level_db, two.level_db)
+        residual = brute_force(one, two, one.residual_db, two.residual_db)
+        assert pair.n == len(level)
+        if pair.n:
+            assert (pair.rmse_db, pair.offset_db) == (level.std(), level.mean())
+        if len(residual):
+            assert pair.residual_rmse_db == residual.std()
+        here, there = cells(one), cells(two)
+        both = [c for c in here if c in there]
+        assert pair.cells == len(both)
+        table = np.array([(*here[c], *there[c]) for c in both])
+        assert pair.place_correlation == pytest.approx(correlation(table[:, 0], table[:, 2]), nan_ok=True)
+        assert pair.place_rmse_db == pytest.approx((table[:, 2] - table[:, 0]).std())
+        assert pair.height_difference_m == pytest.approx(np.median(table[:, 3] - table[:, 1]))
+
+
+def test_shares_of_the_work_make_the_whole() -> None:
+    passes, rule = season(1), {"radius_m": RADIUS_M, "heading_within_deg": None, "cell_m": CELL_M}
+    whole = list(pass_pairs(passes, **rule))
+    parts = [
+        p
+        for share in (["f0", "f3"], ["f1"], ["f2", "f4", "f5", "f6"])
+        for p in pass_pairs(passes, first_flights=share, **rule)
+    ]
+    assert sorted(map(repr, parts)) == sorted(map(repr, whole))
+
+
+@pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])
+def test_the_closed_interval_is_that_of_the_bootstrap(memory: float) -> None:
+    """Against 4000 resamples of the same blocks: the ends within a twentieth of the width."""
+    rng = np.random.default_rng(3)
+    noise = rng.normal(0.0, 2.0, 3000)
+    x = np.empty(len(noise))
+    x[0] = noise[0]
+    for i in range(1, len(x)):
+        x[i] = memory * x[i - 1] + np.sqrt(1 - memory**2) * noise[i]
+    zero = np.zeros(len(x))
+    low, high = error_intervals(zero, x, replicates=4000).rmse_db
+    found = spread_interval(x)
+    assert found == pytest.approx((low, high), abs=0.05 * (high - low))
+
+
+def test_no_interval_where_there_is_nothing_to_tell_from() -> None:
+    assert np.isnan(spread_interval(np.zeros(0))).all()
+    assert np.isnan(spread_interval(np.ones(50))).all()
+    assert np.isnan(spread_interval(np.cumsum(np.ones(60)))).all()

@@ -11,10 +11,8 @@ Pairs are streamed: memory does not grow with their number.
 
 from __future__ import annotations
 
-import os
 import time
 from collections.abc import Callable, Iterator
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -24,6 +22,7 @@ from numba import njit
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .boxtree import box_missed, box_outside, box_tree, within_planes
+from .compiled import in_threads, thread_count
 from .image import MINIMUM_LENGTH_M, merge
 from .merging import WINDOW
 from .paths import PathSet
@@ -176,7 +175,7 @@ def grow_paths(
                 if progress:
                     progress((tower + done) / len(sources_m))
 
-            parts, spent = one.run(first, threads or usable_cores(), share, told if tower == 0 else None)
+            parts, spent = one.run(first, thread_count(threads), share, told if tower == 0 else None)
             found += [_pad(part, poses, tower, max_depth) for part in parts]
             effort = Effort(
                 sequences=effort.sequences + spent.sequences,
@@ -194,14 +193,6 @@ def grow_paths(
         seconds=time.perf_counter() - started,
         estimate_s=effort.estimate_s,
     )
-
-
-def usable_cores() -> int:
-    """Cores that this process may use; ``AERPAW_CMP_THREADS`` overrides it."""
-    stated = os.environ.get("AERPAW_CMP_THREADS", "")
-    if stated.isdigit() and int(stated) > 0:
-        return int(stated)
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
 def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray | None = None) -> _Mirrors:
@@ -274,14 +265,8 @@ class _Search:
 
         done = 0
         for part, size in _chunks(first, threads):
-            with_pool = threads > 1 and done > 0
-            if with_pool:
-                with ThreadPoolExecutor(threads) as pool:
-                    for result in pool.map(chunk, part):
-                        take(result)
-            else:
-                for some in part:
-                    take(chunk(some))
+            for result in in_threads(chunk, part, threads):
+                take(result)
             done += size
             if done <= FIRST_CHUNK < len(first):
                 _follow_again = time.perf_counter()  # the first call compiles, or loads what was compiled
@@ -827,4 +812,4 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
     return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), counts
 
 
-__all__ = ["Effort", "grow_paths", "reflection_points", "segment_cut", "usable_cores", "without_coincident"]
+__all__ = ["Effort", "grow_paths", "reflection_points", "segment_cut", "without_coincident"]

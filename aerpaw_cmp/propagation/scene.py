@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
+from importlib.util import find_spec
 
 import numpy as np
 
@@ -121,6 +122,12 @@ def surfaces_of(site: Site) -> Surfaces | None:
 @lru_cache(maxsize=2)
 def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
     """Faces of a scene; the same scene is merged once."""
+    if find_spec("numba") is None:
+        raise UsageError(
+            "the site is a scene of triangles, and numba is not installed",
+            expected="pip install 'aerpaw-cmp[fast]'",
+            cause="its thousands of faces are searched by compiled code",
+        )
     from .merging import merged  # compiled: loaded where there is a scene
 
     return merged(scene, merge_m)

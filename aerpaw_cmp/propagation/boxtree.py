@@ -29,7 +29,7 @@ def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
     return BoxTree(*_build(lower, upper, leaf))
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     n = len(lower)
     most = max(1, 2 * n)
@@ -82,7 +82,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many."""
     lower, upper, child, start, count, items = tree
@@ -108,7 +108,7 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
 
@@ -133,7 +133,7 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
     """Whether a box lies wholly outside one of the planes."""
     for p in range(many):
@@ -147,7 +147,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
     """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box."""
     enter, leave = 0.0, 1.0

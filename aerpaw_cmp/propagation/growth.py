@@ -43,6 +43,9 @@ EDGE_M = 1e-6
 GRAZING = 0.05
 """Cosine below which a convex face is not asked whether it hides another one wholly."""
 
+SOLID_MARGIN = 1e-6
+"""Share of a triangle's height by which a segment must meet it to cut it beyond doubt."""
+
 FIRST_CHUNK = 64
 """First faces whose search gives the estimate for the others."""
 
@@ -117,6 +120,7 @@ def grow_paths(
     threads: int | None = None,
     progress: Progress | None = None,
     told: Callable[[str], None] | None = None,
+    solids: bool = False,
 ) -> tuple[PathSet, Effort]:
     """All paths with at most ``max_depth`` reflections.
 
@@ -144,6 +148,9 @@ def grow_paths(
         Called with the share done.
     told : callable, optional
         Called with the estimate of time and memory, after the first faces.
+    solids : bool
+        The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
+        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.prisms`, coincident ones among them.
 
     Returns
     -------
@@ -156,7 +163,8 @@ def grow_paths(
     started = time.perf_counter()
     found: list[PathSet] = []
     effort = Effort()
-    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, 0.0, SIDE_M, beams, float(longest_m), shadows)
+    margin = SOLID_MARGIN if solids else 0.0
+    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, margin, SIDE_M, beams, float(longest_m), shadows)
     for tower, source in enumerate(sources_m):
         gap = np.linalg.norm(targets_m - source, axis=1)
         alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
@@ -165,7 +173,8 @@ def grow_paths(
         poses = np.flatnonzero(alive)
         if not len(poses):
             continue
-        mirrors = _mirrors(surfaces, None if usable is None else usable[tower])
+        front_only = np.full(len(surfaces), solids)
+        mirrors = _mirrors(surfaces, None if usable is None else usable[tower], front_only)
         one = _Search(mirrors, surfaces, np.ascontiguousarray(source), targets_m[poses], rules)
         found.append(_pad(one.direct(), poses, tower, max_depth))
         if max_depth:
@@ -185,7 +194,8 @@ def grow_paths(
             )
         if progress:
             progress((tower + 1) / len(sources_m))
-    paths = without_coincident(merge(found, max_depth, None), surfaces)
+    paths = merge(found, max_depth, None)
+    paths = paths if solids else without_coincident(paths, surfaces)
     return paths, Effort(
         sequences=effort.sequences,
         candidates=effort.candidates,
@@ -378,7 +388,7 @@ def reflection_points(
 # ---------------------------------------------------------------- compiled
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
     normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
     count, depth = sequence.shape
@@ -414,7 +424,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
     return vertices, good
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
     """Whether a triangle cuts the segment ``a`` - ``b``.
 
@@ -423,6 +433,7 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
     """
     lower, upper, child, start, count, items = tree
     clearance, end, margin = rules[1], rules[2], rules[3]
+    edge = margin if margin > 0.0 else -1e-9
     d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
     length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
     inverse = np.empty(3)
@@ -449,15 +460,19 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
             g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
             p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
             det = e0 * p0 + e1 * p1 + e2 * p2
-            if abs(det) < 1e-14 * length:
+            if abs(det) <= 1e-14 * length:
                 continue
+            if margin > 0.0:  # so near to grazing that a tolerance might decide
+                m0, m1, m2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+                if abs(det) < 1e-5 * length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2):
+                    continue
             s0, s1, s2 = a[0] - c[0, 0], a[1] - c[0, 1], a[2] - c[0, 2]
             u = (s0 * p0 + s1 * p1 + s2 * p2) / det
-            if u < margin - 1e-9 or u > 1.0 - margin + 1e-9:
+            if u < edge or u > 1.0 - edge:
                 continue
             q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
             v = (d0 * q0 + d1 * q1 + d2 * q2) / det
-            if v < margin - 1e-9 or u + v > 1.0 - margin + 1e-9:
+            if v < edge or u + v > 1.0 - edge:
                 continue
             t = (g0 * q0 + g1 * q1 + g2 * q2) / det
             if t <= 0.0 or t >= 1.0:
@@ -477,7 +492,7 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     none = np.zeros(3)
@@ -486,12 +501,12 @@ def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-d
     return free
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
     return normal[f, 0] * p[0] + normal[f, 1] * p[1] + normal[f, 2] * p[2] - offset[f]
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
     """Which faces may come first (faces,), and how many of the others are hidden by one convex face."""
     normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
@@ -511,7 +526,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
     return good, hidden
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
     """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
     _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
@@ -543,7 +558,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     """Whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
 
@@ -571,7 +586,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
     """Whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
     for k in range(WINDOW):
@@ -587,7 +602,7 @@ def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     """Side planes of the beam from ``apex`` through an outline, added behind the first ``count``; how many then."""
     m0 = m1 = m2 = 0.0
@@ -616,7 +631,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     """Whether one plane has the whole outline outside."""
     for p in range(many):
@@ -631,7 +646,7 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
     """Whether a point of the plane of face ``f`` lies in one of its triangles."""
     a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
@@ -652,7 +667,7 @@ def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped
     return False
 
 
-@njit(cache=True, nogil=True)
+@njit(cache=True, nogil=True, error_model="numpy")
 def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
     """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
     normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
@@ -765,7 +780,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     if (
                         top < -side
                         or low < -side
-                        or top + low <= side
+                        or top + low <= (side if rules[3] == 0.0 else 1e-12)
                         or (step < level and top <= (side if rules[3] == 0.0 else -side))
                     ):
                         good = False

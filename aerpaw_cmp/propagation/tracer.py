@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -240,6 +241,9 @@ def replay(
     )
 
 
+MANY_FACES = 400
+"""Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
+
 MOST_NAMED = 50
 """Small faces that are named one by one; more are counted."""
 
@@ -451,6 +455,18 @@ def _search(
 
         return grow_paths(
             scene.surfaces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )[0]
+    if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
+        from .prisms import find_paths  # compiled: loaded where there are many faces
+
+        return find_paths(
+            scene.faces,
             scene.sources_m,
             poses.position_m,
             max_depth=settings.max_depth,

@@ -11,6 +11,7 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.propagation import image, prisms
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
 from aerpaw_cmp.propagation.scene import Scene
@@ -184,6 +185,40 @@ def test_a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine(scenes, t
     assert prisms.paths.depth.max() == 2
     assert np.array_equal(*counts)
     assert np.nanmax(np.abs(prisms.rss_dbm - surfaces.rss_dbm)[outside]) < 1e-3  # float32 vertices
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
+    """Random prisms with holes, and boxes on a grid whose walls touch, with ends on faces."""
+    rng = np.random.default_rng(11)
+    if aligned:
+        corners = rng.integers(-4, 4, (8, 2)) * 10
+        buildings = [
+            Building(f"b{k}", box(e, n, e + 10, n + 10), 10.0 * (1 + k % 2)) for k, (e, n) in enumerate(corners)
+        ]
+        spots = rng.integers([-9, -9, 0], [10, 10, 6], (60, 3)) * 5.0
+    else:
+        buildings = scenes.buildings(rng, 8, spread_m=90.0, holes=True)
+        spots = rng.uniform([-120, -120, 0], [120, 120, 40], (60, 3))
+    site = scenes.site(buildings, ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
+    scene, poses = Scene.of(site, scenes.link(site), scenes.poses(spots)), scenes.poses(spots)
+    settings = {"max_depth": 2, "usable": scene.usable, "excluded": scene.excluded}
+    expected = image.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
+    found, _ = prisms.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
+    assert len(expected) > 100
+    assert np.array_equal(found.faces, expected.faces)
+    assert np.array_equal(found.pose, expected.pose)
+
+
+def test_a_thousand_buildings_are_searched_not_refused(scenes):
+    rng = np.random.default_rng(12)
+    spot = rng.uniform(-1500, 1500, (1000, 2))
+    buildings = [
+        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
+    ]
+    site = scenes.site(buildings, ((0.0, 0.0, 30.0),))
+    result = replay(site, scenes.link(site), scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3))))
+    assert (result.paths.depth == 2).sum() > 10
 
 
 def test_what_a_scene_cannot_do_is_said(scenes, tmp_path):

@@ -641,7 +641,8 @@ def run_map(
         generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with output.filling() as part:
             with stages("export"):
-                files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
+                about = {"site": place.name, "generated": generated, "version": versions()["aerpaw-cmp"]}
+                files = mapping.export_maps(outcome, part, about, progress)
             progress("page")
             record = mapping.maps_record(
                 outcome,

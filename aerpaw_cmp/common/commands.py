@@ -15,7 +15,7 @@ COMMANDS: dict[str, str] = {
     "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
     "sample": "Copy the sample flight, logs and flight.yaml, into a folder of your own.",
-    "site": "Make a site of map data or a Mitsuba scene (import), look at one (show), write it for Sionna (export).",
+    "site": "Make a site of maps or of a Mitsuba scene (import), look at it (show), export it.",
     "bench": "Speed against error of the replay on this machine.",
     "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
 }

@@ -7,8 +7,9 @@ Guards against what Sionna RT 2.2.0 does silently:
 
 - its hash table of candidates is shared by all receivers of a call and loses paths: a table of 2**24 slots and
   batches of at most 100 poses;
-- it drops paths past ``max_num_paths_per_src`` and corrupts memory when that is below the number of receivers: the
-  limit is 1e6 and a batch that comes near it is an error;
+- it drops candidates past ``max_num_paths_per_src``, of which most are no paths in the end, and corrupts memory when
+  that is below the number of receivers: its own count of candidates is read after each batch, and a batch that had
+  more than the limit, or filled too much of the table, is searched again with room for them;
 - positions given as numbers recompile kernels: they are arrays, and each batch has the same size (the last is padded);
 - a line of sight must have Friis' amplitude and no path a gain above one, or the run stops.
 """
@@ -16,6 +17,7 @@ Guards against what Sionna RT 2.2.0 does silently:
 from __future__ import annotations
 
 import gc
+import inspect
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -36,6 +38,21 @@ from .surfaces import Surfaces
 
 SPECULAR_TABLE_SLOTS = 2**24
 MAXIMUM_PATHS = 1_000_000
+"""Candidates per tower and batch that there is room for at first."""
+
+MOST_CANDIDATES = 2**25
+"""Room beyond which a batch is refused (some 100 bytes each)."""
+
+FULLEST_TABLE = 1 / 32
+"""Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost."""
+
+MOST_SLOTS = 2**28
+"""Slots of the table, over all towers of a call (two tables of 4 bytes each)."""
+
+RAISE_LIMITS = True
+LAST_CANDIDATES = 0
+"""What the last batch had, for benchmarks."""
+
 LARGEST_BATCH = 100
 NO_SHAPE = 0xFFFFFFFF
 HALF_SPACE_THICKNESS_M = 10.0
@@ -242,10 +259,27 @@ class _Finder:
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
+        self.limit, self.slots, self.candidates = MAXIMUM_PATHS, SPECULAR_TABLE_SLOTS, None
         self.sources = sources.arguments(synthetic)
         self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
         self._replace_endpoints(len(sources.centres_m))
         self.solver = rt.PathSolver()
+        self._watch_candidates()
+
+    def _watch_candidates(self) -> None:
+        """Keep PathSolver's own count of candidates per source, which goes on counting beyond its limit."""
+        generator: Any = getattr(self.solver, "_candidate_generator", None)
+        inner = getattr(generator, "_shoot_and_bounce", None)
+        if inner is None:
+            return  # another release: then the count of valid paths is all there is
+        place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
+
+        def watched(*arguments: Any, **named: Any) -> Any:
+            given = arguments[place] if len(arguments) > place else None
+            self.candidates = named.get("paths_counter_per_source", given)
+            return inner(*arguments, **named)
+
+        generator._shoot_and_bounce = watched
 
     def _replace_endpoints(self, towers: int) -> None:
         """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""
@@ -284,7 +318,7 @@ class _Finder:
         return self.solver(
             self.built.scene,
             max_depth=max_depth,
-            max_num_paths_per_src=MAXIMUM_PATHS,
+            max_num_paths_per_src=self.limit,
             samples_per_src=samples,
             synthetic_array=self.synthetic,
             los=True,
@@ -294,15 +328,43 @@ class _Finder:
             diffraction=False,
         )
 
+    def _more_room(self) -> bool:
+        """Whether the last batch had more candidates than there was room for; then there is room for them now."""
+        from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+
+        global LAST_CANDIDATES
+        most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
+        LAST_CANDIDATES = most
+        slots = self.slots
+        while most > FULLEST_TABLE * slots:
+            slots *= 2
+        slots = max(self.slots, min(slots, MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
+        limit = self.limit
+        while most > limit:
+            limit *= 2
+        if limit > MOST_CANDIDATES:
+            raise CheckError(
+                f"a batch has {most} candidates of a path for one tower, more than PathSolver can hold",
+                expected=f"at most {MOST_CANDIDATES}",
+                cause="take fewer samples or a smaller batch, or engine 'image'",
+            )
+        if (limit, slots) == (self.limit, self.slots):
+            return False
+        self.limit, self.slots = limit, slots
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = slots
+        return True
+
     def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
         """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
+        while max_depth and RAISE_LIMITS and self._more_room():
+            paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
         valid = paths.valid.numpy()
-        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * MAXIMUM_PATHS:
+        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * self.limit:
             raise CheckError(
-                f"a tower has nearly {MAXIMUM_PATHS} paths in one batch, beyond which Sionna drops paths",
+                f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
         return {

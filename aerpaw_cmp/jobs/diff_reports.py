@@ -128,7 +128,7 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=file) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"is no JSON ({one_line(str(error))})", expected="metrics.json of a report", cause="a torn copy", path=file
         ) from None
@@ -142,14 +142,34 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
             expected="metrics.json of `aerpaw-cmp report`",
             path=file,
         )
-    wrong = [k for k in ("rss", "rank") if not isinstance(content[k], dict)]
+    wrong = [] if missing else _misshapen(content)
     if missing or wrong:
-        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is no mapping"
-        made = (content.get("versions") or {}).get("aerpaw-cmp", "unknown")
+        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is not of its kind"
+        versions = content.get("versions")
+        made = versions.get("aerpaw-cmp", "unknown") if isinstance(versions, dict) else "unknown"
         raise InputError(
-            found, expected="a report of this version", cause=f"made by version {made}: run the report again", path=file
+            found,
+            expected="a report of this version",
+            cause=f"made by version {one_line(str(made))}: run the report again",
+            path=file,
         )
     return content
+
+
+def _misshapen(content: Mapping[str, Any]) -> list[str]:
+    """Keys whose value is not of the kind that a report writes."""
+    mappings = ("versions", "settings", "rss", "rank", "stages")
+    wrong = [key for key in mappings if not isinstance(content[key], dict)]
+    inputs = content["inputs"]
+    if not isinstance(inputs, list) or not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in inputs):
+        wrong.append("inputs")
+    if wrong:
+        return wrong
+    for tower in content["rss"].values():
+        links = tower.values() if isinstance(tower, dict) else [None]
+        if not all(isinstance(n, dict) and isinstance(n.get("offset_db"), (float, int, type(None))) for n in links):
+            return ["rss"]
+    return wrong
 
 
 def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
@@ -165,7 +185,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
         if not size:
             raise InputError("is empty", expected="a header at least", cause="a torn copy", path=path)
         texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
-        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], encoding="utf-8")
+        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
     except FileNotFoundError:
         raise InputError("there is no such table", expected=f"{kind}.csv beside metrics.json", path=path) from None
     except OSError as error:
@@ -360,10 +380,23 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
-def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[tuple[FloatArray, FloatArray]]]:
+_Residuals = tuple[FloatArray, FloatArray, FloatArray]
+"""Instants [s] of the common samples of a link, and both residuals."""
+
+
+def _instants(table: Any) -> FloatArray:
+    """Seconds after one instant for all links; without times of day, after each link's first sample."""
+    import pandas as pd
+
+    known = pd.to_datetime(table["time_utc"].replace("", None), utc=True, errors="coerce")
+    seconds = (known - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
+
+
+def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
     found: list[LevelDifference] = []
-    residuals: list[tuple[FloatArray, FloatArray]] = []
+    residuals: list[_Residuals] = []
     if one.rss is None or two.rss is None:
         return found, residuals
     names = ("measured_db", "simulated_dbm", "residual_db")
@@ -377,7 +410,7 @@ def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], li
             first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
             offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
             scored = [int(table["residual_db"].notna().sum()) for table in tables]
-            residuals.append((first[2], second[2]))
+            residuals.append((_instants(a), first[2], second[2]))
             found.append(
                 level_difference(
                     tower, channel, overlap, first, second,

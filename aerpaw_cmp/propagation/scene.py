@@ -39,12 +39,18 @@ class Scene:
         Faces that reflect for each tower.
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
+    extent_m : (points, 3), optional
+        Points that set the tolerance of the path search in place of the poses.
+    pairs : int
+        Element pairs of all links of the replay that this scene is a part of; 0 where it is the whole.
     """
 
     faces: Faces
     sources_m: FloatArray
     usable: BoolArray
     excluded: BoolArray
+    extent_m: FloatArray | None = None
+    pairs: int = 0
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:

@@ -601,10 +601,12 @@ def _evaluate(
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
     above_floor = np.isfinite(level_dbm)
+    h = fields.h
+    h[~above_floor] = 0.0
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=np.where(above_floor[:, :, None, None], fields.h, 0.0),
+        h=h,
         has_path=has_path & above_floor,
         paths=paths,
         faces=scene.faces,

@@ -328,6 +328,19 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
         replay(site, link, poses)
 
 
+@needs_numba
+def test_without_a_folder_to_write_nothing_is_kept(monkeypatch):
+    from aerpaw_cmp.propagation import kernels
+
+    def read_only(*args, **kwargs):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
+    assert not kernels._can_keep()
+    monkeypatch.undo()
+    assert kernels._can_keep()
+
+
 def test_only_large_work_is_compiled(monkeypatch):
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))

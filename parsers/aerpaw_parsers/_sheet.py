@@ -171,13 +171,17 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
 
 
 TIME_NAMES = (
-    r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s)?",
+    r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| iso| unix)?",
     r"(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s)?",
     r"(custom )?(update ?)?time( utc| ms| s| local)?",
     r"time ?millisecond",
     r"t",
 )
 """Names of the column of times, the surest first."""
+
+
+SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
+"""Columns of srsUE's metrics file, whose time counts milliseconds."""
 
 
 def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
@@ -196,7 +200,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     if day is not None and day != column:
         texts = [f"{date} {time}".strip() for date, time in zip(sheet.texts(day), texts, strict=True)]
     name, unit = sheet.plain[column], sheet.unit(column)
-    count = "ms" if unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) else "s"
+    in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
+    count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
     clock, cells, warnings = _stamps.read(texts, options, unit=count)
     if clock == "wall" and utc and len(cells):

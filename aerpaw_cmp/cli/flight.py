@@ -31,7 +31,10 @@ def report(
         Optional[Literal["image", "sionna"]],  # noqa: UP045
         typer.Option(help="In place of rt.engine."),
     ] = None,
-    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    audit: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Number of audited links, 'full', 'none', or 'later' (the command audit fills it in)."),
+    ] = None,
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
@@ -69,10 +72,51 @@ def report(
         print_json(outcome.metrics)
     else:
         _print_report_summary(outcome)
-    failed = outcome.failed_checks
-    for check in failed:
+    return _verdict(outcome, strict)
+
+
+def _verdict(outcome: Any, strict: bool) -> int:
+    """Say each stated check that failed; 1 where that is asked to be a failure."""
+    for check in outcome.failed_checks:
         say.warn(f"check failed: {check}")
-    return 1 if strict and failed else 0
+    return 1 if strict and outcome.failed_checks else 0
+
+
+@command(
+    "audit",
+    examples=[
+        "aerpaw-cmp audit reports/mine",
+        "aerpaw-cmp audit flight.yaml -o reports/mine --strict",
+        "aerpaw-cmp audit reports/mine --links full --json",
+    ],
+)
+def audit(
+    target: Annotated[Path, typer.Argument(metavar="REPORT_OR_FLIGHT", help="A report's folder, or its flight.yaml.")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    links: Annotated[Optional[str], typer.Option(help="Number of audited links, or 'full'.")] = None,  # noqa: UP045
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Fill the audit into a report."""
+    from ..jobs import run
+
+    outcome = run.run_audit(target, out=out, logs_root=logs_root, links=links, force=force, progress=say)
+    if as_json:
+        print_json(outcome.metrics)
+        return _verdict(outcome, strict)
+    found = (outcome.metrics["rt"] or {}).get("audit")
+    if found is None:
+        print("nothing to audit: no link was replayed")
+    else:
+        field = found["field"] or {}
+        print(
+            f"audit: {found['links']} links against {found['reference']}, {found['missing_paths']} paths missing, "
+            f"{found['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
+        )
+    print(f"report: {outcome.folder / 'report.html'}")
+    return _verdict(outcome, strict)
 
 
 _WARNINGS = 10
@@ -136,6 +180,8 @@ def _print_report_summary(outcome: Any) -> None:
     if len(warnings) > _WARNINGS:
         say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
+    if outcome.metrics.get("audit_command"):
+        print(f"next: {outcome.metrics['audit_command']}")
 
 
 @command(

@@ -6,6 +6,7 @@ COMMANDS: dict[str, str] = {
     "ingest": "Read logs of any known format, account for every line, write a flight file.",
     "formats": "List the log formats that can be read, with a sample line of each.",
     "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
+    "audit": "Fill the audit and the table of speed into a report that was written without them.",
     "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
     "calibrate": "Learn antennas from several flights; score them on what was left out.",
     "tap": "Log the rank indicator live from the modem's serial port.",

@@ -238,6 +238,18 @@ def parts_left_out(
 
     ``own``: the rest of the flight is learned from, too. The offset of a part comes from the flight's samples outside
     it, so that nothing of the part is fitted.
+
+    Parameters
+    ----------
+    observed : sequence of Observed
+        Of all flights.
+    recipe : Recipe
+    kept : mapping of str to Learned
+        What was learned without each flight: its strengths are used again.
+    parts : callable
+        :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
+    own : bool
+        Learn from the rest of the flight, too.
     """
     out: list[Score | None] = []
     for flight in spread_flights(flights_of(observed)):

@@ -229,7 +229,25 @@ def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettin
 def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
-    """Sort the streams into track, RSS and rank, and check that they belong together."""
+    """Sort the streams into track, RSS and rank, and check that they belong together.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file.
+    files : sequence of IngestedFile
+        In the order of ``settings.logs``.
+    logs_root : Path, optional
+        Where logs and antenna files resolve, in place of ``folder``.
+
+    Raises
+    ------
+    UsageError
+        A log without a tower, a tower that the site does not have, two records at one time.
+    InputError
+        No position, no row that may be compared, a flight far from every tower.
+    """
     site = with_ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder)
     warnings: list[str] = []
     telemetry: list[tuple[str, Stream]] = []

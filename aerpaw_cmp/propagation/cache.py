@@ -47,7 +47,19 @@ class PathCache:
         self.told: list[str] = []
 
     def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, settings: Settings) -> str:
-        """Digest of everything that decides the paths."""
+        """Digest of everything that decides the paths.
+
+        Parameters
+        ----------
+        scene : Scene
+            Faces, sources and what hides them.
+        targets_m : (n, 3)
+            Poses [m].
+        carrier_hz : float
+            Counts for Sionna alone: an image path is the same at every frequency.
+        settings : Settings
+            Engine, depth, samples and the rest.
+        """
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]
         if settings.engine == "sionna":

@@ -149,6 +149,23 @@ class Sequences:
         """Sequences of depth 0 .. max_depth that geometry does not rule out for any target.
 
         ``box`` are the corners of the faces, ``facing`` which of them can follow which.
+
+        Parameters
+        ----------
+        faces : Faces
+        box : (faces, c, 3)
+            Corners of the faces [m].
+        facing : (faces, faces) bool
+            Which of them can follow which.
+        source : (3,)
+        targets : (n, 3)
+            Ends [m].
+        usable : (faces,) bool
+            Faces that may reflect.
+        max_depth, budget : int
+            Most reflections; most sequences of one depth.
+        tolerance_m : float
+            A point this far behind a face still counts as before it [m].
         """
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]
@@ -288,6 +305,23 @@ def meets_last_face(
 
     The in-plane coordinates of the meeting point are linear in those of the target, which are shared by all
     sequences that end on the face.
+
+    Parameters
+    ----------
+    faces : Faces
+    last : (s,)
+        Last face of each sequence.
+    image : (s, 3)
+        Image of the source in all faces of the sequence [m].
+    targets : (n, 3)
+        [m].
+    tolerance_m : float
+        Bounds are taken this much larger [m].
+
+    Returns
+    -------
+    sequence, target : (m,)
+        Numbers of the pairs that are left.
     """
     used, position = np.unique(last, return_inverse=True)
     height = (faces.normal[used] @ targets.T - faces.offset_m[used, None])[position]

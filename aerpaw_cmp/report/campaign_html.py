@@ -270,6 +270,15 @@ def write_campaign(
 
     With ``exports`` also the samples of the first setting in those formats
     (:data:`aerpaw_cmp.report.exports.write.FORMATS`).
+
+    Parameters
+    ----------
+    data : CampaignData
+    folder : str or Path
+    exports : sequence of str
+        Formats.
+    progress : Progress
+        Figures done.
     """
     folder = Path(folder)
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"

@@ -50,6 +50,13 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 
     Altitudes above sea level are brought to height above the first position; angles are degrees unless the column
     names radians or no yaw of the log is beyond 2 pi.
+
+    Parameters
+    ----------
+    rows : Rows
+    sheet : Sheet
+    name, source : str
+        Of the stream, and where its pose comes from.
     """
     latitude, longitude = sheet.find(*LATITUDE), sheet.find(*LONGITUDE)
     if latitude is None or longitude is None:

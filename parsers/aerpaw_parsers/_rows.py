@@ -329,7 +329,17 @@ def torn(pattern: re.Pattern[bytes], text: str) -> Reason:
 
 
 def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
-    """SNR stream of one tower; levels at or below the floor are out of coverage."""
+    """SNR stream of one tower; levels at or below the floor are out of coverage.
+
+    Parameters
+    ----------
+    rows : Rows
+    tower : str
+    values : (n,)
+        [dB].
+    where : (n,) bool, optional
+        Rows that are of this tower.
+    """
     level, flag = rows.level(values)
     return rows.stream(
         "rss", tower, {"rss_db": level}, where=where, flag=flag, node=tower, channel="snr", unit="dB", quantity="SNR"

@@ -76,7 +76,19 @@ def _labels(book: Any, samples: SampleSet) -> None:
 
 
 def write_text(book: Any, name: str, dimensions: tuple[str, ...], values: AnyArray, meaning: str) -> None:
-    """Text as characters, which every reader of CF takes."""
+    """Text as characters, which every reader of CF takes.
+
+    Parameters
+    ----------
+    book : netCDF4.Dataset
+    name : str
+        Of the variable.
+    dimensions : tuple of str
+    values : (...)
+        Turned into text.
+    meaning : str
+        ``long_name``.
+    """
     encoded = [str(value).encode("utf-8") for value in values.ravel()]
     width = max([1, *map(len, encoded)])
     length = f"{name}_length"

@@ -18,7 +18,7 @@ def _row(data: bytes) -> re.Pattern[bytes]:
     if header is None:
         return re.compile(rb"(?!)(?P<time>)")
     cells = b"".join(rb",(?P<t%d>" % i + _lines.NUMBER + rb"|nan|NaN|-inf|)" for i in range(header[1].count(b",")))
-    return re.compile(rb"^(?P<time>" + _time.TIME + _time.ZONE + rb")" + cells + rb"\r?$", re.MULTILINE)
+    return re.compile(rb"^(?P<time>" + _time.TIME + _time.ZONE + rb")" + cells + rb"[ \t]*\r?$", re.MULTILINE)
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:

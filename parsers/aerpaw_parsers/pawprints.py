@@ -29,7 +29,7 @@ _CONNECTED = tuple(
 
 def sniff(head: bytes) -> bool:
     """Whether the first line is an object with a phone's cells and times."""
-    first = head.split(b"\n", 1)[0]
+    first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]
     return (
         head.lstrip(b"\xef\xbb\xbf[ \r\n").startswith(b"{")
         and b'"abs_time"' in first

@@ -21,7 +21,8 @@ from . import _rows, _text, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + rb")\] *(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?[0-9a-fA-F]{1,5}"
+    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *"
+    rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?[0-9a-fA-F]{1,5}"
     + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
     + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% [^\n]{0,160}$",
     re.MULTILINE,

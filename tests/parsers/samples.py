@@ -557,6 +557,7 @@ NO_LOGS: dict[str, bytes] = {
     "uhd_console": (
         b"[2025-03-02 10:00:00.000001] [INFO] [UHD] linux; GNU C++\n[2025-03-02 10:00:01.000001] [INFO] [B200] Detected\n"
     ),
+    "radio_console": b"[2025-03-02 10:00:00.000001] ---  Software Radio Systems LTE eNodeB  ---\n[2025-03-02 10:00:01] Reading\n",
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",
     "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",

@@ -6,6 +6,7 @@ import os
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -219,7 +220,9 @@ def replay(
         left_out += cache.told if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
-    if crowns is not None:
+    if crowns is not None and scene.surfaces is not None:
+        left_out += ["reflections off crowns: they are not searched in a scene of triangles"]
+    elif crowns is not None:
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
@@ -237,6 +240,12 @@ def replay(
         samples_reason=choice.reason if choice else "",
     )
 
+
+MANY_FACES = 400
+"""Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
+
+MOST_NAMED = 50
+"""Small faces that are named one by one; more are counted."""
 
 PAIRS_DIFFER = 1e-9
 """Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
@@ -276,7 +285,7 @@ def _by_pairs(
         one = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
         paths, _ = _above_terrain(site, several, spots, _search(several, one, spots, settings, None))
         found = several
-        if crowns is not None:
+        if crowns is not None and several.surfaces is None:
             found, bounces = several.with_bounces(site, spots, crowns, settings.max_depth)
             paths = image.merge([paths, bounces], settings.max_depth, None)
         loss_db = None if loss is None else loss(paths, found.sources_m, spots.position_m)
@@ -360,8 +369,11 @@ def _buried_towers(site: Site, link: Link) -> list[str]:
 def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
     """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
     good = np.isfinite(poses.position_m).all(axis=1)
-    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
+    area = None if scene.surfaces is None else scene.surfaces.area_m2
+    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz, area)
     left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
+    if len(left_out) > MOST_NAMED:
+        left_out = [f"{len(left_out)} faces smaller than the first Fresnel zone, such as {left_out[0].split(':')[0]}"]
     return replace(scene, usable=scene.usable & ~small), left_out
 
 
@@ -440,6 +452,30 @@ def _search(
     progress: Callable[[float], None] | None,
 ) -> PathSet:
     """Paths by the engine that the settings name."""
+    if settings.engine == "image" and scene.surfaces is not None:
+        from .growth import grow_paths  # compiled: loaded where there is a scene
+
+        return grow_paths(
+            scene.surfaces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )[0]
+    if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
+        from .prisms import find_paths  # compiled: loaded where there are many faces
+
+        return find_paths(
+            scene.faces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )[0]
     if settings.engine == "image":
         return image.find_paths(
             scene.faces,
@@ -464,6 +500,7 @@ def _search(
         batch=settings.batch,
         usable=scene.usable,
         excluded=scene.excluded,
+        surfaces=scene.surfaces,
         variant=settings.variant,
         progress=progress,
     )

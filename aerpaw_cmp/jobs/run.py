@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -628,8 +628,9 @@ def run_campaign(
     out: Path | None = None,
     logs_root: Path | None = None,
     workers: int = 1,
-    cluster: str | None = None,
-    keep: Path | None = None,
+    scheduler: str | None = None,
+    keep: str | None = None,
+    fresh: bool = False,
     force: bool = False,
     progress: Progress = silent,
 ) -> CampaignOutcome:
@@ -644,11 +645,14 @@ def run_campaign(
     logs_root : Path, optional
         Folder against which logs resolve.
     workers : int
-        Processes.
-    cluster : str, optional
-        Address of a Dask scheduler, in place of processes.
-    keep : Path, optional
-        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
+        On this machine.
+    scheduler : str, optional
+        Address of a Dask scheduler, in place of workers here.
+    keep : str, optional
+        Folder or URL of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
+        interruption, computes only what is missing.
+    fresh : bool
+        Keep nothing and take nothing.
     force : bool
         Write into a folder that holds files of others.
     progress : Progress
@@ -678,19 +682,53 @@ def run_campaign(
             path.parent,
             logs_root=logs_root,
             workers=workers,
-            cluster=cluster,
-            keep=keep,
+            scheduler=scheduler,
+            keep=None if fresh else campaign_keep(campaign, path, keep),
             stage=stages,
             progress=progress,
         )
         with stages("report"), output.filling() as place:
             write_campaign(replace(data, stages_s=dict(stages.seconds)), place)
+            write_tracebacks(data.failures, place)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:
         failed.append(f"held-out fit: {data.held_out_failure}")
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+
+
+def campaign_keep(campaign: Any, path: Path, keep: str | None = None) -> str:
+    """Where outcomes are kept: as asked, else as campaign.yaml says, else in the user's cache."""
+    if keep is not None:
+        return keep
+    if campaign.keep is None:
+        return str(outcomes_folder())
+    return str(campaign.keep) if "://" in campaign.keep else str(path.parent / campaign.keep)
+
+
+def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
+    """A file per failed task in ``failures/``: its message, and where in the program it came from."""
+    from ..report.names import safe_name
+
+    for one in failures:
+        if one.traceback:
+            target = folder / "failures" / f"{safe_name(one.flight)}__{safe_name(one.setting)}.txt"
+            target.parent.mkdir(exist_ok=True)
+            target.write_text(f"{one.flight}, {one.setting}: {one.message}\n\n{one.traceback}", encoding="utf-8")
+
+
+def campaign_status(
+    path: Path, *, logs_root: Path | None = None, keep: str | None = None, fresh: bool = False, workers: int = 1
+) -> Any:
+    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`)."""
+    from . import campaign_plan
+    from .campaign import campaign_tasks, load_campaign
+
+    campaign = load_campaign(path)
+    tasks, _, failures = campaign_tasks(campaign, path.parent, logs_root)
+    where = None if fresh else campaign_keep(campaign, path, keep)
+    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, where, workers=workers)
 
 
 @dataclass(frozen=True, slots=True)

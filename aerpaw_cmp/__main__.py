@@ -21,6 +21,8 @@ import sys
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
 BROKEN_PIPE = 141
+_COMPLETE = "_AERPAW_CMP_COMPLETE"
+"""Set by a shell that asks what may follow on the line."""
 ISSUES = "the project's issue tracker"
 
 
@@ -43,6 +45,7 @@ def help_text() -> str:
             "  -h, --help  This text; 'aerpaw-cmp COMMAND --help' tells more of a command.",
             "  --version   The version.",
             "  --debug     Show the traceback of a failure (also AERPAW_CMP_DEBUG=1).",
+            "  --install-completion, --show-completion [bash|zsh|fish]   What the Tab key completes.",
             "",
             "Exit codes: 0 done, 1 a stated check failed, 2 wrong usage or configuration,",
             "3 an input cannot be read or an output not written.",
@@ -64,6 +67,8 @@ def _quick_answer(arguments: list[str]) -> int | None:
     """Answer what needs no library; None when the command line itself has to run."""
     from .common.commands import COMMANDS
 
+    if _COMPLETE in os.environ:
+        return None
     first = arguments[0] if arguments else ""
     if first in ("", "-h", "--help"):
         print(help_text())
@@ -132,8 +137,8 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         code = _quick_answer(arguments)
         return _run(arguments) if code is None else code
-    except KeyboardInterrupt:
-        print("aerpaw-cmp: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as interrupt:
+        print("; ".join(["aerpaw-cmp: interrupted", *getattr(interrupt, "__notes__", ())]), file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         # the interpreter flushes standard output once more at exit: give it a place that accepts

@@ -14,7 +14,7 @@ import os
 import platform
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -124,21 +124,99 @@ def measure_folder() -> dict[str, Any] | None:
 
 
 SCALE_LINES = 5_000_000
-SCALE_HELP = "time and peak memory of a file of so many lines (a power log, made here), each contestant in a process"
+SCALE_HELP = "time and peak memory of a file of so many lines, made here; each contestant in a process of its own"
+START = np.datetime64("2025-03-02T15:00:00", "ns")
+STEP = 250_000
 
 
-def write_large(place: Path, lines: int) -> None:
-    """A power log of so many lines, 500 000 at a time; its octal offsets run through."""
-    rng, step = np.random.default_rng(5), 500_000
-    start = np.datetime64("2025-03-02T15:00:00", "ns")
+def _blocks(lines: int) -> Iterator[tuple[int, int]]:
+    """First line and number of lines, some at a time."""
+    for first in range(0, lines, STEP):
+        yield first, min(STEP, lines - first)
+
+
+def write_sounder(place: Path, lines: int) -> None:
+    """A power log; its octal offsets run through."""
+    rng = np.random.default_rng(5)
     with place.open("wb") as file:
-        for first in range(0, lines, step):
-            count = min(step, lines - first)
-            times = start + (first + np.arange(count)) * np.timedelta64(3_276_000, "ns")
+        for first, count in _blocks(lines):
+            times = START + (first + np.arange(count)) * np.timedelta64(3_276_000, "ns")
             block = format_power_log(times, rng.normal(-40, 9, count), ZONE).split(b"\n")[:-1]
             block = [line for line in block if len(line) > 40]  # no foot lines in the middle
             for i, line in enumerate(block):
                 file.write(b"%s%07o%s\n" % (line[:29], 4 * (first + i), line[36:]))
+
+
+def write_vehicle(place: Path, lines: int) -> None:
+    """Telemetry of ten fields; its index runs through."""
+    rng = np.random.default_rng(6)
+    names = ("altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_north_mps", "velocity_east_mps")
+    with place.open("wb") as file:
+        for first, count in _blocks(lines):
+            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
+            track = pd.DataFrame({name: rng.uniform(-9, 9, count) for name in names})
+            track = track.assign(time=times, latitude_deg=35.73 + track["roll_deg"] / 1e3, longitude_deg=-78.7)
+            track = track.assign(velocity_down_mps=0.5, fix=4, satellites=20)
+            for i, line in enumerate(format_vehicle_out(track, ZONE).splitlines(keepends=True)):
+                file.write(b"%d,%s" % (first + i, line.partition(b",")[2]))
+
+
+def write_quectel(place: Path, lines: int) -> None:
+    """CSI rows of the launched logger."""
+    rng = np.random.default_rng(7)
+    with place.open("wb") as file:
+        for first, count in _blocks(lines):
+            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
+            file.write(format_quectel_csv(times, rng.integers(1, 5, count), ZONE).removeprefix(b"OK\n"))
+
+
+def write_nemo(place: Path, lines: int) -> None:
+    """The rank table of a phone, relative times."""
+    rng = np.random.default_rng(8)
+    with place.open("wb") as file:
+        file.write(b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi\n")
+        for first, count in _blocks(lines):
+            level = rng.uniform(-110, -60, count).tolist()
+            file.writelines(
+                b"%d,%.2f,35.7300001,-78.7000002,%.1f,2.0,%.1f,21.5,12.0\n" % (n, 10.0 * n, n % 90, level[n - first])
+                for n in range(first, first + count)
+            )
+
+
+def write_mapped(place: Path, lines: int) -> None:
+    """A CSV merged by hand: time, position, level."""
+    rng = np.random.default_rng(9)
+    with place.open("wb") as file:
+        file.write(b"Time,Lat,Lon,Level\n")
+        for first, count in _blocks(lines):
+            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
+            level = rng.uniform(-110, -60, count).tolist()
+            file.writelines(
+                b"%sZ,35.7300001,-78.7000002,%.3f\n" % (time.encode(), value)
+                for time, value in zip(np.datetime_as_string(times, unit="ms").tolist(), level, strict=True)
+            )
+
+
+MAPPED = ReadOptions(
+    timezone=ZONE,
+    kind="rss",
+    unit="dBm",
+    columns={"time": "Time", "rss_db": "Level", "latitude_deg": "Lat", "longitude_deg": "Lon"},
+)
+SCALED: dict[str, tuple[Callable[[Path, int], None], str, ReadOptions]] = {
+    "sounder_log": (write_sounder, "x_power_log.txt", ReadOptions(timezone=ZONE)),
+    "vehicle_out": (write_vehicle, "x_vehicleOut.txt", ReadOptions(timezone=ZONE)),
+    "quectel_csv": (write_quectel, "x_kpi.csv", ReadOptions(timezone=ZONE)),
+    "nemo_csv": (write_nemo, "x_nemo.csv", ReadOptions(time_origin="2025-03-02T15:00:00Z")),
+    "generic_csv": (write_mapped, "x_mapped.csv", MAPPED),
+}
+TABLES: dict[str, tuple[int, int | None, list[int]]] = {
+    # rows above, place of the time (None: milliseconds in column 1), places of further numbers
+    "vehicle_out": (0, 11, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 12, 13]),
+    "quectel_csv": (0, 0, [2, 3, 4, 5, 7, 8, 9, 10]),
+    "nemo_csv": (1, None, [2, 3, 4, 5, 6, 7, 8]),
+    "generic_csv": (1, 0, [1, 2, 3]),
+}
 
 
 def _peak_mib() -> float:
@@ -147,82 +225,135 @@ def _peak_mib() -> float:
     return int(next(line for line in status.splitlines() if line.startswith("VmHWM")).split()[1]) / 1024
 
 
-def contest(who: str, place: Path) -> dict[str, float]:
+def contest(who: str, what: str, place: Path) -> dict[str, float]:
     """CPU seconds, peak MiB above the imports, and MiB of the records of one contestant, in this process."""
     run = {"ours": _ours, "pandas": _pandas, "pyarrow": _pyarrow, "polars": _polars}[who]
-    prepare = place.with_suffix(".small")
+    small = place.parent / f"small_{place.name}"
     with place.open("rb") as file:
-        prepare.write_bytes(b"".join(file.readlines(100_000)))
-    run(prepare)  # imports and first-call costs do not count
+        small.write_bytes(b"".join(file.readlines(100_000)))
+    run(what, small)  # imports and first-call costs do not count
     before = _peak_mib()
     start = time.process_time()
-    kept = run(place)
+    kept = run(what, place)
     spent = time.process_time() - start
     peak = _peak_mib()
     records = sum(column.nbytes for column in kept) / 2**20
     return {"cpu_s": spent, "peak_mib": peak - before, "records_mib": records}
 
 
-def _ours(place: Path) -> list[Any]:
-    (file,) = ingest(place, options=ReadOptions(timezone=ZONE), reader="sounder_log")
-    frame = file.result.streams[0].frame
-    return [frame[name].to_numpy() for name in frame]
+def _ours(what: str, place: Path) -> list[Any]:
+    (file,) = ingest(place, options=SCALED[what][2], reader=what)
+    return [frame[name].to_numpy() for frame in (s.frame for s in file.result.streams) for name in frame]
 
 
-def _pandas(place: Path) -> list[Any]:
-    frame = pd.read_csv(place, engine="c", header=None, sep=r"\s+")
-    clock = pd.to_datetime(frame[0].str[1:] + " " + frame[1].str[:-1], format="%Y-%m-%d %H:%M:%S.%f")
-    return [clock.dt.tz_localize(ZONE).dt.tz_convert("UTC").dt.tz_localize(None).to_numpy(), frame[3].to_numpy()]
+def _utc(clock: pd.Series) -> np.ndarray:  # type: ignore[type-arg]
+    return clock.dt.tz_localize(ZONE).dt.tz_convert("UTC").dt.tz_localize(None).to_numpy()
 
 
-def _pyarrow(place: Path) -> list[Any]:
+def _pandas(what: str, place: Path) -> list[Any]:
+    if what == "sounder_log":
+        frame = pd.read_csv(place, engine="c", header=None, sep=r"\s+")
+        clock = pd.to_datetime(frame[0].str[1:] + " " + frame[1].str[:-1], format="%Y-%m-%d %H:%M:%S.%f")
+        return [_utc(clock), frame[3].to_numpy()]
+    skip, at, numbers = TABLES[what]
+    frame = pd.read_csv(place, engine="c", header=None, skiprows=skip, quoting=3 if what == "vehicle_out" else 0)
+    if what == "vehicle_out":
+        for column in (4, 6, 7, 9):
+            frame[column] = frame[column].str.strip('"()').astype(np.float64)
+    values = [frame[column].to_numpy() for column in numbers]
+    if at is None:
+        return [(START + frame[1] * np.timedelta64(1_000_000, "ns")).to_numpy(), *values]
+    if what == "generic_csv":
+        return [pd.to_datetime(frame[at], format="ISO8601").dt.tz_localize(None).to_numpy(), *values]
+    return [_utc(pd.to_datetime(frame[at], format="%Y-%m-%d %H:%M:%S.%f")), *values]
+
+
+def _pyarrow(what: str, place: Path) -> list[Any]:
     import pyarrow.compute as pc
     from pyarrow import csv
 
-    pa_table = csv.read_csv(
-        place,
-        read_options=csv.ReadOptions(column_names=["line"], use_threads=False),
-        parse_options=csv.ParseOptions(delimiter="\x01", quote_char=False),
-    )
-    line = pa_table["line"]
-    clock = pc.cast(pc.utf8_slice_codeunits(line, 1, 27), "timestamp[us]")
-    level = pc.cast(pc.utf8_ltrim_whitespace(pc.utf8_slice_codeunits(line, -16)), "float64")
-    return [pc.assume_timezone(clock, ZONE).to_numpy(), level.to_numpy()]
+    skip = TABLES[what][0] if what in TABLES else 0
+    read = csv.ReadOptions(column_names=["line"], use_threads=False) if what not in TABLES else csv.ReadOptions(
+        autogenerate_column_names=True, skip_rows=skip, use_threads=False)  # fmt: skip
+    if what not in TABLES:
+        table = csv.read_csv(
+            place, read_options=read, parse_options=csv.ParseOptions(delimiter="\x01", quote_char=False)
+        )
+        line = table["line"]
+        clock = pc.cast(pc.utf8_slice_codeunits(line, 1, 27), "timestamp[us]")
+        level = pc.cast(pc.utf8_ltrim_whitespace(pc.utf8_slice_codeunits(line, -16)), "float64")
+        return [pc.assume_timezone(clock, ZONE).to_numpy(), level.to_numpy()]
+    at, numbers = TABLES[what][1:]
+    quote = False if what == "vehicle_out" else '"'
+    table = csv.read_csv(place, read_options=read, parse_options=csv.ParseOptions(quote_char=quote))
+    columns = [table[column] for column in numbers]
+    if what == "vehicle_out":
+        columns = [
+            pc.cast(pc.utf8_trim(column, '"()'), "float64") if number in (4, 6, 7, 9) else column
+            for number, column in zip(numbers, columns, strict=True)
+        ]
+    if at is None:
+        return [table[1].to_numpy(), *(column.to_numpy() for column in columns)]
+    clock = table[at]
+    if clock.type == "string":
+        clock = pc.cast(clock, "timestamp[us]")
+    if getattr(clock.type, "tz", None) is None and what != "generic_csv":
+        clock = pc.assume_timezone(clock, ZONE)
+    return [clock.to_numpy(), *(column.to_numpy() for column in columns)]
 
 
-def _polars(place: Path) -> list[Any]:
+def _polars(what: str, place: Path) -> list[Any]:
     import polars as pl
 
-    line = pl.col("line").str
-    clock = line.slice(1, 26).str.to_datetime("%Y-%m-%d %H:%M:%S%.f", time_zone=ZONE)
-    level = line.tail(16).str.strip_chars().cast(pl.Float64)
-    table = pl.read_csv(place, has_header=False, new_columns=["line"], separator="\x01", quote_char=None)
-    made = table.select(clock.dt.convert_time_zone("UTC").alias("time"), level.alias("level"))
-    return [made["time"].to_numpy(), made["level"].to_numpy()]
+    if what == "sounder_log":
+        line = pl.col("line").str
+        clock = line.slice(1, 26).str.to_datetime("%Y-%m-%d %H:%M:%S%.f", time_zone=ZONE)
+        level = line.tail(16).str.strip_chars().cast(pl.Float64)
+        table = pl.read_csv(place, has_header=False, new_columns=["line"], separator="\x01", quote_char=None)
+        made = table.select(clock.dt.convert_time_zone("UTC").alias("time"), level.alias("level"))
+        return [made["time"].to_numpy(), made["level"].to_numpy()]
+    skip, at, numbers = TABLES[what]
+    table = pl.read_csv(place, has_header=False, skip_rows=skip, quote_char=None if what == "vehicle_out" else '"')
+    names = table.columns
+    wanted = [
+        pl.col(names[n]).str.strip_chars('"()').cast(pl.Float64) if what == "vehicle_out" and n in (4, 6, 7, 9)
+        else pl.col(names[n]) for n in numbers
+    ]  # fmt: skip
+    made = table.select(wanted)
+    values = [made[name].to_numpy() for name in made.columns]
+    if at is None:
+        return [table[names[1]].to_numpy(), *values]
+    form = "%Y-%m-%dT%H:%M:%S%.fZ" if what == "generic_csv" else "%Y-%m-%d %H:%M:%S%.f"
+    zone = "UTC" if what == "generic_csv" else ZONE
+    clock = table.select(pl.col(names[at]).str.to_datetime(form, time_zone=zone).dt.convert_time_zone("UTC"))
+    return [clock[names[at]].to_numpy(), *values]
 
 
-def scale(lines: int) -> None:
+def scale(lines: int, formats: list[str], folder: str | None) -> None:
     """The table of peers."""
     import subprocess
     import sys
     import tempfile
 
-    with tempfile.TemporaryDirectory() as folder:
-        place = Path(folder) / "x_power_log.txt"
-        write_large(place, lines)
-        print(f"{lines} lines, {place.stat().st_size / 1e6:.0f} MB; CPU seconds and peak above the imports")
-        found = {}
-        for who in ("ours", "pandas", "pyarrow", "polars"):
-            command = [sys.executable, __file__, "--contest", who, str(place)]
-            answer = subprocess.run(command, capture_output=True, text=True, check=False)
-            if answer.returncode:
-                print(f"  {who:8} not run: {(answer.stderr.strip().splitlines() or ['?'])[-1][:90]}")
-                continue
-            found[who] = json.loads(answer.stdout)
-            one = found[who]
-            ratio = found["ours"]["cpu_s"] / one["cpu_s"]
-            memory = f"peak {one['peak_mib']:7.0f} MiB, of which records {one['records_mib']:5.0f}"
-            print(f"  {who:8} {one['cpu_s']:8.2f} s   {memory}   ours takes {ratio:.2f} x its time")
+    print(f"load {os.getloadavg()[0]:.1f}; CPU seconds, peak above the imports; peers convert the times as well")
+    with tempfile.TemporaryDirectory(dir=folder) as folder_:
+        for what in formats:
+            write, name, _ = SCALED[what]
+            place = Path(folder_) / name
+            write(place, lines)
+            print(f"{what}: {lines} lines, {place.stat().st_size / 1e6:.0f} MB")
+            found: dict[str, Any] = {}
+            for who in ("ours", "pandas", "pyarrow", "polars"):
+                command = [sys.executable, __file__, "--contest", who, what, str(place)]
+                answer = subprocess.run(command, capture_output=True, text=True, check=False)
+                if answer.returncode:
+                    print(f"  {who:8} not run: {(answer.stderr.strip().splitlines() or ['?'])[-1][:90]}")
+                    continue
+                found[who] = one = json.loads(answer.stdout)
+                ratio = found["ours"]["cpu_s"] / one["cpu_s"] if "ours" in found else float("nan")
+                memory = f"peak {one['peak_mib']:7.0f} MiB, of which records {one['records_mib']:5.0f}"
+                print(f"  {who:8} {one['cpu_s']:8.2f} s   {memory}   ours takes {ratio:.2f} x its time", flush=True)
+            place.unlink()
 
 
 def main() -> None:
@@ -230,13 +361,15 @@ def main() -> None:
     parser.add_argument("--quick", action="store_true", help="a tenth of the lines, few rounds")
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--scale", type=int, nargs="?", const=SCALE_LINES, metavar="LINES", help=SCALE_HELP)
-    parser.add_argument("--contest", nargs=2, metavar=("WHO", "FILE"), help=argparse.SUPPRESS)
+    parser.add_argument("--format", action="append", choices=sorted(SCALED), help="of --scale, repeatable; all")
+    parser.add_argument("--folder", help="where --scale puts its files")
+    parser.add_argument("--contest", nargs=3, metavar=("WHO", "WHAT", "FILE"), help=argparse.SUPPRESS)
     given = parser.parse_args()
     if given.contest:
-        print(json.dumps(contest(given.contest[0], Path(given.contest[1]))))
+        print(json.dumps(contest(given.contest[0], given.contest[1], Path(given.contest[2]))))
         return
     if given.scale:
-        scale(given.scale)
+        scale(given.scale, given.format or list(SCALED), given.folder)
         return
     answer = measure(LINES // 10 if given.quick else LINES, 5 if given.quick else 31)
     folder = None if given.quick else measure_folder()

@@ -8,18 +8,21 @@ from __future__ import annotations
 import typer
 
 from ..common.errors import UsageError
-from . import campaign, flight, live, logs, machine, site
-from .app import app
+from . import campaign, diff, flight, live, logs, machine, site
+from .app import Interrupted, app
 from .shown import say
 
-GROUPS = (logs, flight, campaign, live, site, machine)
+GROUPS = (logs, flight, campaign, diff, live, site, machine)
 """The modules whose commands there are: importing them registers these."""
 
 
 def main(arguments: list[str]) -> int:
     """Run the command line and give its exit code; ``__main__`` turns exceptions into messages."""
+    say.quiet = False
     try:
         result = app(args=arguments, prog_name="aerpaw-cmp", standalone_mode=False)
+    except Interrupted as interrupted:
+        raise interrupted.error from None
     except typer.Abort as error:
         raise KeyboardInterrupt from error
     except Exception as error:

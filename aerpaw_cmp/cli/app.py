@@ -6,24 +6,27 @@ A command is a function in a module of this package::
     def diff(first: Annotated[Path, typer.Argument(help="...")], as_json: Json = False) -> int:
         from ..jobs.diff import run_diff  # here, so that help and completion load nothing
 
-and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0.
+and a line of :mod:`aerpaw_cmp.common.commands`. What it returns is the exit code; nothing is 0. ``-h``, ``--quiet``
+and the examples below the options come with the decorator.
 """
 
 from __future__ import annotations
 
+import functools
+import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional, TypeVar
+from typing import Annotated, Any, Optional, TypeVar, get_type_hints
 
 import typer
 
 from ..common.commands import COMMANDS
+from .shown import say
 
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 
 _SETTINGS = {"help_option_names": ["-h", "--help"]}
 app = typer.Typer(
-    add_completion=False,
     no_args_is_help=True,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
@@ -35,26 +38,76 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
 Force = Annotated[bool, typer.Option("--force", help="Replace also what this tool did not write; never an input.")]
+Export = Annotated[
+    Optional[list[str]],  # noqa: UP045
+    typer.Option(
+        help="Also write the samples as geojson, geopackage, kmz, gpx, mat, netcdf, parquet or all; names joined by "
+        "commas, or repeated."
+    ),
+]
 LogsRoot = Annotated[
     Optional[Path],  # noqa: UP045
     typer.Option("--logs-root", help="Folder against which the paths of the logs resolve."),
 ]
 
 
+Quiet = Annotated[
+    bool,
+    typer.Option("-q", "--quiet", help="No progress and no remarks; results, warnings and failures are still shown."),
+]
+
+
 def command(
-    name: str, *, of: typer.Typer = app, text: str | None = None, examples: Sequence[str] = ()
+    name: str, *, examples: Sequence[str], of: typer.Typer = app, text: str | None = None
 ) -> Callable[[_Function], _Function]:
     """Register a function as a command.
 
     Parameters
     ----------
     name : str
+    examples : sequence of str
+        Whole command lines, shown below the options; a test parses them.
     of : typer.Typer
         The program, or a group of commands such as ``site_app``.
     text : str, optional
         One line of help; without it that of :data:`aerpaw_cmp.common.commands.COMMANDS`.
-    examples : sequence of str
-        Whole command lines, shown below the options.
     """
-    epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples) if examples else None
-    return of.command(name, help=COMMANDS[name] if text is None else text, epilog=epilog)
+    epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples)
+    register = of.command(name, help=COMMANDS[name] if text is None else text, epilog=epilog)
+
+    def take(function: _Function) -> _Function:
+        register(_with_quiet(function))
+        return function
+
+    return take
+
+
+class Interrupted(BaseException):
+    """A command that was interrupted; ``error`` is the interrupt with what it says of what is kept."""
+
+    def __init__(self, error: KeyboardInterrupt) -> None:
+        super().__init__(str(error))
+        self.error = error
+
+
+def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
+    """The function with the option ``--quiet`` and an interrupt that reaches :func:`aerpaw_cmp.cli.main`."""
+
+    @functools.wraps(function)
+    def run(*, quiet: bool = False, **arguments: Any) -> Any:
+        say.quiet = quiet
+        try:
+            return function(**arguments)
+        except KeyboardInterrupt as error:
+            raise Interrupted(error) from None  # typer would make a silent exit code of it
+
+    hints = get_type_hints(function, include_extras=True) | {"quiet": Quiet}
+    kind = inspect.Parameter.KEYWORD_ONLY
+    parameters = [
+        *inspect.signature(function).parameters.values(),
+        inspect.Parameter("quiet", kind, default=False),
+    ]
+    typed = [one.replace(kind=kind, annotation=hints[one.name]) for one in parameters]
+    run.__signature__ = inspect.Signature(typed)  # type: ignore[attr-defined]  # typer reads the options here
+    run.__annotations__ = hints
+    return run

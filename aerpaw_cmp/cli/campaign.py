@@ -9,11 +9,19 @@ import typer
 
 from ..common.errors import UsageError
 from ..common.stages import duration
-from .app import Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, command
 from .shown import number, print_json, say, table
 
 
-@command("campaign")
+@command(
+    "campaign",
+    examples=[
+        "aerpaw-cmp campaign campaign.yaml --workers 4",
+        "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
+        "aerpaw-cmp campaign campaign.yaml --scheduler tcp://scheduler:8786 --keep s3://lab/season",
+        "aerpaw-cmp campaign status campaign.yaml",
+    ],
+)
 def campaign(
     words: Annotated[
         list[str],
@@ -40,6 +48,7 @@ def campaign(
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -62,6 +71,7 @@ def campaign(
         keep=keep,
         fresh=fresh,
         force=force,
+        export=export or (),
         progress=say,
     )
     if as_json:
@@ -69,7 +79,7 @@ def campaign(
     else:
         _print_campaign_summary(outcome)
     for check in outcome.failed_checks:
-        say(f"failed: {check}")
+        say.warn(f"failed: {check}")
     if outcome.nothing_done:
         return 3
     return 1 if strict and outcome.failed_checks else 0

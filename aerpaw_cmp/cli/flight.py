@@ -4,34 +4,51 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import typer
 
 from ..common.errors import one_line
-from .app import Force, Json, LogsRoot, Out, command
-from .shown import number, print_json, say, table
+from .app import Export, Force, Json, LogsRoot, Out, command
+from .shown import number, print_files, print_json, say, table
 
 
-@command("report")
+@command(
+    "report",
+    examples=[
+        "aerpaw-cmp report sample_logs/flight.yaml",
+        "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
+        "aerpaw-cmp report flight.yaml --figures all --style paper",
+        "aerpaw-cmp report flight.yaml --export geopackage,kmz",
+        "aerpaw-cmp report flight.yaml --strict --json --quiet",
+    ],
+)
 def report(
     flight: Annotated[Path, typer.Argument(help="flight.yaml")],
     out: Out = None,
     logs_root: LogsRoot = None,
-    engine: Annotated[Optional[str], typer.Option(help="image or sionna, in place of rt.engine.")] = None,  # noqa: UP045
-    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    engine: Annotated[
+        Optional[Literal["image", "sionna"]],  # noqa: UP045
+        typer.Option(help="In place of rt.engine."),
+    ] = None,
+    audit: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Number of audited links, 'full', 'none', or 'later' (the command audit fills it in)."),
+    ] = None,
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
     ] = None,
     strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
     figures: Annotated[
-        str,
-        typer.Option(help="What is drawn: page (what it shows), none, or every figure as svg, png, pdf, all."),
+        Literal["page", "none", "svg", "png", "pdf", "all"],
+        typer.Option(help="What is drawn: what the page shows, nothing, or every figure in one format or in all."),
     ] = "page",
     style: Annotated[
-        str, typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded).")
+        Literal["screen", "paper"],
+        typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
     ] = "screen",
+    export: Export = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
@@ -46,6 +63,7 @@ def report(
         audit=audit,
         recommend=recommend,
         force=force,
+        export=export or (),
         figures=figures,
         style=style,
         progress=say,
@@ -54,10 +72,51 @@ def report(
         print_json(outcome.metrics)
     else:
         _print_report_summary(outcome)
-    failed = outcome.failed_checks
-    for check in failed:
-        say(f"check failed: {check}")
-    return 1 if strict and failed else 0
+    return _verdict(outcome, strict)
+
+
+def _verdict(outcome: Any, strict: bool) -> int:
+    """Say each stated check that failed; 1 where that is asked to be a failure."""
+    for check in outcome.failed_checks:
+        say.warn(f"check failed: {check}")
+    return 1 if strict and outcome.failed_checks else 0
+
+
+@command(
+    "audit",
+    examples=[
+        "aerpaw-cmp audit reports/mine",
+        "aerpaw-cmp audit flight.yaml -o reports/mine --strict",
+        "aerpaw-cmp audit reports/mine --links full --json",
+    ],
+)
+def audit(
+    target: Annotated[Path, typer.Argument(metavar="REPORT_OR_FLIGHT", help="A report's folder, or its flight.yaml.")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    links: Annotated[Optional[str], typer.Option(help="Number of audited links, or 'full'.")] = None,  # noqa: UP045
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Fill the audit into a report."""
+    from ..jobs import run
+
+    outcome = run.run_audit(target, out=out, logs_root=logs_root, links=links, force=force, progress=say)
+    if as_json:
+        print_json(outcome.metrics)
+        return _verdict(outcome, strict)
+    found = (outcome.metrics["rt"] or {}).get("audit")
+    if found is None:
+        print("nothing to audit: no link was replayed")
+    else:
+        field = found["field"] or {}
+        print(
+            f"audit: {found['links']} links against {found['reference']}, {found['missing_paths']} paths missing, "
+            f"{found['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
+        )
+    print(f"report: {outcome.folder / 'report.html'}")
+    return _verdict(outcome, strict)
 
 
 _WARNINGS = 10
@@ -117,13 +176,21 @@ def _print_report_summary(outcome: Any) -> None:
         table(["tower", "K", "agreement", "total variation", "n"], rows, "Rank, measured against replayed")
     warnings = [one_line(text) for text in outcome.metrics["warnings"]]
     for text in warnings[:_WARNINGS]:
-        say(f"warning: {text}")
+        say.warn(f"warning: {text}")
     if len(warnings) > _WARNINGS:
-        say(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
+        say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
+    if outcome.metrics.get("audit_command"):
+        print(f"next: {outcome.metrics['audit_command']}")
 
 
-@command("calibrate")
+@command(
+    "calibrate",
+    examples=[
+        "aerpaw-cmp calibrate calibration.yaml -o learned.yaml",
+        "aerpaw-cmp calibrate calibration.yaml --logs-root /data/flights --json",
+    ],
+)
 def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Out = None,
@@ -165,29 +232,45 @@ def calibrate(
     print(page if page.exists() else outcome.folder)
 
 
-@command("simulate")
+@command(
+    "simulate",
+    examples=[
+        "aerpaw-cmp simulate plan/flight.yaml",
+        "aerpaw-cmp simulate plan/flight.yaml -o planned_logs --json",
+    ],
+)
 def simulate(
     flight: Annotated[Path, typer.Argument(help="flight.yaml with flight.plan")],
     out: Out = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Forward-simulate a planned flight into logs of the real formats."""
     from ..jobs import run
 
-    for path in run.run_simulate(flight, out=out, force=force, progress=say):
-        print(path)
+    print_files(run.run_simulate(flight, out=out, force=force, progress=say), as_json)
 
 
-@command("sample")
+@command(
+    "sample",
+    examples=[
+        "aerpaw-cmp sample",
+        "aerpaw-cmp sample -o try_it",
+    ],
+)
 def sample(
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder that gets flight.yaml and the logs.")] = Path(
         "sample"
     ),
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Copy the sample flight into a folder of your own."""
     from ..jobs.sample import write_sample
 
     flight = write_sample(out, force=force)
+    if as_json:
+        print_json({"flight": str(flight)})
+        return
     print(f"flight: {flight}")
     print(f"next: aerpaw-cmp report {flight}")

@@ -4,16 +4,24 @@ from __future__ import annotations
 
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import typer
 
 from ..common.errors import UsageError
-from .app import Force, command
-from .shown import say
+from .app import Force, Json, command
+from .shown import print_files, print_json, say
 
 
-@command("tap")
+@command(
+    "tap",
+    examples=[
+        "aerpaw-cmp tap",
+        "aerpaw-cmp tap /dev/ttyUSB2 -o taplog --no-csi-alarm 5 --duration 600",
+        "aerpaw-cmp tap --replay taplog --no-status",
+        "aerpaw-cmp tap -o taplog --export csv",
+    ],
+)
 def tap(
     port: Annotated[str | None, typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the log segments.")] = Path("tap"),
@@ -29,20 +37,28 @@ def tap(
     duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
     wait: Annotated[float, typer.Option(help="Wait so many seconds for the port to appear.")] = 0.0,
     replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
-    export: Annotated[Optional[str], typer.Option(help="csv: write the log below OUT as a table and end.")] = None,  # noqa: UP045
+    export: Annotated[
+        Optional[Literal["csv"]],  # noqa: UP045
+        typer.Option(help="Write the log below OUT as a table and end."),
+    ] = None,
     flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
     if export is not None:
-        if export != "csv":
-            raise UsageError(f"--export {export!r}", expected="csv")
+        from ..common.jsonable import json_safe
         from ..live.export import export_csv
 
-        print(export_csv(out, out / "tap.csv", force=force))
+        exported = export_csv(out, out / "tap.csv", force=force)
+        if as_json:
+            print_json(json_safe(exported))
+        else:
+            print(exported)
         return 0
     _needs_posix("tap")
+    from ..common.jsonable import json_safe
     from ..live.log import LogSettings
     from ..live.session import TapSettings, format_status
     from ..live.tap import run_tap
@@ -66,6 +82,7 @@ def tap(
 
         predict = live_prediction(flight, telemetry)
     terminal = sys.stderr.isatty()
+    status = status and not say.quiet
 
     def show(now: Any) -> None:
         if now.message:
@@ -81,8 +98,10 @@ def tap(
     say(
         ("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}"
     )
-    for segment in summary.segments:
-        print(segment)
+    if as_json:
+        print_json(json_safe(summary))
+    else:
+        print_files(summary.segments)
     return int(summary.exit_code)
 
 
@@ -101,21 +120,37 @@ def _needs_posix(command: str) -> None:
             ) from None
 
 
-@command("modem-sim")
+@command(
+    "modem-sim",
+    examples=[
+        "aerpaw-cmp modem-sim --link /tmp/modem",
+        "aerpaw-cmp modem-sim --source taplog --fault echo=true --fault unplug_every_s=20",
+    ],
+)
 def modem_sim(
     link: Annotated[Optional[Path], typer.Option(help="Symbolic link to the port, kept right.")] = None,  # noqa: UP045
     source: Annotated[
         Path | None, typer.Option(help="What to play: a transcript, a tap log, or any log with ranks.")
     ] = None,
-    kind: Annotated[str, typer.Option(help="modem, gps, diag, silent or rubbish.")] = "modem",
+    kind: Annotated[
+        Literal["modem", "gps", "diag", "silent", "rubbish"], typer.Option(help="What the port behaves like.")
+    ] = "modem",
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
+    as_json: Json = False,
 ) -> int:
     """Serve a pseudo-terminal that behaves like an RM502Q-AE until interrupted."""
     _needs_posix("modem-sim")
     from ..live.simulator import ModemSimSettings, run_modem_sim
 
     settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there
-    return run_modem_sim(settings, on_ready=lambda port: print(port, flush=True))
+
+    def ready(port: object) -> None:
+        if as_json:
+            print_json({"port": str(port)})
+        else:
+            print(port, flush=True)
+
+    return run_modem_sim(settings, on_ready=ready)
 
 
 def _faults(pairs: list[str]) -> Any:

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Literal, Optional
 
 import typer
 
-from ..common.errors import UsageError
 from .app import Force, Json, Out, command
 from .shown import print_json, say, table
 
 
-@command("ingest")
+@command(
+    "ingest",
+    examples=[
+        "aerpaw-cmp ingest my_logs/ -o flight.h5",
+        "aerpaw-cmp ingest my_logs/ --timezone America/New_York --draft flight.yaml",
+        "aerpaw-cmp ingest levels.csv --map time=time --map power_dbm=rss_db --unit dBm --json",
+    ],
+)
 def ingest(
     paths: Annotated[list[Path], typer.Argument(help="Log files and folders.")],
     out: Out = None,
@@ -20,7 +26,10 @@ def ingest(
     reader: Annotated[Optional[str], typer.Option(help="Reader of all files, in place of sniffing.")] = None,  # noqa: UP045
     timezone: Annotated[Optional[str], typer.Option(help="IANA zone of zone-less clocks.")] = None,  # noqa: UP045
     time_origin: Annotated[Optional[str], typer.Option(help="ISO time of logs with relative times.")] = None,  # noqa: UP045
-    ri_base: Annotated[Optional[str], typer.Option(help="zero or one: what the source prints for rank 1.")] = None,  # noqa: UP045
+    ri_base: Annotated[
+        Optional[Literal["zero", "one"]],  # noqa: UP045
+        typer.Option(help="What the source prints for rank 1."),
+    ] = None,
     columns: Annotated[
         Optional[list[str]],  # noqa: UP045
         typer.Option("--map", metavar="COLUMN=QUANTITY", help="What a column of a CSV holds: time, rss_db, rank, ..."),
@@ -33,8 +42,6 @@ def ingest(
     from ..jobs import run
     from ..logs.ingest import ACCOUNT, account_notes, account_rows
 
-    if ri_base not in (None, "zero", "one"):
-        raise UsageError(f"--ri-base {ri_base!r}", expected="zero or one")
     options = {"timezone": timezone, "time_origin": time_origin, "ri_base": ri_base, "unit": unit}
     if columns:
         options |= run.mapping(columns)
@@ -56,7 +63,13 @@ def ingest(
             print(f"wrote {place}")
 
 
-@command("formats")
+@command(
+    "formats",
+    examples=[
+        "aerpaw-cmp formats",
+        "aerpaw-cmp formats --json",
+    ],
+)
 def formats(as_json: Json = False) -> None:
     """List the readers with a sample line each."""
     from ..logs.readers import catalogue

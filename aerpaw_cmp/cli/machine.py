@@ -10,7 +10,13 @@ from .app import Json, command
 from .shown import number, print_json, say, table
 
 
-@command("bench")
+@command(
+    "bench",
+    examples=[
+        "aerpaw-cmp bench --quick",
+        "aerpaw-cmp bench --poses 500 --json",
+    ],
+)
 def bench(
     poses: Annotated[int, typer.Option(min=2, help="Poses of the flight that is replayed.")] = 200,
     quick: Annotated[bool, typer.Option("--quick", help="Few poses, at most 1e4 samples, no peers.")] = False,
@@ -62,7 +68,13 @@ def bench(
         print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
 
 
-@command("doctor")
+@command(
+    "doctor",
+    examples=[
+        "aerpaw-cmp doctor",
+        "aerpaw-cmp doctor --json",
+    ],
+)
 def doctor(as_json: Json = False) -> int:
     """Check this machine."""
     from ..machine import doctor as doctor_room

@@ -5,6 +5,8 @@ from __future__ import annotations
 import json
 import sys
 import time
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 _EVERY_S = 30.0
@@ -14,7 +16,8 @@ class ProgressLines:
     """Progress on standard error, so that standard output stays clean.
 
     On a terminal a share is a bar with the time left; elsewhere every quarter is a line. What stands behind a tab in
-    the text may change from call to call: it is shown with the bar, and elsewhere every half minute.
+    the text may change from call to call: it is shown with the bar, and elsewhere every half minute. With ``quiet``
+    nothing is said but what :meth:`warn` gets.
     """
 
     def __init__(self) -> None:
@@ -22,12 +25,14 @@ class ProgressLines:
         self._quarters: dict[str, int] = {}
         self._name = ""
         self._last = time.monotonic()
+        self.quiet = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
         """Show a line, or how far something is."""
+        if self.quiet:
+            return
         if fraction is None:
-            self.end()
-            print(text, file=sys.stderr, flush=True)
+            self.warn(text)
         elif sys.stderr.isatty():
             self._draw(text, fraction)
         else:
@@ -36,6 +41,11 @@ class ProgressLines:
             if late or int(4 * fraction) > self._quarters.get(name, 0):
                 self._quarters[name], self._last = int(4 * fraction), time.monotonic()
                 print(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", file=sys.stderr, flush=True)
+
+    def warn(self, text: str) -> None:
+        """Show a line, also where all else is quiet."""
+        self.end()
+        print(text, file=sys.stderr, flush=True)
 
     def _draw(self, text: str, fraction: float) -> None:
         name, _, tail = text.partition("\t")
@@ -75,7 +85,16 @@ say = ProgressLines()
 
 def print_json(value: dict[str, Any]) -> None:
     """One object on standard output."""
-    print(json.dumps(value, indent=1, allow_nan=False))
+    print(json.dumps(value, indent=1, allow_nan=False), flush=True)
+
+
+def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
+    """What was written: a line each, or one object."""
+    if as_json:
+        print_json({"files": [str(path) for path in paths]})
+        return
+    for path in paths:
+        print(path)
 
 
 _FIXED = 20

@@ -3,32 +3,56 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Optional
+from typing import Annotated, Literal, Optional
 
 import typer
 
-from ..common.errors import UsageError
 from .app import Force, Json, LogsRoot, Out, command, site_app
-from .shown import print_json, say, table
+from .shown import print_files, print_json, say, table
 
 
-@command("import", of=site_app, text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.")
+@command(
+    "import",
+    of=site_app,
+    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.",
+    examples=[
+        "aerpaw-cmp site import farm.osm -o site.yaml",
+        "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
+    ],
+)
 def site_import(
     files: Annotated[list[Path], typer.Argument(help="Map files.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
     base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
-    untagged: Annotated[Optional[str], typer.Option(help="building, forest or geofence: areas without a tag.")] = None,  # noqa: UP045
+    untagged: Annotated[
+        Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
+        typer.Option(help="What areas without a tag are."),
+    ] = None,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Import footprints."""
     from ..jobs import run
 
-    for line in run.run_site_import(files, out, base=base, untagged=untagged, force=force):
+    actions = run.run_site_import(files, out, base=base, untagged=untagged, force=force)
+    if as_json:
+        print_json({"file": str(out), "base": base, "actions": actions})
+        return
+    for line in actions:
         say(line)
     print(out)
 
 
-@command("show", of=site_app, text="Plan view, 3-D picture and a standalone page of a site.")
+@command(
+    "show",
+    of=site_app,
+    text="Plan view, 3-D picture and a standalone page of a site.",
+    examples=[
+        "aerpaw-cmp site show",
+        "aerpaw-cmp site show site.yaml -o reports/site --export",
+        "aerpaw-cmp site show --flight sample_logs/flight.yaml --pose 60",
+    ],
+)
 def site_show(
     site: Annotated[Optional[str], typer.Argument(help="site.yaml or packaged site; else the flight's.")] = None,  # noqa: UP045
     out: Out = None,
@@ -37,16 +61,23 @@ def site_show(
     pose: Annotated[Optional[int], typer.Option(help="Draw the paths to this point of the track.")] = None,  # noqa: UP045
     export: Annotated[bool, typer.Option("--export", help="Also PLY + Mitsuba XML for sionna.rt.load_scene.")] = False,
     force: Force = False,
+    as_json: Json = False,
 ) -> None:
     """Look at a site."""
     from ..jobs import run
 
     shown = run.run_site_show(site, out, flight=flight, logs_root=logs_root, pose=pose, export=export, force=force)
-    for path in shown:
-        print(path)
+    print_files(shown, as_json)
 
 
-@command("map")
+@command(
+    "map",
+    examples=[
+        "aerpaw-cmp map --quick",
+        "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
+        "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
+    ],
+)
 def map_(
     site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")] = "lake_wheeler",
     out: Out = None,
@@ -72,7 +103,10 @@ def map_(
         typer.Option("-k", "--k", help="Singular-value ratio; may be repeated. Default: 10, 100, 1000."),
     ] = None,
     carrier_ghz: Annotated[Optional[float], typer.Option(help="Default: 3.4.")] = None,  # noqa: UP045
-    engine: Annotated[Optional[str], typer.Option(help="image or sionna.")] = None,  # noqa: UP045
+    engine: Annotated[
+        Optional[Literal["image", "sionna"]],  # noqa: UP045
+        typer.Option(help="Default: image."),
+    ] = None,
     max_depth: Annotated[Optional[int], typer.Option(min=0, max=3, help="Reflections. Default: 2.")] = None,  # noqa: UP045
     samples: Annotated[Optional[int], typer.Option(min=1, help="Rays per tower, sionna only. Default: 1e6.")] = None,  # noqa: UP045
     flight: Annotated[
@@ -91,8 +125,6 @@ def map_(
     """Coverage and rank maps of a site, Kriging of rank."""
     from ..jobs import run
 
-    if engine not in (None, "image", "sionna"):
-        raise UsageError(f"--engine {engine!r}", expected="image or sionna")
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
     outcome = run.run_map(
         site,

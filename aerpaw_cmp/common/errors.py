@@ -40,6 +40,16 @@ def printable(text: str) -> str:
     return "\n".join(one_line(line) for line in text.split("\n"))
 
 
+def add_note(error: BaseException, text: str) -> None:
+    """Add a sentence to an exception that goes on: what is kept when a run is interrupted.
+
+    Notes
+    -----
+    What ``BaseException.add_note`` of Python 3.11 does.
+    """
+    error.__notes__ = [*getattr(error, "__notes__", ()), text]  # type: ignore[attr-defined]
+
+
 class AerpawCmpError(Exception):
     """A message for the user; never shown with a traceback.
 

@@ -34,7 +34,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, BinaryIO
 
-from .errors import OutputError, UsageError, one_line
+from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
 
 SUMS = "SHA256SUMS"
@@ -224,6 +224,14 @@ class OutputFile:
         if self._place is not None:
             self._place.leave()
             self._place = None
+            _say_kept(error, self.named)
+
+
+def _say_kept(error: BaseException | None, named: Path) -> None:
+    """Add to an interrupt what stands at the output's name."""
+    if isinstance(error, KeyboardInterrupt):
+        there = os.path.lexists(named)
+        add_note(error, f"{one_line(str(named))} {'is as it was before' if there else 'was not written'}")
 
 
 def _replaces_input(named: Path, path: Path) -> UsageError:
@@ -282,6 +290,7 @@ class OutputFolder:
         self._place: _Place | None = None
         self._made: list[Path] = []
         """Parents made for this run, removed again where it fails."""
+        self._written = False
 
     def __enter__(self) -> OutputFolder:
         with told(self.named):
@@ -355,6 +364,7 @@ class OutputFolder:
             yield place.part
             place.refuse_gone()
             self._commit(place)
+            self._written = True
         self._made = []
 
     def _commit(self, place: _Place) -> None:
@@ -411,6 +421,8 @@ class OutputFolder:
             self._place.leave()
             self._place = None
         _remove_folders(self._made)
+        if not self._written:
+            _say_kept(error, self.named)
 
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
@@ -484,6 +496,7 @@ class OutputSet:
         self._known: dict[str, set[str]] = {}
         self._made: list[Path] = []
         self._place: _Place | None = None
+        self._written = False
         self._journal = beside(self.folder / listing, "journal")
 
     def __enter__(self) -> OutputSet:
@@ -557,6 +570,7 @@ class OutputSet:
                         beside(self.folder / name, "new").unlink(missing_ok=True)
                 raise
             _sync_folder(self.folder)
+            self._written = True
             self._recover()
         return [self.folder / name for name in everything]
 
@@ -603,6 +617,8 @@ class OutputSet:
             self._place.leave()
             self._place = None
         _remove_folders(self._made)
+        if not self._written:
+            _say_kept(error, self.named)
 
 
 def _listed(listing: Path) -> dict[str, str]:

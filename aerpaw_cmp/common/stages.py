@@ -69,8 +69,9 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time one stage."""
-        self.progress(name)
+        """Time one stage; one that comes again is not announced again."""
+        if name not in self.seconds:
+            self.progress(name)
         start = time.perf_counter()
         try:
             yield

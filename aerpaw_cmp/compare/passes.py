@@ -265,7 +265,17 @@ def _entered(one: Pass, good: BoolArray, places: dict[bytes, _Places]) -> bytes:
 def cell_means(
     position_m: FloatArray, residual_db: FloatArray, good: BoolArray, cell_m: float
 ) -> tuple[IntArray, FloatArray, FloatArray]:
-    """Squares of the plan that have a sample: (c, 2) numbers east and north in order, mean residual, mean height."""
+    """Squares of the plan that have a sample: (c, 2) numbers east and north in order, mean residual, mean height.
+
+    Parameters
+    ----------
+    position_m : (n, 3)
+    residual_db : (n,)
+    good : (n,) bool
+        Samples that count.
+    cell_m : float
+        Side of a square [m].
+    """
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     found, which = np.unique(cells, axis=0, return_inverse=True)
     which = which.reshape(-1)

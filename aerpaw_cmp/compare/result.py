@@ -82,6 +82,20 @@ class ExpectedOffset:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SnrScore:
+    """A ratio to the noise against the replay's level over thermal noise, nothing fitted, over ``n`` samples.
+
+    ``noise_dbm`` is k T B with the noise figure; ``mean_error_db`` is measured minus predicted, and what is left of the
+    error without that mean is the comparison's RMSE.
+    """
+
+    noise_dbm: float
+    rmse_db: float
+    mean_error_db: float
+    n: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Repeated:
     """What two passes of the same places differ by [dB], over ``n`` pairs."""
 
@@ -135,6 +149,8 @@ class RssFurther:
     averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
+    snr: SnrScore | None = None
+    """Of a ratio to the noise whose receiver's bandwidth is given."""
     repeatability: Mapping[str, Repeated]
     foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]

@@ -41,6 +41,8 @@ class RssSeries:
     link: LinkSettings
     settings_key: str
     """Equal for series whose link settings are equal: they share a replay."""
+    noise_dbm: float | None = None
+    """Of a ratio to the noise: that of the receiver, where its bandwidth or floor is given; None for levels."""
     flagged: Mapping[str, int] = field(default_factory=dict)
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
     serving: FloatArray | None = None
@@ -202,20 +204,50 @@ def _refuse_other_kind(path: Path, reader: Reader) -> None:
     )
 
 
-RATIOS = ("quality", "snr")
+SNR = "snr"
+RATIOS = ("quality", SNR)
 """Streams or channels of kind rss that are no levels, as sounder and controller name them."""
 
 
-def is_ratio(stream: Stream) -> bool:
-    """Whether a stream of kind rss is a ratio to the noise."""
-    names = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
-    return stream.kind == "rss" and any(name is not None and name.lower() in RATIOS for name in names)
+def is_ratio(stream: Stream, names: Sequence[str] = RATIOS) -> bool:
+    """Whether a stream of kind rss is a ratio to the noise, of one of the names."""
+    known = (stream.name, _text(stream, "channel"), _text(stream, "quantity"))
+    return stream.kind == "rss" and any(name is not None and name.lower() in names for name in known)
+
+
+def _noise(stream: Stream, link: LinkSettings) -> tuple[float | None, LinkSettings]:
+    """Noise [dBm] under an SNR, where the flight file gives it, and the link as such a receiver hears it.
+
+    An estimator reports ratios below 0 dB too (it knows the signal): its own noise cuts nothing off.
+    """
+    if not is_ratio(stream, (SNR,)) or (link.noise_floor_dbm is None and link.bandwidth_hz is None):
+        return None, link
+    free = {"noise_floor_dbm": None, "bandwidth_hz": None, "noise_figure_db": None}
+    return link.floor_dbm, link.model_copy(update=free)
 
 
 def gather(
     settings: FlightFile, folder: Path, files: Sequence[IngestedFile], logs_root: Path | None = None
 ) -> FlightData:
-    """Sort the streams into track, RSS and rank, and check that they belong together."""
+    """Sort the streams into track, RSS and rank, and check that they belong together.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file.
+    files : sequence of IngestedFile
+        In the order of ``settings.logs``.
+    logs_root : Path, optional
+        Where logs and antenna files resolve, in place of ``folder``.
+
+    Raises
+    ------
+    UsageError
+        A log without a tower, a tower that the site does not have, two records at one time.
+    InputError
+        No position, no row that may be compared, a flight far from every tower.
+    """
     site = with_ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder)
     warnings: list[str] = []
     telemetry: list[tuple[str, Stream]] = []
@@ -239,12 +271,7 @@ def gather(
             warnings.append(
                 f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
             )
-        if ratios := [s.name for s in file.result.streams if is_ratio(s) and s.name not in log.skip]:
-            shown = ", ".join(map(repr, ratios)) + (" is a ratio" if len(ratios) == 1 else " are ratios")
-            warnings.append(
-                f"{log.path}: {shown} to the noise, no level: compared as RSS as if the noise were constant "
-                f"('skip: [{', '.join(ratios)}]' beside the path leaves it out)"
-            )
+        warnings += _of_ratios(settings, log, file.result.streams)
     if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
@@ -263,6 +290,29 @@ def gather(
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
+    """What is said of streams that are compared with a level over noise, or as if they were one."""
+    kept = [s for s in streams if is_ratio(s) and s.name not in log.skip]
+    blind = [s.name for s in kept if _noise(s, _link_of(settings, log, s))[0] is None]
+    if not blind:
+        return []
+    shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
+    return [
+        f"{log.path}: {shown} to the noise, no level: compared as RSS over constant noise ('bandwidth_hz' and "
+        f"'noise_figure_db' of link.rss make an SNR absolute; 'skip: [{', '.join(blind)}]' beside the path leaves "
+        "it out)"
+    ]
+
+
+def _link_of(settings: FlightFile, log: LogSettings, stream: Stream) -> LinkSettings:
+    """Of the stream's channel."""
+    return settings.link.channels.get(_channel_of(log, stream), settings.link.rss)
+
+
+def _channel_of(log: LogSettings, stream: Stream) -> str:
+    return log.channel or _text(stream, "channel") or stream.name
 
 
 def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings: list[str]) -> Track:
@@ -407,8 +457,8 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
     pci = stream.attributes.get("pci")
     home = log.cells.get(int(pci)) if pci is not None else None
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
-    channel = log.channel or _text(stream, "channel") or stream.name
-    link = settings.link.channels.get(channel, settings.link.rss)
+    channel = _channel_of(log, stream)
+    noise_dbm, link = _noise(stream, _link_of(settings, log, stream))
     frame, left_out = _scored(stream, log.path)
     return RssSeries(
         tower=tower,
@@ -418,6 +468,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         measured_db=frame["rss_db"].to_numpy(np.float64),
         link=link,
         settings_key=link.model_dump_json(),
+        noise_dbm=noise_dbm,
         log=np.full(len(frame), settings.logs.index(log), dtype=np.int64),
         line=frame["line"].to_numpy(np.int64),
         flagged=left_out,

@@ -32,6 +32,9 @@ _RIVAL = 10.83
 _SCANNED = 6000
 """The search runs on at most this many samples; the refinement on all."""
 
+_HELD = 1 << 15
+"""Residuals held at once by the search: they stay in a core's cache."""
+
 _INDEPENDENT = 0.7
 """Share of the evidence of several channels that counts: one airframe and one path make their residuals alike."""
 
@@ -264,7 +267,23 @@ def sample(
     resolution_s: float,
     origin_ns: int | None = None,
 ) -> Sampled | str:
-    """Samples that have a level, and the prediction sampled around them; a reason where they are too few."""
+    """Samples that have a level, and the prediction sampled around them; a reason where they are too few.
+
+    Parameters
+    ----------
+    times : (n,)
+        datetime64; NaT does not count.
+    measured_db : (n,)
+        NaN does not count [dB].
+    predictor : callable
+        Level (m,) [dB] at instants (m,).
+    window_s : float
+        Largest lag [s].
+    resolution_s : float
+        Step of the prediction [s].
+    origin_ns : int, optional
+        Zero of the seconds; by default the first instant.
+    """
     stamp, levels = nanoseconds(times).ravel(), np.asarray(measured_db, dtype=np.float64).ravel()
     if stamp.shape != levels.shape:
         raise ValueError(f"{len(stamp)} times and {len(levels)} levels")
@@ -301,7 +320,18 @@ def symmetric(window: float, step: float) -> FloatArray:
 
 
 def no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
-    """A failed fit."""
+    """A failed fit.
+
+    Parameters
+    ----------
+    reason : str
+    n : int
+        Samples there were.
+    window_s : float
+        Largest lag [s]: all the interval says.
+    lags : (m,)
+        Lags that would have been tried [s].
+    """
     nan = float("nan")
     return LagFit(
         radio_minus_telemetry_s=nan,
@@ -332,6 +362,21 @@ def _cost(residual: FloatArray, phi: float, least: int) -> float:
     """Mean square of the whitened residual about its mean; infinite where too few samples have a prediction."""
     w = _whitened(residual, phi)
     return float(w.var()) if len(w) >= least else float("inf")
+
+
+def _costs(residuals: FloatArray, phi: float, least: int) -> FloatArray:
+    """:func:`_cost` of each row (lags, n), to the last digit; rows without a gap at once."""
+    whole = np.isfinite(residuals).all(axis=1)
+    found = np.empty(len(residuals))
+    if whole.any() and residuals.shape[1] > least:
+        r = residuals if whole.all() else residuals[whole]
+        r = r - r.mean(axis=1, keepdims=True)
+        found[whole] = (r[:, 1:] - phi * r[:, :-1]).var(axis=1)
+    else:
+        whole = np.zeros(len(residuals), dtype=bool)
+    for row in np.flatnonzero(~whole):
+        found[row] = _cost(residuals[row], phi, least)
+    return found
 
 
 def _phi(residual: FloatArray) -> float:
@@ -387,7 +432,21 @@ def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_d
 def fit_lag(
     t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
 ) -> LagFit:
-    """Search, refine, judge."""
+    """Search, refine, judge.
+
+    Parameters
+    ----------
+    t, m : (n,)
+        Times [s] and levels [dB].
+    prediction : callable
+        Level (n,) [dB] at times (n,) [s].
+    lags : (m,)
+        Lags to try first [s].
+    limit_s : float
+        Largest lag [s].
+    drifting : bool
+        Fit a drift, too.
+    """
     middle = 0.5 * float(t[0] + t[-1])
     few = slice(None, None, -(-len(t) // _SCANNED))
     ts, ms = t[few], m[few]
@@ -398,8 +457,18 @@ def fit_lag(
         y = ms - prediction.at(at)
         return y - _explained(y, prediction.terms_at(at), phi) if prediction.terms.shape[1] else y
 
+    def costs(tried: FloatArray, rate: float, phi: float) -> FloatArray:
+        if prediction.terms.shape[1]:
+            return np.array([_cost(residual(float(lag), rate, phi), phi, least) for lag in tried])
+        found = np.empty(len(tried))
+        drifted = rate * (ts - middle)
+        for block in range(0, len(tried), rows := max(1, _HELD // len(ts))):
+            part = slice(block, block + rows)
+            found[part] = _costs(ms - prediction.at(ts - tried[part, None] - drifted), phi, least)
+        return found
+
     def scan(phi: float, rate: float) -> FloatArray:
-        return np.array([_cost(residual(lag, rate, phi), phi, least) for lag in lags])
+        return costs(lags, rate, phi)
 
     plain = scan(0.0, 0.0)
     if not np.isfinite(plain).any():
@@ -413,7 +482,7 @@ def fit_lag(
     still = len(rates) // 2
     if len(ts) * np.log(table[still].min() / table[row, column]) <= _RIVAL:  # no drift where none shows
         row, column = still, best_of(table[still], lags)
-    near = _between(table[row], lags, lambda lag: _cost(residual(lag, float(rates[row]), phi), phi, least))
+    near = _between(table[row], lags, lambda tried: costs(tried, float(rates[row]), phi))
     start = np.array([near, rates[row]])[: 2 if drifting else 1]
     (lag, rate), (width, rate_width), rmse = _refine(t, m, prediction, middle, start)
     # last entry: a constant instead of the prediction
@@ -441,12 +510,12 @@ def fit_lag(
     )
 
 
-def _between(cost: FloatArray, lags: FloatArray, cost_at: Callable[[float], float]) -> float:
+def _between(cost: FloatArray, lags: FloatArray, costs_at: Callable[[FloatArray], FloatArray]) -> float:
     """Best lag on a ten times finer grid around the five best of the scan: interference makes valleys narrower."""
     step = float(lags[1] - lags[0])
     coarse = lags[np.argsort(np.where(np.isfinite(cost), cost, np.inf), kind="stable")[:5]]
     fine = (coarse[:, None] + np.arange(-6, 7) * (step / 10.0)).ravel()
-    return float(fine[best_of(np.array([cost_at(float(lag)) for lag in fine]), fine)])
+    return float(fine[best_of(costs_at(fine), fine)])
 
 
 def _rates(span_s: float, lag_step_s: float) -> FloatArray:

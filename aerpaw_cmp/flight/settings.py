@@ -360,6 +360,8 @@ class RtSettings(Settings):
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
+    threads: Annotated[int, Field(ge=1, le=1024)] | None = None
+    """Of compiled code; by default the cores this process may use. Results do not depend on it."""
 
 
 class PortSettings(Settings):
@@ -453,6 +455,10 @@ class ReportSettings(Settings):
     title: str | None = None
     waypoints: list[Waypoint] = []
     speed_table: bool = True
+    audit: Literal["now", "later"] = "now"
+    """``later``: the report is written without the audit and the table of speed; ``aerpaw-cmp audit`` fills them in."""
+    export: list[Literal["geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet", "all"]] = []
+    """Formats of the samples besides rss.csv and rank.csv."""
 
 
 class FlightFile(Settings):

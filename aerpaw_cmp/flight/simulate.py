@@ -116,7 +116,18 @@ def plan_attitude(trajectory: Trajectory, time_s: FloatArray) -> tuple[FloatArra
 def telemetry_frame(
     trajectory: Trajectory, start_utc: pd.Timestamp, interval_s: float, frame: SiteFrame
 ) -> pd.DataFrame:
-    """Telemetry records of the trajectory; altitude counts from the first position."""
+    """Telemetry records of the trajectory; altitude counts from the first position.
+
+    Parameters
+    ----------
+    trajectory : Trajectory
+    start_utc : Timestamp
+        Of the first row.
+    interval_s : float
+        Between rows [s].
+    frame : SiteFrame
+        Local to geographic.
+    """
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
     position = trajectory.position_at(time_s)
     velocity = trajectory.velocity_at(time_s)
@@ -152,7 +163,22 @@ def times_after(start_utc: pd.Timestamp, seconds: FloatArray) -> pd.Series:
 def correlated_noise(
     generator: np.random.Generator, count: int, standard_deviation: float, step_s: float, correlation_s: float
 ) -> FloatArray:
-    """First-order autoregressive Gaussian noise with the stated standard deviation and correlation time."""
+    """First-order autoregressive Gaussian noise with the stated standard deviation and correlation time.
+
+    Parameters
+    ----------
+    generator : Generator
+    count : int
+        Samples.
+    standard_deviation : float
+        Of each sample.
+    step_s, correlation_s : float
+        Between samples; time after which the correlation is 1/e [s].
+
+    Returns
+    -------
+    (count,)
+    """
     from scipy.signal import lfilter
 
     if count == 0 or standard_deviation == 0:

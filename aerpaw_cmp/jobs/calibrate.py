@@ -28,7 +28,7 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import RATIOS, FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, SNR, FlightData, RssSeries, gather, read_logs
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
@@ -184,8 +184,11 @@ def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
     carriers: dict[str, dict[str, float]] = {}
     for data in flights:
         name = data.settings.flight.name
+        has_level = any(s.channel.lower() not in RATIOS for s in data.rss)
         for series in data.rss:
-            if series.channel.lower() in RATIOS:
+            if series.channel.lower() == SNR and not has_level:
+                warnings.append(f"{name}: {series.tower} {SNR} stands for a level: the noise is taken as constant")
+            elif series.channel.lower() in RATIOS:
                 warnings.append(f"{name}: {series.channel} is a ratio, no level: left out")
                 continue
             one, guessed = _observe(data, series)

@@ -100,7 +100,17 @@ def settings_text(found: Calibration, folder_name: str) -> str:
 def record_of(
     found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
 ) -> CalibrationData:
-    """All that the page shows."""
+    """All that the page shows.
+
+    Parameters
+    ----------
+    found : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    text : str
+        The settings to copy into a flight file.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+    """
     model = found.learned.choice.model
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
@@ -142,13 +152,24 @@ def _place(found: Calibration, place: Learned) -> dict[str, FloatArray]:
     first = place.fit.antennas[0]
     own = [o.samples for o in found.observed if o.samples.antenna == first]
     thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
-    gain = [place.fit.predict(s, ("place",))[0] for s in thin]
+    gain = [place.fit.mean(s, ("place",)) for s in thin]
     position = np.concatenate([s.position_m for s in thin])
     return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 
 
 def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[str, float]) -> tuple[Any, str]:
-    """Fill the folder of a calibration; gives its record and the text of calibrated.yaml."""
+    """Fill the folder of a calibration; gives its record and the text of calibrated.yaml.
+
+    Parameters
+    ----------
+    found : Calibration
+    folder : Path
+        Exists, and is swapped for the old one by the caller.
+    name : str
+        Of the folder, as the settings name its files.
+    stages_s : mapping of str to float
+        Time of each stage [s].
+    """
     maps = antenna_maps(found)
     carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
     for file, text in antenna_files(found, maps, carrier).items():

@@ -68,6 +68,8 @@ class CampaignFile(Settings):
     repeatability: RepeatSettings = RepeatSettings()
     keep: str | None = None
     """Where outcomes are kept: a folder, against this file's, or a URL such as ``s3://bucket/season``."""
+    export: list[str] = Field(default_factory=list)
+    """Formats of the samples: those of ``report.export`` of a flight."""
 
 
 def load_campaign(path: Path) -> CampaignFile:
@@ -180,6 +182,7 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
+        flown_ranks=tuple(one for o in results for one in o.flown),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),

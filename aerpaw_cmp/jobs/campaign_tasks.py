@@ -25,11 +25,9 @@ from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, RssSettings, load_flight
 from ..report import campaign_data
-from ..report.campaign_data import Failure, FlownTrack, RankRow, RssRow
-from . import over_flights
+from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from .flight_run import run_flight
 from .outcomes import OutcomeStore, code_digest, records_of, task_inputs, task_key
-from .over_flights import RankFlown
 from .place import open_place
 
 _this = sys.modules[__name__]
@@ -56,7 +54,7 @@ class Outcome:
     rank: tuple[RankRow, ...] = ()
     failure: Failure | None = None
     track: FlownTrack | None = None
-    flown: tuple[RankFlown, ...] = ()
+    flown: tuple[FlownRank, ...] = ()
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -112,7 +110,15 @@ def run_task(task: Task) -> Outcome:
         rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
         track=_flown(task, found.result),
         flown=tuple(
-            RankFlown(flight=task.flight, tower=one.tower, position_m=one.position_m, rank=one.measured)
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
             for one in found.result.rank
         ),
     )
@@ -242,7 +248,7 @@ def task_facts(task: Task) -> Facts:
 
 def outcome_store(keep: str) -> OutcomeStore:
     """The outcomes of campaigns in a folder or object store."""
-    return OutcomeStore(open_place(keep), records_of(_this, over_flights, campaign_data, rank, result, rss, statistics))
+    return OutcomeStore(open_place(keep), records_of(_this, campaign_data, rank, result, rss, statistics))
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
@@ -273,6 +279,10 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
 def _flown(task: Task, result: FlightResult) -> FlownTrack:
     first = result.rss[0] if result.rss else result.rank[0]
     return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
 
 
 def _elapsed_s(time: AnyArray) -> FloatArray:
@@ -306,6 +316,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         measured_db=found.measured_db,
         simulated_dbm=found.simulated_dbm,
         time_s=_elapsed_s(found.time),
+        start_ns=_start_ns(found.time),
         position_m=found.position_m,
         distance_m=found.geometry["distance_m"],
         heading_deg=found.geometry.get("heading_deg"),

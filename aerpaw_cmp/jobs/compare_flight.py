@@ -31,6 +31,7 @@ from ..compare.result import (
     Repeated,
     RssFurther,
     RssResult,
+    SnrScore,
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
@@ -168,6 +169,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
             censored=_censored(settings, levels),
+            snr=_snr(series, levels),
             expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
@@ -263,6 +265,22 @@ def _expected(
         receiver_reference_dbm=received,
         transmitter_reference_dbm=sent,
         fitted_minus_expected_db=offset_db - expected,
+    )
+
+
+def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
+    """The replay's level over the receiver's noise against the logged ratio, without any offset."""
+    if series.noise_dbm is None:
+        return None
+    error_db = levels.measured_db - (levels.simulated_db - series.noise_dbm)
+    error_db = error_db[np.isfinite(error_db)]
+    if not len(error_db):
+        return None
+    return SnrScore(
+        noise_dbm=series.noise_dbm,
+        rmse_db=float(np.sqrt(np.mean(error_db**2))),
+        mean_error_db=float(error_db.mean()),
+        n=len(error_db),
     )
 
 

@@ -36,6 +36,7 @@ from ..maps.job import (
     PAPER_KS,
     PAPER_RANK_ALTITUDES_M,
     PAPER_RSS_ALTITUDES_M,
+    RATIO_LIMIT_DB,
     Antennas,
     Evaluate,
     Evaluation,
@@ -44,6 +45,7 @@ from ..maps.job import (
     layers_of,
     map_job,
 )
+from ..maps.netcdf import write_netcdf
 from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
@@ -60,8 +62,6 @@ from .what_if import p833_note
 FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
 
-RATIO_LIMIT_DB = 180.0
-"""Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
 RATIOS = ("spread", "condition")
 
 
@@ -398,7 +398,9 @@ def maps_record(
         borders_m=tuple(border.line_m for border in result.borders),
         rss=rss,
         rank=rank,
+        rank_by_tower=tuple(one for mode, maps in outcome.ordered() for one in _tower_rank_maps(maps, mode)),
         layers=tuple(_further_layers(outcome)),
+        further=tuple(_linked_layers(outcome)),
         correlation=tuple(_correlation_panels(outcome)),
         errors=tuple(_errors(outcome)),
         learning=tuple(_learning(outcome)),
@@ -439,6 +441,45 @@ def _rank_maps(result: MapResult, mode: str) -> Iterator[page.RankMap]:
                 share=shares[row, column],
                 foliage=mode,
             )
+
+
+def _tower_rank_maps(result: MapResult, mode: str) -> Iterator[page.RankMap]:
+    """Rank to each tower alone."""
+    for tower in result.tower_names if len(result.tower_names) > 1 else ():
+        ranks, shares = result.ranks(tower), result.rank_shares(tower)
+        for column, k in enumerate(result.ks):
+            for row, height in enumerate(result.rank_altitudes_m):
+                yield page.RankMap(
+                    k=k, altitude_m=height, rank=result.grid.raster(ranks[row, column]).astype(np.int64),
+                    share=shares[row, column], foliage=mode, tower=tower,
+                )  # fmt: skip
+
+
+def _linked_layers(outcome: MapOutcome) -> Iterator[page.MapLayer]:
+    """Layers of the linked map alone: how many towers cover a position, at what share of heights, which one serves."""
+    kinds: tuple[Antennas, ...] = ("mimo", "siso")
+    for mode, result in outcome.ordered():
+        raster = result.grid.raster
+        for antennas in kinds:
+            axes = {"Antennas": antennas.upper(), "Foliage": mode}
+            each = np.isfinite(result.rss_mimo_dbm if antennas == "mimo" else result.rss_siso_dbm)
+            for row, height in enumerate(result.rss_altitudes_m):
+                yield page.MapLayer(
+                    quantity="Towers in coverage", unit="towers", axes={**axes, "Height": f"{height:g} m"},
+                    values=raster(each[row].sum(axis=0).astype(np.float64)),
+                )  # fmt: skip
+            for tower in (None, *result.tower_names) if len(result.rss_altitudes_m) > 1 else ():
+                covered = np.isfinite(result.rss(antennas, tower)).mean(axis=0)
+                yield page.MapLayer(
+                    quantity="Probability of coverage over heights", unit="%",
+                    axes={"Tower": tower or page.JOINT, **axes}, values=raster(100.0 * covered),
+                )  # fmt: skip
+    shown = outcome.shown
+    if len(shown.tower_names) > 1:
+        yield page.MapLayer(
+            quantity="Serving tower", unit="", axes={}, values=shown.grid.raster(shown.serving.astype(np.float64)),
+            classes=shown.tower_names,
+        )  # fmt: skip
 
 
 def _further_layers(outcome: MapOutcome) -> Iterator[page.Layer]:
@@ -653,7 +694,8 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         export.write_kmz(folder / "maps.kmz", grid, site.frame, shown, towers, borders, title=site.name),
     ]
     try:
-        written.append(export.write_netcdf(folder / "maps.nc", grid, site.frame, every, site.name))
+        made = {name: str(summary.get(name, "")) for name in ("generated", "version")}
+        written.append(write_netcdf(folder / "maps.nc", dict(outcome.ordered()), site.frame, title=site.name, **made))
         written.append(export.write_geotiff(folder / "maps.tif", grid, site.frame, joint))
     except UsageError as missing:
         progress(str(missing))

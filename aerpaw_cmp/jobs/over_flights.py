@@ -24,7 +24,7 @@ from ..compare.offset import Pooling, pooled_offsets
 from ..compare.passes import Pass, PassPair, PassTable
 from ..compare.rank import repeat_rank
 from ..flight.settings import Positive, Settings
-from ..report.campaign_data import PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
+from ..report.campaign_data import FlownRank, PooledOffset, RankPairing, RankRow, RankTransfer, Repeat, RssRow
 from .place import open_place
 from .workers import Lost, Workers
 
@@ -38,16 +38,6 @@ class RepeatSettings(Settings):
     heading_within_deg: Positive | None = 20.0
     """Headings of a pair agree within this; null: any heading."""
     cell_m: Positive = 20.0
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class RankFlown:
-    """Reported ranks (n,), NaN where none, and where: ``position_m`` (n, 3)."""
-
-    flight: str
-    tower: str
-    position_m: FloatArray
-    rank: FloatArray
 
 
 def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], list[PooledOffset]]:
@@ -268,7 +258,7 @@ def _repeat(pair: PassPair, first: RssRow, second: RssRow, known: int) -> Repeat
     )
 
 
-def rank_repeats(flown: Sequence[RankFlown], radius_m: float) -> list[RankPairing]:
+def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairing]:
     """Every pair of flights that reported ranks to one tower at the same places."""
     out = []
     boxes = [_box(one.position_m) for one in flown]

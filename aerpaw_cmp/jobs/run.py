@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -154,6 +154,8 @@ def run_report(
     force: bool = False,
     figures: str = "page",
     style: str = "screen",
+    export: Sequence[str] = (),
+    same_inputs: Sequence[Mapping[str, Any]] | None = None,
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
@@ -166,7 +168,8 @@ def run_report(
     out, logs_root : Path, optional
         Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
-        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit and the
+        table of speed are left to :func:`run_audit`.
     recommend : Path, optional
         Where to write it.
     force : bool
@@ -174,6 +177,10 @@ def run_report(
     figures : {"page", "none", "svg", "png", "pdf", "all"}
         What is drawn: what the page shows, nothing, or every figure in one format or in all.
     style : {"screen", "paper"}
+    export : sequence of str
+        Formats of the samples besides those of ``report.export``.
+    same_inputs : sequence of mapping, optional
+        ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
     progress : Progress
 
     Raises
@@ -183,12 +190,15 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
+    from ..report.exports.write import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
+    from .later_audit import refuse_changed, with_later_audit
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
+    formats = chosen_formats([*settings.report.export, *export])
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -199,14 +209,67 @@ def run_report(
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
         record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
+        record = with_later_audit(record, settings, flight, folder, logs_root, asked)
+        if same_inputs is not None:
+            refuse_changed(same_inputs, record)
         if target is not None:
             from .ladder import recommended_text
 
             target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
         with output.filling() as place:
-            record = write_report(record, place, drawn=figures, style=style, stages=stages).data
+            record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def run_audit(
+    target: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    links: str | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> ReportOutcome:
+    """Fill the audit and the table of speed into an existing report, whose folder is exchanged as a whole.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of a report, or the flight file that it was made from.
+    out : Path, optional
+        Folder of the report, where ``target`` is a flight file (default ``reports/<flight>``).
+    logs_root : Path, optional
+        In place of the one that the report was made with.
+    links : str, optional
+        Number of audited links or "full", in place of ``rt.audit_links``.
+    force : bool
+        Replace also what was changed in the folder by hand.
+    progress : Progress
+
+    Raises
+    ------
+    UsageError
+        No report there, or no number of links.
+    InputError
+        An input is gone, or has changed since.
+    """
+    from .later_audit import earlier_report
+
+    if links is not None and links != "full" and not (links.isdecimal() and int(links)):
+        raise UsageError(f"--links {links!r}", expected="a number of links above 0, or 'full'")
+    earlier = earlier_report(target, out)
+    return run_report(
+        earlier.flight,
+        out=earlier.folder,
+        logs_root=logs_root or earlier.logs_root,
+        audit=links or str(earlier.audit_links),
+        force=force,
+        same_inputs=earlier.inputs,
+        progress=progress,
+        **earlier.asked,
+    )
 
 
 def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
@@ -240,7 +303,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     found = run_flight(data, stages, ladder=True)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
-    if settings.report.speed_table and settings.rt.audit_links:
+    if settings.report.speed_table and settings.rt.audit_links and settings.report.audit == "now":
         with stages("speed"):
             from .speed_table import speed_rows
 
@@ -268,12 +331,14 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
         if engine not in ("image", "sionna"):
             raise UsageError(f"--engine {engine!r}", expected="image or sionna")
         change["engine"] = engine
+    report = settings.report
     if audit is not None:
-        numbers = {"full": 10**9, "none": 0}
-        if audit not in numbers and not audit.isdigit():
-            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
-        change["audit_links"] = numbers.get(audit, int(audit) if audit.isdigit() else 0)
-    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
+        numbers = {"full": 10**9, "none": 0, "later": settings.rt.audit_links}
+        if audit not in numbers and not audit.isdecimal():
+            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full', 'none' or 'later'")
+        change["audit_links"] = numbers[audit] if audit in numbers else int(audit)
+        report = report.model_copy(update={"audit": "later" if audit == "later" else "now"})
+    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change), "report": report})
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -285,6 +350,8 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
                 failed.append(f"{tower} {channel}: no sample could be compared")
             elif m["at_search_edge"]:
                 failed.append(f"{tower} {channel}: the best offset lies at the edge of the searched span")
+    if metrics.get("audit_command"):
+        failed.append(f"the replay engine is not audited yet: run {metrics['audit_command']}")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
@@ -574,7 +641,8 @@ def run_map(
         generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with output.filling() as part:
             with stages("export"):
-                files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
+                about = {"site": place.name, "generated": generated, "version": versions()["aerpaw-cmp"]}
+                files = mapping.export_maps(outcome, part, about, progress)
             progress("page")
             record = mapping.maps_record(
                 outcome,
@@ -632,6 +700,7 @@ def run_campaign(
     keep: str | None = None,
     fresh: bool = False,
     force: bool = False,
+    export: Sequence[str] = (),
     progress: Progress = silent,
 ) -> CampaignOutcome:
     """Many flights and settings: replay, compare, pool, hold out, report.
@@ -655,6 +724,8 @@ def run_campaign(
         Keep nothing and take nothing.
     force : bool
         Write into a folder that holds files of others.
+    export : sequence of str
+        Formats of the samples of the first setting, besides those that campaign.yaml names.
     progress : Progress
 
     Raises
@@ -666,11 +737,13 @@ def run_campaign(
 
     from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
+    from ..report.exports.write import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
 
     stages = Stages(progress)
     campaign = load_campaign(path)
+    formats = chosen_formats([*campaign.export, *export])
     inputs = input_files(campaign, path)
     for entry in campaign.flights:
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
@@ -688,7 +761,8 @@ def run_campaign(
             progress=progress,
         )
         with stages("report"), output.filling() as place:
-            write_campaign(replace(data, stages_s=dict(stages.seconds)), place)
+            finished = replace(data, stages_s=dict(stages.seconds))
+            write_campaign(finished, place, exports=formats, progress=progress)
             write_tracebacks(data.failures, place)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
@@ -749,6 +823,19 @@ def run_calibrate(
     progress: Progress = silent,
 ) -> CalibrateOutcome:
     """Learn antennas from flights; write ``calibrated.yaml`` and, in the folder of its name, antennas and page.
+
+    Parameters
+    ----------
+    path : Path
+        calibration.yaml.
+    out : Path, optional
+        The file to write; the folder lies beside it.
+    logs_root : Path, optional
+        Where the paths of logs and antennas resolve.
+    force : bool
+        Replace also what this tool did not write; never an input.
+    progress : Progress
+        Stage and share done.
 
     Raises
     ------

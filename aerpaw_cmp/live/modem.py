@@ -128,6 +128,17 @@ LTE_BANDWIDTH_MHZ = (1.4, 3, 5, 10, 15, 20)
 def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -> int | None:
     """Integer field in its range, else None; why goes into ``flags``.
 
+    Parameters
+    ----------
+    name : str
+        Field, a key of ``RANGES``.
+    text : str or None
+        As the modem wrote it.
+    flags : list of str
+        Receives why there is no value.
+    prefix : str
+        Before the field in the flag.
+
     Examples
     --------
     >>> flags = []
@@ -257,7 +268,17 @@ def decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
 
 
 def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: str) -> Values:
-    """``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology."""
+    """``+QRSRP: <PRX>,<DRX>,<RX2>,<RX3>[,<sysmode>]``, one line per radio access technology.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Of the answer.
+    flags : list of str
+        Receives what was odd.
+    command, kind : str
+        Such as ``+QRSRP``; the field that its values get.
+    """
     values: Values = {}
     for line in lines:
         payload = payload_of(line, command)
@@ -278,7 +299,19 @@ def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: 
 
 
 def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Sequence[str]) -> Values:
-    """Rows of text fields under names; for answers kept for the record, not computed with."""
+    """Rows of text fields under names; for answers kept for the record, not computed with.
+
+    Parameters
+    ----------
+    lines : sequence of str
+        Of the answer.
+    flags : list of str
+        Receives what was odd.
+    command : str
+        Such as ``+QCAINFO``.
+    names : sequence of str
+        Of the fields, in order.
+    """
     rows: list[Values] = []
     for line in lines:
         payload = payload_of(line, command)

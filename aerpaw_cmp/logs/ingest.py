@@ -303,7 +303,7 @@ def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -
     from . import limits
 
     least = blocks.FROM_BYTES // 16 if _raw(place, 2) == _GZIP else blocks.FROM_BYTES
-    if place.stat().st_size < least or reader is None or reader.apart is None:
+    if place.stat().st_size < least or reader is None or reader.in_blocks is None:
         return None
     given = _options(place, options, _beside(place))
     try:

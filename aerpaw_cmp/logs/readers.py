@@ -7,7 +7,7 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Literal
@@ -18,6 +18,9 @@ from .records import Kind, ReadResult
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
 HEAD_BYTES = 65_536
 """Sniffers see at most this much of a file."""
+
+InBlocks = Callable[[Iterator[bytes], "ReadOptions"], ReadResult]
+"""Reads a log from the pieces of its file."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,9 +91,9 @@ class Reader:
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool
         Is a file of a few records a piece of the log that its folder holds?
-    apart : re.Pattern, optional
-        Lines that are read alone, one record each: between two of them a large file may be cut. None where a line
-        needs others (a header, a block it stands in).
+    in_blocks : callable, optional
+        ``in_blocks(chunks, options) -> ReadResult``: the same from pieces of the file, in memory that its size does not
+        move; see :func:`aerpaw_cmp.logs.blocks.by_lines`. None where a file is read in one piece.
     """
 
     name: str
@@ -100,7 +103,7 @@ class Reader:
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
-    apart: re.Pattern[bytes] | None = None
+    in_blocks: InBlocks | None = None
 
 
 @cache

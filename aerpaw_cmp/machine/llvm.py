@@ -241,7 +241,18 @@ def try_library(
     program: str = TRIAL_PROGRAM,
     timeout_s: float = TRIAL_TIMEOUT_S,
 ) -> Trial:
-    """Trace two paths with this library in a child process (about 2 s); never raises, never crashes."""
+    """Trace two paths with this library in a child process (about 2 s); never raises, never crashes.
+
+    Parameters
+    ----------
+    library : Library
+    python : str
+        Interpreter of the child.
+    program : str
+        What it runs: prints one JSON line.
+    timeout_s : float
+        After it the child is ended and the trial has failed [s].
+    """
     if reason := _too_old(library.version):
         return Trial(library, False, reason)
     reason, answer = _run_trial(library, "llvm_ad_mono_polarized", python, program, timeout_s)

@@ -191,6 +191,17 @@ def uav_comparison_array(
     Slants alternate between neighbours in both directions. Which mounting the modem had is not published: with the
     tower at 12 m this one leaves a total variation of 0.06 and 0.09 to the measured ranks of two flights at K = 10,
     alternating along the numbering 0.07 and 0.11.
+
+    Parameters
+    ----------
+    wavelength_m : float
+        Elements are half of it apart [m].
+    yaw_deg, roll_deg : float
+        Mount: counter-clockwise from the nose (or east), about the boresight [deg].
+    slant_deg : tuple of 4 float
+        Polarisation of each port from vertical [deg].
+    pattern : Pattern, optional
+        Of every element; isotropic by default.
     """
     half = wavelength_m / 4
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
@@ -203,7 +214,18 @@ def uav_comparison_array(
 
 
 def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern: Pattern | None = None) -> Array:
-    """Horizontal line of vertical elements; the paper's maps use 4 at half a wavelength along the y axis."""
+    """Horizontal line of vertical elements; the paper's maps use 4 at half a wavelength along the y axis.
+
+    Parameters
+    ----------
+    elements : int
+    spacing_m : float
+        Between neighbours [m].
+    yaw_deg : float
+        Of the boresight, counter-clockwise from east; the line is across it [deg].
+    pattern : Pattern, optional
+        Of every element; isotropic by default.
+    """
     along = np.arange(elements, dtype=np.float64) * spacing_m
     return Array(
         _centred_line(along),

@@ -228,7 +228,19 @@ def _spread(poses: Poses, count: int | None) -> IntArray:
 
 
 def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[float] = RANK_K) -> Difference:
-    """Differences of a replay from a reference that has only the poses ``chosen``."""
+    """Differences of a replay from a reference that has only the poses ``chosen``.
+
+    Parameters
+    ----------
+    replay : Replay
+        Of all poses.
+    reference : Replay
+        Of the chosen poses, by the other engine.
+    chosen : (m,) int
+        Rows of ``replay`` that the reference has, in its order.
+    ks : sequence of float
+        Singular-value ratios at which ranks are compared.
+    """
     # numbered together: the facets of crowns that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])
     ours = set(_keys(replay, plane[0], chosen))

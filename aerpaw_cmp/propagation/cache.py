@@ -47,13 +47,25 @@ class PathCache:
         self.told: list[str] = []
 
     def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, settings: Settings) -> str:
-        """Digest of everything that decides the paths."""
+        """Digest of everything that decides the paths.
+
+        Parameters
+        ----------
+        scene : Scene
+            Faces, sources and what hides them.
+        targets_m : (n, 3)
+            Poses [m].
+        carrier_hz : float
+            Counts for Sionna alone: an image path is the same at every frequency.
+        settings : Settings
+            Engine, depth, samples and the rest.
+        """
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]
         if settings.engine == "sionna":
             versions += [metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
             versions += [str(carrier_hz), *scene.faces.material]
-        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()))])
+        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()) if k != "threads")])
         digest.update(text.encode())
         faces = scene.faces
         for polygon in faces.polygon:

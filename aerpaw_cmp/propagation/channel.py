@@ -23,6 +23,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
 from ..site.materials import face_material
+from . import compiled
 from .arrays import Array, Link, Poses
 from .paths import Faces, PathSet
 
@@ -56,6 +57,9 @@ def channel_matrices(
     poses: Poses,
     link: Link,
     loss_db: FloatArray | None = None,
+    *,
+    threads: int | None = None,
+    work: int | None = None,
 ) -> Fields:
     """Channel matrices of a path set.
 
@@ -72,6 +76,11 @@ def channel_matrices(
     link : Link
     loss_db : (paths,), optional
         Further loss of each path, such as foliage.
+    threads : int, optional
+        Of compiled code (default: the cores this process may use); results do not depend on it.
+    work : int, optional
+        Element pairs of all links of the replay that this call is a part of; decides whether compiled code is worth
+        loading (:mod:`aerpaw_cmp.propagation.compiled`).
 
     Returns
     -------
@@ -80,11 +89,37 @@ def channel_matrices(
     Raises
     ------
     UsageError
-        If the towers' arrays have different numbers of elements.
+        If the towers' arrays have different numbers of elements, or an array has patterns for some elements only.
+
+    Notes
+    -----
+    Compiled code differs from NumPy's by rounding: by some 1e-16 of the length in wavelengths, as angles [rad]
+    (``tests/propagation/test_compiled.py``).
     """
     arrays = list(link.tower_arrays.values())
     ports = _ports(arrays)
-    uav = len(link.uav_array)
+    _check_patterns([*arrays, link.uav_array])
+    pairs = ports * len(link.uav_array)
+    kernels = compiled.kernels_for(len(poses) * len(arrays) * pairs if work is None else work)
+    if kernels is not None:
+        from .compiled_field import evaluate
+
+        tables = _Materials.of(faces, link.carrier_hz)
+        electric = (tables.permittivity, tables.thickness_m)
+        h, path_power = evaluate(kernels, paths, faces, electric, sources_m, poses, link, loss_db, threads)
+    else:
+        h, path_power = _in_numpy(paths, faces, sources_m, poses, link, loss_db)
+    links = paths.pose * len(arrays) + paths.tower
+    power = np.bincount(links, weights=path_power, minlength=len(poses) * len(arrays)).astype(np.float64)
+    return Fields(h, path_power, power.reshape(len(poses), len(arrays)))
+
+
+def _in_numpy(
+    paths: PathSet, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link, loss_db: FloatArray | None
+) -> tuple[ComplexArray, FloatArray]:
+    """H (poses, towers, n_rx, n_tx) and the power (paths,) of each path alone."""
+    arrays = list(link.tower_arrays.values())
+    ports, uav = len(arrays[0]), len(link.uav_array)
     h = np.zeros((len(poses) * len(arrays), uav, ports), dtype=np.complex128)
     path_power = np.zeros(len(paths))
     tables = _Materials.of(faces, link.carrier_hz)
@@ -97,15 +132,18 @@ def channel_matrices(
         key = paths.pose[rows] * len(arrays) + tower
         first = np.flatnonzero(np.diff(key, prepend=-1))
         h[key[first]] += np.add.reduceat(one, first, axis=0)
-    link_of = paths.pose * len(arrays) + paths.tower
-    power = np.asarray(np.bincount(link_of, weights=path_power, minlength=len(poses) * len(arrays)), dtype=np.float64)
     if link.uav_transmits:
         h = h.swapaxes(1, 2)
-    return Fields(
-        np.ascontiguousarray(h).reshape(len(poses), len(arrays), *h.shape[1:]),
-        path_power,
-        power.reshape(len(poses), len(arrays)),
-    )
+    return np.ascontiguousarray(h).reshape(len(poses), len(arrays), *h.shape[1:]), path_power
+
+
+def _check_patterns(arrays: Sequence[Array]) -> None:
+    for array in arrays:
+        if len(array.patterns) not in (1, len(array)):
+            raise UsageError(
+                f"{len(array.patterns)} patterns for {len(array)} elements",
+                expected="one shared pattern or one per element",
+            )
 
 
 def _ports(arrays: Sequence[Array]) -> int:
@@ -222,11 +260,6 @@ def _element_fields(array: Array, theta: FloatArray, phi: FloatArray, axis: int)
     """Pattern of each element in its own directions."""
     if len(array.patterns) == 1:
         return array.patterns[0].field(theta, phi)
-    if len(array.patterns) != len(array):
-        raise UsageError(
-            f"{len(array.patterns)} patterns for {len(array)} elements",
-            expected="one shared pattern or one per element",
-        )
     e_theta = np.empty(theta.shape, dtype=np.complex128)
     e_phi = np.empty_like(e_theta)
     for element, pattern in enumerate(array.patterns):

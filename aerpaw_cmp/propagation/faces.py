@@ -280,6 +280,13 @@ def smaller_than_fresnel_zone(
     The zone on a face at distances d1 and d2 has the area ``pi lambda d1 d2 / (d1 + d2)`` at least; a face is
     named only when it is smaller for the nearest source and the nearest target it can have.
 
+    Parameters
+    ----------
+    faces : Faces
+    sources_m, targets_m : (s, 3), (n, 3)
+        Ends of the links [m].
+    frequency_hz : float
+
     Returns
     -------
     (faces,) bool

@@ -138,7 +138,23 @@ def against_reference(
 
 
 def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expected: Expected) -> FieldAudit:
-    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist."""
+    """Paths ``rows`` of a replay, which the other engine lacks, that cannot exist.
+
+    Parameters
+    ----------
+    site : Site
+    poses : Poses
+    replay : Replay
+    rows : (m,) int
+        Paths of the replay.
+    expected : Expected
+        Arrays and loss as the settings say, read a second time.
+
+    Returns
+    -------
+    FieldAudit
+        ``phantom_paths`` and their failures; all else empty.
+    """
     count = 0
     for row in rows:
         tower = int(replay.paths.tower[row])
@@ -339,7 +355,23 @@ def against_sionna(
     batch: int,
     complete: bool = True,
 ) -> FieldAudit:
-    """Each path's power, phase and polarisation against what Sionna itself computes."""
+    """Each path's power, phase and polarisation against what Sionna itself computes.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+    poses : Poses
+    replay : Replay
+    chosen : (m,) int
+        Poses that are asked.
+    expected : Expected
+        Arrays and loss as the settings say, read a second time.
+    max_depth, samples, batch : int
+        Of Sionna's search.
+    complete : bool
+        Ask for the explicit arrays at short range, too.
+    """
     from .sionna import own_coefficients
 
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])

@@ -161,6 +161,15 @@ def foliage_model(
     """A model by the words of flight.yaml: ``none``, ``opaque``, ``attenuating`` (= ``p833``) or ``weissberger``.
 
     ``gamma_db_per_m`` and ``maximum_db`` replace the table's values in P.833.
+
+    Parameters
+    ----------
+    name : str
+    frequency_hz : float
+    in_leaf : bool
+        Season of the tables.
+    gamma_db_per_m, maximum_db : float, optional
+        Specific attenuation [dB/m] and largest loss [dB] in place of P.833's table.
     """
     if name in ("attenuating", "p833"):
         table = P833.at(frequency_hz, in_leaf=in_leaf)
@@ -215,7 +224,7 @@ def foliage_loss_db(
     if isinstance(model, NoFoliage):
         loss = np.zeros(len(source_m))
     else:
-        index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+        index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
         depth = foliage_depth_m(source_m, vertices_m, target_m, index, bounced if opaque else None)
         if opaque:
             depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
@@ -235,10 +244,20 @@ def foliage_depth_m(
     """Length of each path inside crowns (paths,) [m]; arguments as for :func:`foliage_loss_db`.
 
     The crown off which a path bounces does not count on the two segments that meet there: a bounce is on its outside.
+
+    Parameters
+    ----------
+    source_m, target_m : (paths, 3)
+        Ends [m].
+    vertices_m : (paths, depth, 3)
+        Points of reflection [m]; NaN where a path has fewer.
+    trees : Trees or CrownIndex
+    bounced : (paths, depth) int, optional
+        Tree whose crown reflects at each vertex, -1 for none.
     """
     source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
     vertices = np.asarray(vertices_m, dtype=np.float64)
-    index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+    index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
     end = target
     last = vertices.shape[1] - 1
@@ -250,6 +269,18 @@ def foliage_depth_m(
         end = start
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
+
+
+_last_index: list[CrownIndex] = []
+
+
+def crown_index(trees: Trees) -> CrownIndex:
+    """The index of cones of these trees; that of the trees asked for last is kept, as a flight asks many times."""
+    kept = next((one for one in _last_index if one.trees is trees), None)
+    if kept is None:
+        kept = CrownIndex(trees)
+        _last_index[:] = [kept]
+    return kept
 
 
 class CrownIndex:

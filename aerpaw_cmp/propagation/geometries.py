@@ -69,7 +69,19 @@ def every_geometry(
     grounds: Sequence[float],
     sums: Sequence[Ground] = ("power_sum",),
 ) -> tuple[Geometry, ...]:
-    """All combinations; mounts are (yaw, pitch, roll). Geometries of one mount follow each other."""
+    """All combinations; mounts are (yaw, pitch, roll). Geometries of one mount follow each other.
+
+    Parameters
+    ----------
+    mounts_deg : sequence of (yaw, pitch, roll)
+        Of the UAV's array [deg].
+    tower_slants_deg, uav_slants_deg : sequence of tuple of float
+        Polarisation of each port from vertical [deg].
+    grounds : sequence of float
+        Strength of the ground reflection against Fresnel's.
+    sums : sequence of {"power_sum", "coherent", ...}
+        How the two rays add up.
+    """
     return tuple(
         Geometry(
             uav_yaw_deg=yaw,
@@ -153,6 +165,17 @@ def basis_fields(
     """Channel matrices (n, 2 uav ports, 2 tower ports) of line of sight and of the ground reflection alone.
 
     Each port is there twice, vertical then horizontal: :func:`slant_basis` combines them.
+
+    Parameters
+    ----------
+    tower, uav : Array
+        Slants do not count.
+    tower_m : (3,)
+        [m].
+    poses : Poses
+    carrier_hz : float
+    material : str
+        Of the ground.
     """
     link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (material,), ("ground",))

@@ -113,7 +113,23 @@ class ExpectedLoss:
 def layout_positions(
     layout: str, wavelength: float, elements: int = 4, positions_m: Sequence[Sequence[float]] | None = None
 ) -> tuple[Vector, ...]:
-    """Element positions of a layout of flight.yaml, in the device frame (x forward, y left, z up) [m]."""
+    """Element positions of a layout of flight.yaml, in the device frame (x forward, y left, z up) [m].
+
+    Parameters
+    ----------
+    layout : str
+        ``single``, ``linear``, ``tower_comparison``, ``uav_comparison``, ``custom``.
+    wavelength : float
+        [m].
+    elements : int
+        Of ``linear``.
+    positions_m : sequence of (3,), optional
+        Of ``custom`` [m].
+
+    Returns
+    -------
+    tuple of (3,)
+    """
     if layout == "custom":
         return tuple((float(p[0]), float(p[1]), float(p[2])) for p in positions_m or ())
     if layout == "tower_comparison":  # arXiv 2502.10324 VII-D: 60 mm, 1.68 m, 60 mm, the first port leftmost
@@ -314,7 +330,17 @@ class Blocks:
         self._shapes: dict[float, list[Polygon]] = {}
 
     def cut(self, a: Vector, b: Vector, grow_m: float, spared: tuple[int, ...] = ()) -> bool:
-        """Whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little."""
+        """Whether a segment runs through a building; those in ``spared`` (it ends on them) are shrunk a little.
+
+        Parameters
+        ----------
+        a, b : (3,)
+            Ends [m].
+        grow_m : float
+            Every other building is taken this much larger on all sides [m].
+        spared : tuple of int
+            Numbers of the buildings that the segment ends on.
+        """
         shadow = LineString([a[:2], b[:2]])
         for number, building in enumerate(self._site.buildings):
             grown = -MARGIN_M / 10 if number in spared else grow_m
@@ -422,7 +448,24 @@ class Reference:
         return None if strict or worst < margin_m else True
 
     def pair(self, sequence: Sequence[Mirror], tx: int, rx: int, target: Vector, turn: Matrix) -> complex:
-        """Amplitude of one path between tower element ``tx`` and UAV element ``rx``, without foliage."""
+        """Amplitude of one path between tower element ``tx`` and UAV element ``rx``, without foliage.
+
+        Parameters
+        ----------
+        sequence : sequence of Mirror
+            What the path meets, from the tower on.
+        tx, rx : int
+            Elements of tower and UAV.
+        target : (3,)
+            Centre of the UAV's array [m].
+        turn : (3, 3)
+            Body to site.
+
+        Returns
+        -------
+        complex
+            Such that its squared magnitude is received over sent power; 0 where the path does not exist.
+        """
         tower, uav = self.link.towers[self.tower], self.link.uav
         start = _plus(self.source, _times(tower.mount, tower.positions_m[tx]))
         uav_turn = product(turn, uav.mount)
@@ -504,7 +547,19 @@ class Reference:
 
 
 def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: float) -> tuple[complex, complex]:
-    """Reflection (TE, TM) of ITU-R P.2040-4 (31): half-space; with a thickness the slab of (43) and (44)."""
+    """Reflection (TE, TM) of ITU-R P.2040-4 (31): half-space; with a thickness the slab of (43) and (44).
+
+    Parameters
+    ----------
+    cosine : float
+        Of the angle of incidence from the normal.
+    eta : complex
+        Relative permittivity.
+    thickness_m : float or None
+        Of the slab [m]; None: half-space.
+    wavelength : float
+        In vacuum [m].
+    """
     refracted = cmath.sqrt(eta - (1 - cosine * cosine))
     te, tm = (cosine - refracted) / (cosine + refracted), (eta * cosine - refracted) / (eta * cosine + refracted)
     if thickness_m is None:
@@ -578,6 +633,16 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trun
 
     The largest of the distances outside base, top and side is a convex function along the segment: its minimum by
     golden section, then the two ends of the chord by bisection.
+
+    Parameters
+    ----------
+    trees : Trees
+    a, b : (3,)
+        Ends of the segment [m].
+    without : set of int
+        Trees that do not count.
+    trunks : bool
+        The cylinders below in place of the cones.
     """
     start, step = np.array(a), np.array(b) - np.array(a)
     length = float(np.sqrt((step**2).sum()))

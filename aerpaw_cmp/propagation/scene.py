@@ -24,6 +24,7 @@ class Settings:
     samples: int = 1_000_000
     batch: int = 50
     variant: str | None = None
+    threads: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,7 +70,17 @@ class Scene:
         return cls(faces, sources, usable, excluded)
 
     def with_bounces(self, site: Site, poses: Poses, crowns: Crowns, max_depth: int) -> tuple[Scene, PathSet]:
-        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths."""
+        """Scene with the facets of crowns that reflect, as hidden by nothing else than before, and their paths.
+
+        Parameters
+        ----------
+        site : Site
+        poses : Poses
+        crowns : Crowns
+            Those that reflect.
+        max_depth : int
+            Most reflections of a path, the bounce among them.
+        """
         paths, faces = crowns.bounces(
             self.faces,
             self.sources_m,

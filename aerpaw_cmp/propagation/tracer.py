@@ -139,6 +139,7 @@ def replay(
     drop_small_faces: bool = False,
     visibility: Visibility = "centre",
     variant: str | None = None,
+    threads: int | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -176,6 +177,8 @@ def replay(
         searches as a link has element pairs). ``paths`` are those of the centres in any case.
     variant : {"cuda", "llvm"}, optional
         ``sionna`` only.
+    threads : int, optional
+        Of compiled code (default: the cores this process may use); results do not depend on it.
     progress : callable, optional
         Called with the share done.
 
@@ -201,7 +204,7 @@ def replay(
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant)
+    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
     choice = None
     if relevance_db is not None:
         paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
@@ -220,7 +223,7 @@ def replay(
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
-    result = _evaluate(scene, link, poses, paths, engine, loss)
+    result = _evaluate(scene, link, poses, paths, engine, loss, threads)
     if visibility == "pairs":
         small = drop_small_faces
         result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
@@ -395,6 +398,8 @@ def _search_relevant(
         usable=scene.usable,
         excluded=scene.excluded,
         select=chooser,
+        work=_pairs(link, poses),
+        threads=settings.threads,
         progress=progress,
     )
     again = np.zeros(len(poses), dtype=np.bool_)
@@ -443,6 +448,8 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
+            work=_pairs(link, poses),
+            threads=settings.threads,
             progress=progress,
         )
     from . import sionna
@@ -460,6 +467,11 @@ def _search(
         variant=settings.variant,
         progress=progress,
     )
+
+
+def _pairs(link: Link, poses: Poses) -> int:
+    """Element pairs of all links."""
+    return len(poses) * sum(len(array) for array in link.tower_arrays.values()) * len(link.uav_array)
 
 
 def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
@@ -498,10 +510,12 @@ def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tu
     ] if lost else []
 
 
-def _evaluate(scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None) -> Replay:
+def _evaluate(
+    scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None, threads: int | None
+) -> Replay:
     """Fields of the paths; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db)
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import FloatArray
+from ..common.units import FloatArray, IntArray
 from ..compare.passes import cell_means
 from ..compare.result import Repeated
 from ..site.site import Site
@@ -53,6 +53,8 @@ class RssRow:
     position_m: FloatArray = field(repr=False)
     distance_m: FloatArray = field(repr=False)
     heading_deg: FloatArray | None = field(repr=False, default=None)
+    start_ns: int = 0
+    """Instant of ``time_s`` = 0, nanoseconds after 1970-01-01."""
     within: Mapping[str, Repeated] = field(default_factory=dict)
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
@@ -100,6 +102,23 @@ class RankRow:
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
     """Agreement of always saying the commonest rank: what a model has to beat."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class FlownRank:
+    """Samples of the rank of one flight and tower under the first setting.
+
+    ``rank`` (n,) as reported, NaN where none; ``simulated`` by K (n,), 0 where there is no path; ``position_m`` (n, 3);
+    ``time_s`` (n,) after ``start_ns``, nanoseconds after 1970-01-01.
+    """
+
+    flight: str
+    tower: str
+    position_m: FloatArray
+    rank: FloatArray
+    simulated: Mapping[float, IntArray] = field(default_factory=dict)
+    time_s: FloatArray = field(default_factory=lambda: np.zeros(0))
+    start_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -278,6 +297,7 @@ class CampaignData:
     held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()
+    flown_ranks: tuple[FlownRank, ...] = ()
     radius_m: float = 3.0
     heading_within_deg: float | None = 20.0
     cell_m: float = 20.0

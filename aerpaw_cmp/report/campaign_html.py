@@ -12,11 +12,14 @@ import numpy as np
 import pandas as pd
 
 from ..common.jsonable import json_safe
+from ..common.stages import Progress, silent
 from ..compare.result import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
 from .canvas import Picture
 from .export import write_file
+from .exports.samples import of_campaign
+from .exports.write import write_exports
 from .html import by_section, environment, policy
 from .names import k_key
 
@@ -260,13 +263,32 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
     return text
 
 
-def write_campaign(data: CampaignData, folder: str | Path) -> list[Path]:
-    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first."""
+def write_campaign(
+    data: CampaignData, folder: str | Path, *, exports: Sequence[str] = (), progress: Progress = silent
+) -> list[Path]:
+    """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
+
+    With ``exports`` also the samples of the first setting in those formats
+    (:data:`aerpaw_cmp.report.exports.write.FORMATS`).
+
+    Parameters
+    ----------
+    data : CampaignData
+    folder : str or Path
+    exports : sequence of str
+        Formats.
+    progress : Progress
+        Figures done.
+    """
     folder = Path(folder)
     numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
     table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
     written = [write_file(folder / "campaign.json", numbers), write_file(folder / "campaign.csv", table)]
     drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
-    page = write_file(folder / "campaign.html", campaign_page(data, drawn, ["campaign.json", "campaign.csv"]))
+    samples = of_campaign(data) if exports else None
+    exported = [] if samples is None else write_exports(samples, folder, exports, progress)
+    files = ["campaign.json", "campaign.csv", *(path.relative_to(folder).as_posix() for path in exported)]
+    written += exported
+    page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
     return [page, *written]

@@ -42,6 +42,7 @@ class RankMap:
     rank: IntArray
     share: FloatArray
     foliage: str = ""
+    tower: str = JOINT
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -52,6 +53,32 @@ class Layer:
     label: str
     altitude_m: float
     values: FloatArray
+    difference: bool = False
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class MapLayer:
+    """One layer that the page can show.
+
+    Parameters
+    ----------
+    quantity, unit : str
+        Layers of one quantity share a colour scale and can be subtracted.
+    axes : mapping of str to str
+        What tells it from the others of its quantity: "Tower", "Antennas", "Foliage", "K", "Height", with their value.
+    values : (rows, columns)
+        From the south-west; NaN out of coverage.
+    classes : tuple of str
+        Names of the values 0, 1, ... where the layer holds classes.
+    difference : bool
+        Its zero means something: a scale around it.
+    """
+
+    quantity: str
+    unit: str
+    axes: Mapping[str, str]
+    values: FloatArray = field(repr=False, compare=False)
+    classes: tuple[str, ...] = ()
     difference: bool = False
 
 
@@ -119,6 +146,10 @@ class MapsData:
         Centres of the cells [m].
     borders_m : tuple of (2, 2) arrays
         Lines between the areas of two towers (Voronoi), east and north [m].
+    rank : tuple of RankMap
+        The nearest tower serving; ``rank_by_tower`` each alone, for the linked map.
+    further : tuple of MapLayer
+        Layers of the linked map that have no static figure.
     metrics : mapping
         Written to ``metrics.json`` after the tables of this page.
     """
@@ -132,7 +163,9 @@ class MapsData:
     borders_m: tuple[FloatArray, ...] = ()
     rss: tuple[RssMap, ...] = ()
     rank: tuple[RankMap, ...] = ()
+    rank_by_tower: tuple[RankMap, ...] = ()
     layers: tuple[Layer, ...] = ()
+    further: tuple[MapLayer, ...] = ()
     correlation: tuple[Correlation, ...] = ()
     errors: tuple[MapError, ...] = ()
     learning: tuple[LearningCurve, ...] = ()

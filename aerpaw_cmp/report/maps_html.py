@@ -7,12 +7,16 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from markupsafe import Markup
+
 from ..common.jsonable import json_safe
 from . import canvas, maps_figures
 from .canvas import Picture
 from .data import RANKS
+from .explorer import as_json
 from .export import merge, write_file
-from .html import by_section, environment, policy
+from .html import by_section, environment, policy, script
+from .map_explorer import layer_numbers, page_layers, payload
 from .maps_data import MapError, MapsData
 from .names import k_key
 
@@ -39,6 +43,7 @@ def maps_metrics(data: MapsData) -> dict[str, Any]:
             }
             for m in data.rank
         ],
+        "layers": [layer_numbers(layer) for layer in page_layers(data)],
         "mae": [picked(e, "evaluation", "method", "k", "altitude_m", "mae", "mae_ci95", "n") for e in data.errors],
         "paper": [picked(p, "where", "what", "paper", "ours") for p in data.paper],
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
@@ -77,6 +82,8 @@ def error_tables(
 
 def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
+    linked = payload(data) if data.rss or data.rank or data.layers or data.further else None
+    code = script("common.js", "map_explorer.js") if linked else ""
     text: str = environment().get_template("map.html.jinja").render(
         data=data,
         sections=by_section(pictures),
@@ -84,7 +91,9 @@ def maps_page(data: MapsData, pictures: Sequence[Picture], files: Sequence[str])
         errors=error_tables(data.errors),
         names={picture.name for picture in pictures},
         files=files,
-        content_policy=policy(),
+        explorer=Markup(as_json(linked)) if linked else "",
+        script=Markup(code),
+        content_policy=policy(code),
     )  # fmt: skip
     return text
 

@@ -123,7 +123,18 @@ def rss_verdict(panel: RssPanel) -> str:
         return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
     words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
     words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
-    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
+    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB.{_snr_words(panel)}"
+
+
+def _snr_words(panel: RssPanel) -> str:
+    """What a ratio to the noise adds: its error with nothing fitted."""
+    snr = panel.extra.get("snr")
+    if not snr:
+        return ""
+    return (
+        f" As a signal-to-noise ratio over {snr['noise_dbm']:.1f} dBm of noise, nothing fitted, it is "
+        f"{signed(snr['mean_error_db'])} dB from the replay in the mean ({snr['rmse_db']:.1f} dB RMSE)."
+    )
 
 
 def rank_verdict(panel: RankPanel) -> str:
@@ -169,7 +180,11 @@ def warnings(data: ReportData) -> list[str]:
         found += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        found.append("The replay engine was not audited against the other engine in this report.")
+        found.append(
+            f"The replay engine is not audited yet: run {data.audit_command}."
+            if data.audit_command
+            else "The replay engine was not audited against the other engine in this report."
+        )
     if audit is not None and (audit.missing_paths or audit.extra_paths):
         found.append(
             f"The audit found {count(audit.missing_paths)} paths that only the {audit.reference} engine has and "

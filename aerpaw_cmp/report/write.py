@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,7 +12,9 @@ from ..common.stages import Stages
 from . import figures, html
 from .canvas import FORMATS, STYLES, write_plates
 from .data import ReportData
-from .export import metrics, rank_frame, rss_frame, write_file
+from .export import metrics, rank_csv, rss_csv, write_file
+from .exports.samples import of_report
+from .exports.write import FOLDER, write_exports
 
 PAGE = "page"
 FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
@@ -34,6 +37,7 @@ def write_report(
     *,
     drawn: str = PAGE,
     style: str = "screen",
+    exports: Sequence[str] = (),
     stages: Stages | None = None,
 ) -> WrittenReport:
     """Write the files of a report.
@@ -46,6 +50,8 @@ def write_report(
     drawn : str
         One of :data:`FIGURES`.
     style : {"screen", "paper"}
+    exports : sequence of str
+        Formats of :data:`aerpaw_cmp.report.exports.write.FORMATS` for the samples, besides the CSVs.
     stages : Stages, optional
         Times the stage "report"; all its seconds are then those of the record.
 
@@ -62,15 +68,19 @@ def write_report(
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
     written = []
     with stages("report"):
-        for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
+        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
             # written even without rows: a reader finds the same files in every report
-            written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
+            written.append(write_file(folder / name, text))
         plates = [] if drawn == "none" else [p for p in figures.plates(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
         pictures, paths = write_plates(plates, folder / "figures", formats, style, stages.progress)
     written += paths
+    if exports:
+        with stages("exports"):
+            written += write_exports(of_report(data), folder, exports, stages.progress)
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))
-    files = ["metrics.json", *(str(path.relative_to(folder)) for path in written if path.parent == folder)]
+    beside = (folder, folder / FOLDER)
+    files = ["metrics.json", *(path.relative_to(folder).as_posix() for path in written if path.parent in beside)]
     with stages("report"):
         shown = [one for one in pictures if {"png", "svg"} & set(one.formats)]
         page = write_file(folder / "report.html", html.page(data, shown, files))

@@ -599,7 +599,19 @@ def import_site(
         "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *found.credits],
     }
     content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in found.trees]}
-    return SiteModel.model_validate(content), found.actions
+    imported = SiteModel.model_validate(content)
+    return imported, [_kept_of_base(imported, base), *found.actions]
+
+
+def _kept_of_base(model: SiteModel, base: str | Path) -> str:
+    """What an import takes over from its base, in one sentence."""
+    origin = f"{model.origin.latitude_deg:.6f}, {model.origin.longitude_deg:.6f}"
+    ground = "flat ground" if model.dem is None else f"the elevation model {model.dem.path}"
+    return (
+        f"kept from the base '{base}': the name '{model.name}', the origin {origin}, the towers "
+        f"{', '.join(model.towers)} with their positions and antennas, {ground} of {model.ground_material}, tree "
+        "sizes; change them in the file, or name a base of your own with --base"
+    )
 
 
 def _tree_dict(tree: SingleTree) -> dict[str, Any]:

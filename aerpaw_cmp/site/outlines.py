@@ -110,7 +110,19 @@ def reason(error: Exception) -> str:
 
 
 def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
-    """The line of the list about an element that cannot be used."""
+    """The line of the list about an element that cannot be used.
+
+    Parameters
+    ----------
+    path : Path
+        The map.
+    line : int or None
+        Where the element stands.
+    what : str
+        The element.
+    error : Exception
+        Why it cannot be used.
+    """
     place = path.name if line is None else f"{path.name}, line {line}"
     why = reason(error).removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")
     return f"warning: {place}: {what} was left out: {why}"

@@ -94,7 +94,19 @@ def trees_at(
     random: np.random.Generator | None = None,
     ground_m: FloatArray | float = 0.0,
 ) -> Trees:
-    """Trees at given points (n,) [m], with drawn sizes."""
+    """Trees at given points (n,) [m], with drawn sizes.
+
+    Parameters
+    ----------
+    east_m, north_m : (n,)
+        Trunks [m].
+    sizes : TreeSizes, optional
+        What is drawn from.
+    random : Generator, optional
+        By default of seed 0.
+    ground_m : (n,) or float
+        Height of the ground at the trunks [m].
+    """
     sizes = sizes or TreeSizes()
     random = random or np.random.default_rng(0)
     east = np.asarray(east_m, dtype=np.float64)

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray, IntArray
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _lines, _rows
 
@@ -94,16 +94,31 @@ def _serving(found: list[Reading]) -> FloatArray:
     return served
 
 
+def _once(time: AnyArray, served: FloatArray) -> IntArray:
+    """Rows to keep: of two readings of one instant the serving one."""
+    order = np.lexsort((-np.nan_to_num(served), time))
+    return np.asarray(np.sort(order[np.concatenate(([True], np.diff(time[order]) != np.timedelta64(0)))]))
+
+
+def settled(result: ReadResult) -> ReadResult:
+    """A result whose blocks may have cut an instant in two: each cell once at each time."""
+    streams = []
+    for stream in result.streams:
+        if stream.kind == "rss" and "serving" in stream.frame:
+            keep = _once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())
+            if len(keep) < len(stream.frame):
+                stream = replace(stream, frame=stream.frame.iloc[keep].reset_index(drop=True))
+        streams.append(stream)
+    return replace(result, streams=tuple(streams))
+
+
 def _stream(
     rows: _rows.Rows, mine: list[Reading], served: FloatArray, rat: str, pci: float, source: str
 ) -> Stream | None:
     if not mine:
         return None  # a cell whose number is none
     pick: IntArray = np.array([one.row for one in mine], dtype=np.int64)
-    time = rows.time[pick]
-    # of two readings of one instant the serving one is kept
-    order = np.lexsort((-np.nan_to_num(served), time))
-    keep = np.sort(order[np.concatenate(([True], np.diff(time[order]) != np.timedelta64(0)))])
+    keep = _once(rows.time[pick], served)
     pick, mine, served = pick[keep], [mine[i] for i in keep], served[keep]
     level = np.array([one.rsrp_dbm for one in mine])
     flag = rows.flag[pick].copy()

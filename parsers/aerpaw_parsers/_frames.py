@@ -16,7 +16,20 @@ _INTEGERS = ("fix", "satellites")
 
 
 def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray]) -> pd.DataFrame:
-    """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1)."""
+    """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1).
+
+    Parameters
+    ----------
+    kind : Kind
+    time : (n,)
+        datetime64[ns], UTC.
+    line : (n,)
+        Of the file, from 1.
+    flag : (n,)
+        Reasons, empty where there is none.
+    values : mapping of str to (n,)
+        Columns of the kind that the log has.
+    """
     count = len(time)
     content: dict[str, Any] = {
         "time": np.asarray(time, dtype="datetime64[ns]"),

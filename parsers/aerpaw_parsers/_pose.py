@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
-from aerpaw_cmp.logs.records import Stream
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _rows, _sheet
 
@@ -48,6 +50,13 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
 
     Altitudes above sea level are brought to height above the first position; angles are degrees unless the column
     names radians or no yaw of the log is beyond 2 pi.
+
+    Parameters
+    ----------
+    rows : Rows
+    sheet : Sheet
+    name, source : str
+        Of the stream, and where its pose comes from.
     """
     latitude, longitude = sheet.find(*LATITUDE), sheet.find(*LONGITUDE)
     if latitude is None or longitude is None:
@@ -84,8 +93,22 @@ def above_takeoff(rows: _rows.Rows, altitude: FloatArray, lost: AnyArray) -> Flo
     if not len(known):
         return altitude
     zero = float(known[0])
-    rows.warnings.append(f"altitudes are above sea level: {zero:.1f} m, that of the first position, was taken off")
+    rows.warnings.append(_TAKEN_OFF.format(zero))
     return np.asarray(altitude - zero)
+
+
+def from_takeoff(result: ReadResult) -> ReadResult:
+    """A result whose track holds altitudes above sea level, with heights above its first position instead."""
+    track = next((stream for stream in result.streams if stream.kind == "telemetry"), None)
+    altitude = None if track is None else track.frame["altitude_m"].to_numpy()
+    if track is None or altitude is None or not np.isfinite(altitude).any():
+        return result
+    zero = float(altitude[np.isfinite(altitude)][0])
+    track.frame["altitude_m"] = altitude - zero
+    return replace(result, warnings=(*result.warnings, _TAKEN_OFF.format(zero)))
+
+
+_TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first position, was taken off"
 
 
 def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: AnyArray) -> FloatArray:

@@ -74,7 +74,21 @@ def stream(
     rows: _rows.Rows, name: str, values: FloatArray, *, unit: str = "", where: BoolArray | None = None,
     about: Mapping[str, Attribute | None] | None = None,
 ) -> Stream | None:  # fmt: skip
-    """Level or KPI stream of a named quantity; of an unknown one, a KPI under its own name."""
+    """Level or KPI stream of a named quantity; of an unknown one, a KPI under its own name.
+
+    Parameters
+    ----------
+    rows : Rows
+    name : str
+        As the log calls it.
+    values : (n,)
+    unit : str
+        Where the quantity does not say.
+    where : (n,) bool, optional
+        Rows that count.
+    about : mapping, optional
+        Further attributes.
+    """
     meaning = quantity(name) or Quantity("kpi", name, "")
     short = re.sub(r"\W+", "_", plain(name))
     if meaning.kind == "rss":

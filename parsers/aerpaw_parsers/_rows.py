@@ -50,6 +50,8 @@ class Rows:
         Do the times count from an origin that nobody named?
     at : int array, shape (n,)
         Index of each row among those that were given to :func:`built`.
+    data : bytes
+        The text itself, for what stands between the rows.
     """
 
     reader: str
@@ -64,6 +66,7 @@ class Rows:
     warnings: list[str] = field(default_factory=list)
     relative: bool = False
     at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    data: bytes = field(default=b"", repr=False)
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -274,6 +277,7 @@ def built(
         warnings,
         relative,
         np.flatnonzero(~comment)[valid],
+        lines.data,
     )
 
 
@@ -325,7 +329,17 @@ def torn(pattern: re.Pattern[bytes], text: str) -> Reason:
 
 
 def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = None) -> Stream | None:
-    """SNR stream of one tower; levels at or below the floor are out of coverage."""
+    """SNR stream of one tower; levels at or below the floor are out of coverage.
+
+    Parameters
+    ----------
+    rows : Rows
+    tower : str
+    values : (n,)
+        [dB].
+    where : (n,) bool, optional
+        Rows that are of this tower.
+    """
     level, flag = rows.level(values)
     return rows.stream(
         "rss", tower, {"rss_db": level}, where=where, flag=flag, node=tower, channel="snr", unit="dB", quantity="SNR"

@@ -254,7 +254,22 @@ def texts_to_utc(column: AnyArray, options: ReadOptions, *, needed_by: str) -> t
 def parsed_to_utc(
     wall: IntArray, valid: BoolArray, offset_s: IntArray, zoned: BoolArray, options: ReadOptions, *, needed_by: str
 ) -> Instants:
-    """What :func:`parse_texts` gives, to UTC."""
+    """What :func:`parse_texts` gives, to UTC.
+
+    Parameters
+    ----------
+    wall : (n,)
+        Wall clock [ns since 1970].
+    valid : (n,) bool
+    offset_s : (n,)
+        East of UTC, where the text has a zone [s].
+    zoned : (n,) bool
+        Whether it has one.
+    options : ReadOptions
+        Zone of the others.
+    needed_by : str
+        What the message names if there is no zone.
+    """
     naive = valid & ~zoned
     if len(wall) and naive.all():
         return wall_to_utc(wall, options, needed_by=needed_by)

@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
@@ -121,6 +122,7 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000] UE_ID  CL RNTI C cqi  ri  mcs retx txok brate",
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(read, keep=(_TITLE,)),
 )
 JSON_READER = Reader(
     name="amarisoft_json",
@@ -129,4 +131,5 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
+    in_blocks=blocks.by_lines(read_json),
 )

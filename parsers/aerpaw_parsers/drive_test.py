@@ -41,7 +41,9 @@ def is_header(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Whether a header of such names stands in front, and it is none of the narrower formats."""
-    return _sheet.starts(head, is_header) and not any(r.sniff(head) for r in (nemo_csv, quectel_ri, aadm_snr, own_csv))
+    return _sheet.starts(head, is_header) and not any(
+        r.READER.sniff(head) for r in (nemo_csv, quectel_ri, aadm_snr, own_csv)
+    )
 
 
 @dataclass

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
+from dataclasses import replace
 from difflib import get_close_matches
 
 import numpy as np
@@ -15,6 +16,7 @@ import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
@@ -28,6 +30,7 @@ _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": (
 
 _TEXT = re.compile(_time.TIME + _time.ZONE)
 _PLAIN = re.compile(_lines.NUMBER)
+_FORM = re.compile(rb"%s|%s" % (_TEXT.pattern, _PLAIN.pattern))
 
 
 def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
@@ -101,11 +104,10 @@ def _number(cell: bytes) -> float:
 
 def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
     texts = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
-    plain = np.array([_PLAIN.fullmatch(cell) is not None for cell in texts], dtype=bool)
-    if not plain.any():
+    if not _counts(texts):
         written = np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts] or [b"-"], dtype=np.bytes_)
         return _time.texts_to_utc(written[: len(texts)], options, needed_by="generic_csv")
-    seconds = np.array([float(cell) if mark else np.nan for cell, mark in zip(texts, plain, strict=True)])
+    seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts])
     origin = _time.origin_ns(options, needed_by="generic_csv")
     valid = np.isfinite(seconds) & (np.abs(seconds) < (9e8 if origin is not None else 9.2e9))
     whole = np.floor(np.where(valid, seconds, 0))
@@ -117,6 +119,16 @@ def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyA
     return _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
 
 
+def _counts(texts: list[bytes]) -> bool:
+    """Whether times are numbers: the first that is a time in either form decides."""
+    for text in texts:
+        if _PLAIN.fullmatch(text):
+            return True
+        if _TEXT.fullmatch(text):
+            return False
+    return False
+
+
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """One stream of the kind that the options name.
 
@@ -125,6 +137,45 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
     """
+    return _settled(_read(data, options))
+
+
+def _settled(result: ReadResult) -> ReadResult:
+    """How many rows hold a word where a number belongs, with the first of them."""
+    if not result.streams:
+        return result
+    frame = result.streams[0].frame
+    flag = frame["flag"].to_numpy(dtype=object)
+    odd = [i for i in np.flatnonzero(flag != "").tolist() if "no_number" in flag[i].split(";")]
+    if not odd:
+        return result
+    words = "1 row is" if len(odd) == 1 else f"{len(odd)} rows are"
+    first = int(frame["line"].iloc[odd[0]])
+    text = f"{words} flagged no_number; the first: line {first}, a word or an infinity; not scored"
+    return replace(result, warnings=(*result.warnings, text))
+
+
+def _head(data: bytes, options: ReadOptions) -> int:
+    """Bytes of the header and of the rows down to the first with a time: that row says which form times have."""
+    end, column = 0, -1
+    for line in data[:1_000_000].splitlines(keepends=True):
+        end += len(line)
+        if not line.strip():
+            continue
+        try:
+            cells = _fields(line.removeprefix(b"\xef\xbb\xbf").rstrip(b"\r\n"))
+        except csv.Error:
+            continue
+        if column < 0:
+            names = [name.strip() for name in cells]
+            column = names.index(options.columns.get("time", "")) if options.columns.get("time") in names else 0
+        elif len(cells) == len(names) and _FORM.fullmatch(cells[column].strip().strip('"').encode("ascii", "replace")):
+            break
+    return end
+
+
+def _read(data: bytes, options: ReadOptions) -> ReadResult:
+    """What each row says by itself."""
     lines = _lines.split(data)
     blank = lines.blank
     first = int(np.argmin(blank)) if len(lines) and not blank.all() else -1
@@ -147,10 +198,6 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     frame = _frames.frame(kind, instants.time, rows + 1, flag, values)[valid].reset_index(drop=True)
     stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
     warnings = [*instants.warnings, *_frames.steps_back(frame)]
-    if (odd & valid).any():
-        first_odd = int(rows[odd & valid][0]) + 1
-        words = "1 row is" if (odd & valid).sum() == 1 else f"{int((odd & valid).sum())} rows are"
-        warnings.append(f"{words} flagged no_number; the first: line {first_odd}, a word or an infinity; not scored")
     if kind == "rss" and options.unit is None:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
@@ -232,4 +279,5 @@ READER = Reader(
     sample="Time,Power,...",
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(_read, head=_head, settle=_settled),
 )

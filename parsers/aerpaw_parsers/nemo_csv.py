@@ -11,6 +11,7 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
@@ -95,4 +96,5 @@ READER = Reader(
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0",
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(read, head=blocks.first_line),
 )

@@ -101,7 +101,7 @@ def _flight_talk(head: bytes) -> bool:
     lines = _texts(head)
     stamped = sum(_SCRIPT_TALK.match(line) is not None for line in lines)
     marks = (b"[aerpawlib]", b"Waypoint", b"waypoint", b"Taking off", b"Arming", b"arming", b"Landing")
-    return 2 * stamped > len(lines) and any(mark in head for mark in marks) and not vehicle_log.sniff(head)
+    return 2 * stamped > len(lines) and any(mark in head for mark in marks) and not vehicle_log.READER.sniff(head)
 
 
 def _yaml(head: bytes) -> bool:

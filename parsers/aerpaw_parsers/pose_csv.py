@@ -31,7 +31,7 @@ def _has_time(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Whether a header with position and time stands in front, and it is not AERPAW's own layout."""
-    return _sheet.starts(head, is_header) and not any(r.sniff(head) for r in (vehicle_out, nemo_csv, quectel_ri))
+    return _sheet.starts(head, is_header) and not any(r.READER.sniff(head) for r in (vehicle_out, nemo_csv, quectel_ri))
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -11,6 +11,7 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
@@ -19,6 +20,14 @@ from . import _cells, _lines, _rows, _time
 _STAMP = re.compile(rb"^(" + _time.TIME + rb")")
 _ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')
 _HEADER = re.compile(rb"\|\s*\|\s*(LTE|NR5G-NSA|NR5G-SA|servingcell)\s*\|(.*)\|\s*$")
+_KEPT = (
+    re.compile(_STAMP.pattern, re.MULTILINE),
+    *(
+        re.compile(rb"^\|[ \t]*\|[ \t]*" + name + rb"[ \t]*\|", re.MULTILINE)
+        for name in (b"LTE", b"NR5G-NSA", b"NR5G-SA")
+    ),
+)
+"""Lines on which the rows below hang: the time of a table, and the head of each kind."""
 _CSI = ("lte_csi", "nr5g_csi")
 
 
@@ -99,4 +108,5 @@ READER = Reader(
     sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |',
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(read, keep=_KEPT, settle=_cells.settled),
 )

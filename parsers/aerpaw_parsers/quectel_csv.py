@@ -26,6 +26,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
@@ -294,5 +295,5 @@ READER = Reader(
     sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
     sniff=sniff,
     read=read,
-    apart=_CSI,
+    in_blocks=blocks.by_lines(read),
 )

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
@@ -279,5 +280,5 @@ READER = Reader(
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
     sniff=sniff,
     read=read,
-    apart=re.compile(_HEAD + rb"[0-7]{7,12} +[-0-9.]{1,16}\r?$"),
+    in_blocks=blocks.by_lines(read, apart=re.compile(_HEAD + rb"[0-7]{7,12} +[-0-9.]{1,16}\r?$")),
 )

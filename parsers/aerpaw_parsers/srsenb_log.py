@@ -12,11 +12,11 @@ log ``two_ports`` prints 0, 1 and 2; on one port nothing is reported and 0 stand
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.records import Stream
 
-from . import _rows, _time
+from . import _rows, _text, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
@@ -25,41 +25,28 @@ _ROW = re.compile(
     + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% \|[^\n]{0,160}$",
     re.MULTILINE,
 )  # fmt: skip
-_TITLE = re.compile(rb"^\[[^\]\n]{19,40}\] *rat +(?:pci +)?rnti +cqi +ri +mcs", re.MULTILINE)
 _CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (\d{1,2}) channels in RF device", re.MULTILINE)
-_TORN = re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} ")
+_MIXED = "srsENB prints the truncated mean of the ranks reported in a second: 1 may be a mix of 1 and 2"
 
 
-def sniff(head: bytes) -> bool:
-    """Whether it is a console with the trace's title line."""
-    return head.startswith(b"[") and _TITLE.search(head) is not None
-
-
-def _ports(data: bytes) -> int | None:
-    """Transmit channels that the console says it opened: no rank can be higher. None where it does not say."""
-    found = [int(number) for number in _CHANNELS.findall(data)]
-    return max(found) if found and max(found) > 0 else None
-
-
-def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``srsenb``; UsageError if no time zone is given."""
-    torn = _rows.torn(_TORN, "an incomplete line of the trace (torn line?)")
-    rows = _rows.matched(data, _ROW, options, reader="srsenb_log", reason=torn)
+def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
+    """Rank ``srsenb``; no rank is above the number of transmit channels that the console says it opened."""
     ri = rows.number("ri")
+    rows.warnings += [_MIXED] if (ri > 0).any() else []
+    ports = max((int(number) for number in _CHANNELS.findall(rows.data)), default=0) or None
     values = rows.rank(ri, none=ri == 0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs")}
-    if (ri > 0).any():
-        rows.warnings.append(
-            "srsENB prints the truncated mean of the ranks reported in a second: 1 may be a mix of 1 and 2"
-        )
-    about = {"ri_base": "one", "source": "CSI report, truncated mean", "ports": _ports(data)}
-    return rows.result([rows.stream("rank", options.channel or "srsenb", values, about=about)])
+    about = {"ri_base": "one", "source": "CSI report, truncated mean", "ports": ports}
+    yield rows.stream("rank", rows.options.channel or "srsenb", values, about=about)
 
 
-READER = Reader(
-    name="srsenb_log",
-    title="srsENB console: rank indicator (0 = no report)",
+READER = _text.reader(
+    "srsenb_log",
+    "srsENB console: rank indicator (0 = no report)",
     kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
-    sniff=sniff,
-    read=read,
+    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *rat +(?:pci +)?rnti +cqi +ri +mcs", re.MULTILINE),
+    row=_ROW,
+    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "),
+    keep=(_CHANNELS,),
+    streams=_streams,
 )

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
@@ -112,6 +113,7 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000]   1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2",
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(read, keep=(_TITLE, _SCHEDULER)),
 )
 JSON_READER = Reader(
     name="srsran_json",
@@ -120,4 +122,5 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
+    in_blocks=blocks.by_lines(read_json),
 )

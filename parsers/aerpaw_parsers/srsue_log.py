@@ -2,19 +2,19 @@
 
 ``[time] cc pci rsrp pl cfo | mcs snr iter brate bler ta_us | mcs buff brate bler``; RSRP in dBm of an uncalibrated
 front end (the level follows the gain), path loss in dB as the UE reckons it, CFO with SI suffix in Hz. It prints no
-rank.
+rank. A level stream per cell, and the carrier offset as KPI.
 """
 
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 
 import numpy as np
 
-from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.records import Stream
 
-from . import _cells, _rows, _time
+from . import _cells, _rows, _text, _time
 
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
@@ -23,34 +23,27 @@ _ROW = re.compile(
     + rb" \|" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}\|[^\n]{0,80}$",
     re.MULTILINE,
 )  # fmt: skip
-_TITLE = re.compile(rb"^\[[^\]\n]{19,40}\] *(?:cc|rat) +pci +rsrp +pl +cfo +\|", re.MULTILINE)
-_TORN = re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +-?\d")
 
 
-def sniff(head: bytes) -> bool:
-    """Whether it is a console with the UE's title line."""
-    return head.startswith(b"[") and _TITLE.search(head) is not None
-
-
-def read(data: bytes, options: ReadOptions) -> ReadResult:
-    """A level stream per cell, and the carrier offset as KPI; UsageError if no time zone is given."""
-    torn = _rows.torn(_TORN, "an incomplete line of the trace (torn line?)")
-    rows = _rows.matched(data, _ROW, options, reader="srsue_log", reason=torn)
+def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
     readings = [
         _cells.Reading(i, rats[i], pci[i], np.nan, rsrp[i], True, (np.nan, np.nan, snr[i], loss[i]))
         for i in range(len(rows))
     ]
-    streams = _cells.streams(rows, readings, source="srsUE")
-    return rows.result([*streams, rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")])
+    yield from _cells.streams(rows, readings, source="srsUE")
+    yield rows.stream("kpi", "cfo", {"value": cfo}, quantity="CFO", unit="Hz")
 
 
-READER = Reader(
-    name="srsue_log",
-    title="srsUE console: RSRP, path loss, CFO",
+READER = _text.reader(
+    "srsue_log",
+    "srsUE console: RSRP, path loss, CFO",
     kinds=("rss", "kpi"),
     sample="[2025-01-01 12:00:07.000000]   0    1   -61   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M",
-    sniff=sniff,
-    read=read,
+    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:cc|rat) +pci +rsrp +pl +cfo +\|", re.MULTILINE),
+    row=_ROW,
+    torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +-?\d"),
+    streams=_streams,
+    settle=_cells.settled,
 )

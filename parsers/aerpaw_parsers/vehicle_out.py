@@ -16,11 +16,12 @@ Writers: AERPAW/aerpawlib ``examples/v1/{gps_logger,preplanned_trajectory,guided
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
@@ -166,6 +167,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If the times carry no offset and no time zone is given.
     """
+    return _settled(_read(data, options))
+
+
+def _read(data: bytes, options: ReadOptions) -> ReadResult:
+    """What each row says by itself."""
     lines = _lines.split(data)
     fast = _at_once(lines)
     rows = fast.join(_by_pattern(lines, fast.line))
@@ -175,13 +181,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rejected += lines.reject_all(rows.line[~rows.valid], "the time stamp is no date of the calendar")
     flag = _lines.flags(len(rows.line))
     instants.flag(flag)
-    values, warnings = _values(rows.number, flag)
+    values = _values(rows.number, flag)
     if lines.unterminated and len(rows.line):
         _lines.add_flag(flag, rows.line == len(lines) - 1, _lines.UNTERMINATED)
     frame = _frames.frame("telemetry", instants.time, rows.line + 1, flag, values)
     if len(keep) < len(frame):
         frame = frame.iloc[keep].reset_index(drop=True)
-    warnings += [*instants.warnings, *_doubts(rows.number[:, keep]), *_frames.steps_back(frame)]
+    jumps = int((np.diff(rows.number[0, keep]) != 1).sum())
+    warnings = [f"the row index jumps at {jumps} places: rows are missing or files were joined"] if jumps else []
+    warnings = [*instants.warnings, *warnings, *_frames.steps_back(frame)]
     stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, source="vehicleOut"))
     return ReadResult(
         "vehicle_out",
@@ -194,9 +202,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     )
 
 
-def _values(number: FloatArray, flag: AnyArray) -> tuple[dict[str, AnyArray], list[str]]:
-    """Columns of the record model; positions without a fix and unknown attitudes become NaN."""
-    warnings: list[str] = []
+def _values(number: FloatArray, flag: AnyArray) -> dict[str, AnyArray]:
+    """Columns of the record model; positions without a fix become NaN."""
     longitude, latitude, altitude = number[1:4]
     angles, velocity = number[4:7], number[7:10]
     fix, satellites = number[10].astype(np.int64), number[11].astype(np.int64)
@@ -208,18 +215,9 @@ def _values(number: FloatArray, flag: AnyArray) -> tuple[dict[str, AnyArray], li
         part[no_fix | outside] = np.nan
     zero = (angles[0] == 0) & (angles[1] == 0) & (angles[2] == 0)
     _lines.add_flag(flag, zero, "zero_attitude")
-    if zero.any():
-        text = f"{int(zero.sum())} rows have attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
-        if zero.all():  # level flight due north in every row: no aircraft does that
-            text += " zero_attitude and read as unknown, because no row has another attitude"
-            for part in (*angles, *velocity):
-                part[:] = np.nan
-        warnings.append(text)
-    if no_fix.any():
-        warnings.append(f"{int(no_fix.sum())} rows have no position fix; their positions are NaN, flagged no_fix")
     pitch, yaw, roll = (np.degrees(angle) for angle in angles)
     names = ("velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
-    values = {
+    return {
         "latitude_deg": latitude,
         "longitude_deg": longitude,
         "altitude_m": altitude,
@@ -230,18 +228,33 @@ def _values(number: FloatArray, flag: AnyArray) -> tuple[dict[str, AnyArray], li
         "fix": fix,
         "satellites": satellites,
     }
-    return values, warnings
 
 
-def _doubts(number: FloatArray) -> list[str]:
-    """Things that a flight as a whole may show."""
+_MOTION = ("roll_deg", "pitch_deg", "yaw_deg", "velocity_north_mps", "velocity_east_mps", "velocity_down_mps")
+
+
+def _settled(result: ReadResult) -> ReadResult:
+    """What a log as a whole shows: attitudes that are unknown throughout, a run of the digital twin."""
+    if not result.streams:
+        return result
+    frame = result.streams[0].frame
+    flag = frame["flag"].to_numpy(dtype=object)
+    odd = flag[flag != ""].tolist()  # few: the flags are looked at one by one
+    zero, no_fix = (sum(name in text.split(";") for text in odd) for name in ("zero_attitude", "no_fix"))
     warnings = []
-    jumps = int((np.diff(number[0]) != 1).sum())
-    if jumps:
-        warnings.append(f"the row index jumps at {jumps} places: rows are missing or files were joined")
-    if number.shape[1] > 10 and (number[10] == 6).all() and (number[11] == 10).all():
+    if zero:
+        text = f"{zero} rows have attitude (0,0,0), which AERPAW's converter writes for 'unknown'; flagged"
+        if zero == len(frame):  # level flight due north in every row: no aircraft does that
+            text += " zero_attitude and read as unknown, because no row has another attitude"
+            for name in _MOTION:
+                frame[name] = np.nan
+        warnings.append(text)
+    if no_fix:
+        warnings.append(f"{no_fix} rows have no position fix; their positions are NaN, flagged no_fix")
+    warnings += result.warnings
+    if len(frame) > 10 and (frame["fix"] == 6).all() and (frame["satellites"] == 10).all():
         warnings.append("fix 6 with 10 satellites throughout: a digital-twin run looks like this, not a flight")
-    return warnings
+    return replace(result, warnings=tuple(warnings))
 
 
 READER = Reader(
@@ -251,4 +264,5 @@ READER = Reader(
     sample='7,-78.6960001,35.7280002,30.1,"(0.01,1.57,-0.02)","(0.0,5.0,0.1)",48.1,2025-01-01 12:00:07.000000,4,18',
     sniff=sniff,
     read=read,
+    in_blocks=blocks.by_lines(_read, apart=_ROW, settle=_settled),
 )

@@ -81,6 +81,7 @@ def test_scores_are_those_of_what_was_left_out(metrics: dict) -> None:
     for row in metrics["scores"]["flight_left_out"]:
         assert row["rmse_db"] < 0.6 * row["free_space_rmse_db"]
         assert row["within_2sd"] > 0.8
+        assert row["rmse_shared_offset_db"] >= row["rmse_db"]  # the flight's own offset is the best one
     assert metrics["ground"]["likely_m"][1] is None  # infinite: there is no ground ray in these flights
     assert len(metrics["words"]) >= 3
     assert metrics["stages"]["fit_s"] > 0

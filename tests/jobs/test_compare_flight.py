@@ -13,6 +13,7 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.compare.result import FlightResult, RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
@@ -598,3 +599,34 @@ def test_positions_that_the_rank_log_lacks_come_from_the_track(tmp_path: Path) -
     (found,) = replay_rank(data)
     assert found.valid.all()
     assert found.poses.position_m[19] == pytest.approx(found.poses.position_m[[18, 20]].mean(axis=0), abs=0.01)
+
+
+def snr_flight(folder: Path, above_db: float, link: str) -> Any:
+    """The report's numbers of a flight whose log holds level over noise, ``above_db`` of it unexplained."""
+    at = np.arange(0, 60, 0.5)
+    noise = noise_floor_dbm(20e6, 7.0)
+    folder.mkdir()
+    path = flight(folder, rss={"snr": (at, free_space_db(at) - noise + above_db)})
+    text = path.read_text(encoding="utf-8")
+    more = "link:\n  rss: {carrier_hz: 3.3e9" + link + "}\n"
+    path.write_text(text if "link:" in text else text + more, encoding="utf-8")
+    assert more in path.read_text(encoding="utf-8")
+    return compared_rss(path)
+
+
+def test_an_snr_is_the_level_over_the_noise_that_is_given(tmp_path: Path) -> None:
+    one = snr_flight(tmp_path / "a", 2.5, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].panel
+    found = one.extra["snr"]
+    assert found["noise_dbm"] == pytest.approx(-93.96, abs=0.01)  # kTB of 20 MHz at 290 K and 7 dB
+    without_offset = snr_flight(tmp_path / "b", 0.0, ", bandwidth_hz: 20e6, noise_figure_db: 7")[0].panel.extra["snr"]
+    assert found["mean_error_db"] - without_offset["mean_error_db"] == pytest.approx(2.5, abs=1e-9)
+    assert found["rmse_db"] == pytest.approx(np.hypot(one.extra["snr"]["mean_error_db"], one.rmse_db), abs=0.01)
+    wider = snr_flight(tmp_path / "c", 0.0, ", bandwidth_hz: 40e6, noise_figure_db: 7")[0].panel.extra["snr"]
+    assert wider["mean_error_db"] - without_offset["mean_error_db"] == pytest.approx(10 * np.log10(2.0), abs=1e-6)
+
+
+def test_the_noise_under_an_snr_cuts_nothing_off(tmp_path: Path) -> None:
+    deaf = snr_flight(tmp_path / "a", 0.0, ", noise_floor_dbm: -20")[0].panel
+    assert deaf.n == 120  # a level below -20 dBm would be out of coverage
+    assert deaf.extra["snr"]["noise_dbm"] == -20.0
+    assert snr_flight(tmp_path / "b", 0.0, "")[0].panel.extra.get("snr") is None

@@ -16,7 +16,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.ingest import ingest
-from aerpaw_cmp.logs.readers import by_name
+from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.logs.writers import format_power_log
 from tests.parsers import samples
@@ -47,9 +47,12 @@ def same(one: ReadResult, other: ReadResult) -> None:
         other.blank,
         other.rejected,
     )
-    assert one.warnings == other.warnings
-    for a, b in zip(one.streams, other.streams, strict=True):
-        pd.testing.assert_frame_equal(a.frame, b.frame)
+    assert sorted(one.warnings) == sorted(other.warnings)
+    by = {(stream.kind, stream.name): stream for stream in one.streams}
+    assert len(by) == len(one.streams) == len(other.streams)
+    for b in other.streams:
+        a = by[b.kind, b.name]
+        pd.testing.assert_frame_equal(a.frame, b.frame, check_like=True)
         assert dict(a.attributes) == dict(b.attributes)
 
 
@@ -77,6 +80,40 @@ def test_blocks_say_what_one_piece_says(
         result, digest = blocks.read(place, by_name(reader), options)
     same(result, by_name(reader).read(data, options))
     assert digest == hashlib.sha256(data).hexdigest()
+
+
+LARGE = [
+    (reader, name, data)
+    for reader, found in samples.SAMPLES.items()
+    for name, (data, *_) in found.items()
+    if by_name(reader).in_blocks is not None
+]
+
+
+def in_two(reader: str, pieces: list[bytes], options: ReadOptions) -> ReadResult:
+    """What a reader says of a file that comes in such pieces, each at once a block as far as it has whole lines."""
+    read = by_name(reader).in_blocks
+    assert read is not None
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(blocks, "BLOCK_BYTES", 1)
+        return read(iter(pieces), options)
+
+
+@pytest.mark.parametrize(("reader", "name", "data"), LARGE, ids=[f"{reader}-{name}" for reader, name, _ in LARGE])
+def test_a_cut_at_any_line_changes_nothing(reader: str, name: str, data: bytes) -> None:
+    whole = by_name(reader).read(data, OPTIONS)
+    ends = [i + 1 for i in range(len(data)) if data[i : i + 1] == b"\n"]
+    for place in ends:
+        same(in_two(reader, [data[:place], data[place:]], OPTIONS), whole)
+    lines = [data[a:b] for a, b in zip([0, *ends], [*ends, len(data)], strict=True)]
+    same(in_two(reader, lines, OPTIONS), whole)
+
+
+def test_a_cut_at_any_byte_changes_nothing() -> None:
+    for reader, data in (("sounder_log", samples.SOUNDER), ("vehicle_out", samples.VEHICLE_10)):
+        whole = by_name(reader).read(data, OPTIONS)
+        for place in range(0, len(data) + 1, 3):
+            same(in_two(reader, [data[:place], data[place:]], OPTIONS), whole)
 
 
 def test_large_logs_go_through_blocks_packed_or_not(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -3,33 +3,27 @@
 from __future__ import annotations
 
 import dataclasses
-import json
-import shutil
-from importlib import resources
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.compare.offset import grid_offset
 from aerpaw_cmp.report import write
+from tests.report.browsing import (
+    asked_outside,
+    choose,
+    complaints,
+    frame,
+    needs_browser,
+    serious_findings,
+    set_scheme,
+    set_width,
+    start,
+    usual_width,
+)
 
-selenium = pytest.importorskip("selenium", reason="selenium is not installed")
-BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
-pytestmark = pytest.mark.skipif(not (BROWSER and DRIVER), reason="no chromium with chromedriver on this machine")
-
-
-def start(*arguments: str, scripts: bool = True):
-    from selenium.webdriver import Chrome, ChromeOptions
-    from selenium.webdriver.chrome.service import Service
-
-    options = ChromeOptions()
-    options.binary_location = BROWSER
-    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", *arguments):
-        options.add_argument(argument)
-    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
-    if not scripts:
-        options.add_experimental_option("prefs", {"profile.managed_default_content_settings.javascript": 2})
-    return Chrome(options=options, service=Service(DRIVER))
+pytest.importorskip("selenium", reason="selenium is not installed")
+pytestmark = needs_browser
 
 
 @pytest.fixture(scope="module")
@@ -52,24 +46,9 @@ def whole_flight(request):
         request.getfixturevalue("driver").execute_script("explorer.span(null)")
 
 
-def choose(driver, element: str, text: str) -> None:
-    from selenium.webdriver.support.ui import Select
-
-    Select(driver.find_element("id", element)).select_by_visible_text(text)
-
-
-def frame(driver) -> None:
-    driver.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done));")
-
-
 def test_nothing_is_said_on_the_console_and_nothing_leaves_the_page(driver):
-    assert [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")] == []
-    asked = [
-        message["params"]["request"]["url"]
-        for message in (json.loads(entry["message"])["message"] for entry in driver.get_log("performance"))
-        if message["method"] == "Network.requestWillBeSent"
-    ]
-    assert [url for url in asked if not url.startswith(("file:", "data:", "chrome:"))] == []
+    assert complaints(driver) == []
+    assert asked_outside(driver) == []
 
 
 def test_numbers_of_the_whole_flight_are_those_of_the_report(driver, small_report):
@@ -159,26 +138,12 @@ def test_the_map_shows_the_flight_from_above_and_in_three_dimensions(driver):
 
 
 def test_no_serious_finding_of_accessibility(driver):
-    axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is not installed")
-    source = resources.files(axe) / "node_modules" / "axe-core" / "axe.min.js"
-    driver.execute_script(source.read_text(encoding="utf-8"))
-    # HTML 5.2 lets <div> group the items of a <dl>, which the packaged axe does not know yet
-    rules = {"rules": {"dlitem": {"enabled": False}}}
-    found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
-    serious = {
-        v["id"]: [n["html"][:120] for n in v["nodes"]]
-        for v in found["violations"]
-        if v["impact"] in ("serious", "critical")
-    }
-    assert serious == {}
+    assert serious_findings(driver) == {}
 
 
 @pytest.mark.parametrize("width", [1440, 768, 390])
 def test_nothing_overflows(driver, width):
-    driver.execute_cdp_cmd(
-        "Emulation.setDeviceMetricsOverride", {"width": width, "height": 1000, "deviceScaleFactor": 1, "mobile": False}
-    )
-    frame(driver)
+    set_width(driver, width)
     try:
         assert driver.execute_script("return document.documentElement.scrollWidth") <= width
         charts = driver.execute_script(
@@ -187,18 +152,15 @@ def test_nothing_overflows(driver, width):
         assert charts
         assert max(charts) <= width
     finally:
-        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+        usual_width(driver)
 
 
 def test_dark_and_light(driver):
     seen = []
     for scheme in ("light", "dark"):
-        driver.execute_cdp_cmd(
-            "Emulation.setEmulatedMedia", {"features": [{"name": "prefers-color-scheme", "value": scheme}]}
-        )
-        frame(driver)
+        set_scheme(driver, scheme)
         seen.append(driver.execute_script("return getComputedStyle(document.body).backgroundColor"))
-    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": []})
+    set_scheme(driver)
     assert seen == ["rgb(255, 255, 255)", "rgb(23, 23, 23)"]
 
 

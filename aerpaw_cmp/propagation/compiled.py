@@ -1,0 +1,124 @@
+"""Whether and how the compiled kernels run: settings, fall-back to NumPy, threads.
+
+numba is optional (extra ``fast``). Importing it and reading the compiled code takes about a second, the first
+compilation on a machine some ten; so replays too small to gain from it stay with NumPy. The choice depends on the size
+of the work alone: the same replay is evaluated the same way each time. ``AERPAW_CMP_COMPILED`` decides otherwise:
+``auto``, ``never`` or ``always``.
+"""
+
+from __future__ import annotations
+
+import os
+import warnings
+from collections.abc import Callable, Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import lru_cache
+from importlib import import_module
+from importlib.util import find_spec
+from types import ModuleType
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import AnyArray
+
+SWITCH = "AERPAW_CMP_COMPILED"
+ENOUGH_WORK = 400_000
+"""Element pairs of all links of a replay from which compiled code is faster, numba's import included
+(``benchmarks/kernel.py --break-even``)."""
+
+
+@dataclass(frozen=True, slots=True)
+class State:
+    """Compiled code, or why there is none."""
+
+    kernels: ModuleType | None
+    reason: str
+
+
+def switch() -> str:
+    """The value of ``AERPAW_CMP_COMPILED``.
+
+    Raises
+    ------
+    UsageError
+        If it is none of those known.
+    """
+    value = os.environ.get(SWITCH, "auto").strip().lower() or "auto"
+    if value not in ("auto", "never", "always"):
+        raise UsageError(f"{SWITCH}={value}", expected="auto, never or always")
+    return value
+
+
+def kernels_for(work: int) -> ModuleType | None:
+    """Compiled kernels of the field, or None: the work (element pairs of links) is too small, or they cannot run."""
+    return _chosen("kernels", work)
+
+
+def search_kernels_for(work: int) -> ModuleType | None:
+    """Those of the path search."""
+    return _chosen("search_kernels", work)
+
+
+def _chosen(name: str, work: int) -> ModuleType | None:
+    chosen = switch()
+    if chosen == "never" or (chosen == "auto" and work < ENOUGH_WORK):
+        return None
+    state = load(name)
+    if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
+        _warn_once(state.reason)
+    return state.kernels
+
+
+@lru_cache(maxsize=2)
+def load(name: str) -> State:
+    """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
+
+    A broken installation shows itself in many ways (no LLVM for this processor, a NumPy too new, a cache cut short),
+    and NumPy gives the same answer.
+    """
+    if find_spec("numba") is None:
+        return State(None, "numba is not installed (pip install 'aerpaw-cmp[fast]')")
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # numba's own, about its cache
+            kernels = import_module(f".{name}", __package__)
+            kernels.try_out()
+    except Exception as error:
+        line = (str(error).splitlines() or [""])[0]
+        return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")
+    return State(kernels, "")
+
+
+@lru_cache(maxsize=1)
+def _warn_once(reason: str) -> None:
+    warnings.warn(f"{reason}: the replay runs in NumPy, some ten times slower", RuntimeWarning, stacklevel=4)
+
+
+def thread_count(threads: int | None) -> int:
+    """Threads to use: as asked, else the cores that this process may use."""
+    if threads is not None:
+        if threads < 1:
+            raise UsageError(f"{threads} threads", expected="at least 1")
+        return threads
+    try:
+        return len(os.sched_getaffinity(0))
+    except AttributeError:  # not on macOS and Windows
+        return os.cpu_count() or 1
+
+
+def in_threads(call: Callable[[Any], Any], parts: Iterable[Any], threads: int | None) -> list[Any]:
+    """``call`` of each part, results in order; kernels release the interpreter's lock."""
+    parts = list(parts)
+    count = min(thread_count(threads), len(parts))
+    if count < 2:
+        return [call(part) for part in parts]
+    with ThreadPoolExecutor(count) as pool:
+        return list(pool.map(call, parts))
+
+
+def column(values: AnyArray, kind: Any = np.float64) -> AnyArray:
+    """An array as kernels take it: of one type, contiguous, writable (a read-only one would be compiled for anew)."""
+    return np.require(values, kind, ["C", "W"])

@@ -1,0 +1,98 @@
+"use strict";
+// What the scripts of all pages share: arrays of the page's data, colours, words, small charts.
+const common = (() => {
+  const at = id => document.getElementById(id);
+  const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
+  const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? v.toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
+  const FONT = "12px system-ui, sans-serif";
+
+  // one deflated block in base64 that holds all arrays one after the other, each at a multiple of eight bytes
+  async function unpack(packed) {
+    const raw = atob(packed.data), bytes = new Uint8Array(raw.length);
+    for (let i = 0; i < raw.length; i++) bytes[i] = raw.charCodeAt(i);
+    const stream = new Blob([bytes]).stream().pipeThrough(new DecompressionStream("deflate"));
+    const buffer = await new Response(stream).arrayBuffer();
+    const kinds = { i1: Int8Array, u1: Uint8Array, i2: Int16Array, u2: Uint16Array, i4: Int32Array, f4: Float32Array, f8: Float64Array };
+    return packed.arrays.map(([kind, offset, length]) => new kinds[kind](buffer, offset, length));
+  }
+
+  // numbers kept as integers: value = stored * step; the least integer stands for "none"
+  const none = { i1: -128, i2: -32768, u1: 255, u2: 65535 };
+  function values(array, step) {
+    const missing = array instanceof Int16Array ? none.i2 : array instanceof Uint8Array ? none.u1 : array instanceof Uint16Array ? none.u2 : none.i1;
+    return Float64Array.from(array, v => v === missing ? NaN : v * step);
+  }
+
+  function cells(target, rows) {
+    target.replaceChildren(...rows.map(([name, value]) => {
+      const row = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
+      dt.textContent = name; dd.textContent = value; row.append(dt, dd);
+      return row;
+    }));
+  }
+
+  function fill(select, names, chosen, always = false) {
+    select.replaceChildren(...names.map((name, i) => { const o = document.createElement("option"); o.value = i; o.textContent = name; return o; }));
+    select.value = chosen;
+    select.closest("label").hidden = names.length < 2 && !always;
+  }
+
+  function frame(canvas) {
+    const pen = canvas.getContext("2d"), ratio = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
+    canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
+    pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.fillStyle = css("--paper"); pen.fillRect(0, 0, w, h); pen.font = FONT; pen.lineJoin = "round";
+    return [pen, w, h];
+  }
+
+  function ticks(low, high, most = 5) {
+    if (!(high > low)) return [low];
+    const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw * (1 - 1e-9)), out = [];
+    for (let v = Math.ceil(low / step - 1e-9) * step; v <= high + 1e-9 * step; v += step) out.push(Math.abs(v) < 1e-9 * step ? 0 : v);
+    return out;
+  }
+  const digits = marks => { const step = marks.length > 1 ? Math.abs(marks[1] - marks[0]) : 1; return Math.max(0, Math.min(6, -Math.floor(Math.log10(step) + 1e-9))); };
+
+  // axes of a small chart; gives the two scales. x and y: {low, high, label, marks?, words?}
+  function axes(pen, w, h, x, y, left = 50) {
+    const right = w - 12, top = 10, bottom = h - 38;
+    const X = v => left + (v - x.low) / (x.high - x.low || 1) * (right - left), Y = v => bottom - (v - y.low) / (y.high - y.low || 1) * (bottom - top);
+    const xs = x.marks || ticks(x.low, x.high, Math.max(2, Math.floor(w / 110))), ys = y.marks || ticks(y.low, y.high, 4);
+    pen.strokeStyle = css("--line"); pen.fillStyle = css("--ink"); pen.lineWidth = 1; pen.font = FONT;
+    const dx = digits(xs), dy = digits(ys);
+    pen.textAlign = "center";
+    for (const v of xs) { pen.beginPath(); pen.moveTo(X(v), top); pen.lineTo(X(v), bottom); pen.stroke(); pen.fillText(x.words ? x.words(v) : number(v, dx), X(v), bottom + 14); }
+    pen.textAlign = "right";
+    for (const v of ys) { pen.beginPath(); pen.moveTo(left, Y(v)); pen.lineTo(right, Y(v)); pen.stroke(); pen.fillText(y.words ? y.words(v) : number(v, dy), left - 5, Y(v) + 4); }
+    pen.textAlign = "center"; pen.fillText(x.label, (left + right) / 2, h - 6);
+    pen.save(); pen.translate(12, (top + bottom) / 2); pen.rotate(-Math.PI / 2); pen.fillText(y.label, 0, 0); pen.restore();
+    pen.textAlign = "left";
+    return { X, Y, left, right, top, bottom };
+  }
+
+  // a colour ramp given as one string of six-digit colours
+  function ramp(hex) {
+    const n = hex.length / 6, parts = [];
+    for (let i = 0; i < n; i++) parts.push([0, 2, 4].map(k => parseInt(hex.slice(i * 6 + k, i * 6 + k + 2), 16)));
+    return t => parts[Math.max(0, Math.min(n - 1, Math.floor(t * n)))];
+  }
+
+  function quantile(sorted, share) {
+    if (!sorted.length) return NaN;
+    const place = (sorted.length - 1) * share, low = Math.floor(place), high = Math.ceil(place);
+    return sorted[low] + (sorted[high] - sorted[low]) * (place - low);
+  }
+
+  let waiting = new Set();
+  function later(...jobs) {
+    if (!waiting.size) requestAnimationFrame(() => { const now = [...waiting]; waiting = new Set(); for (const job of now) job(); });
+    jobs.forEach(job => waiting.add(job));
+  }
+
+  function whenResized(element, job) {
+    let width = 0;
+    new ResizeObserver(() => { if (element.clientWidth !== width) { width = element.clientWidth; later(job); } }).observe(element);
+    matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
+  }
+
+  return { at, css, number, unpack, values, cells, fill, frame, ticks, axes, ramp, quantile, later, whenResized, digits };
+})();

@@ -1,0 +1,80 @@
+"""Seconds, bytes and peak memory of each export of a long flight, each in a process of its own.
+
+    python benchmarks/exports.py [--samples 1000000] [--formats geojson,kmz,...]
+
+A made-up flight: one link with positions, four levels and a residual, random numbers with a seed. What is measured is
+the writing alone, in CPU time; the peak is that of the whole process, beside one that makes the samples and no file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+import numpy as np
+
+
+def flight(samples: int):
+    """An export of one link."""
+    from aerpaw_cmp.report.exports.samples import Export, SampleSet, Series, column
+    from aerpaw_cmp.site.siteyaml import load_site
+
+    rng = np.random.default_rng(1)
+    s = np.linspace(0, 1, samples)
+    names = ("measured_db", "calibrated_db", "simulated_dbm", "residual_db", "free_space_dbm", "two_ray_dbm")
+    values = {name: np.round(rng.normal(-80, 8, samples), 4) for name in names}
+    series = Series(
+        flight="long", tower="LW1", channel="USRP1", unit="dBm",
+        time=np.datetime64("2024-07-15T17:02:11", "ns") + np.round(s * samples * 1e8).astype("timedelta64[ns]"),
+        east_m=500 * np.cos(50 * s), north_m=900 * np.sin(41 * s), up_m=40 + 30 * s, values=values,
+    )  # fmt: skip
+    rss = SampleSet(kind="rss", columns=tuple(column(name, "dBm") for name in names), series=(series,))
+    return Export(name="long", title="A long flight", site=load_site("lake_wheeler"), sets=(rss,), lines=(), clock=True)
+
+
+def one(name: str, samples: int) -> None:
+    """Write one format and print its numbers."""
+    from aerpaw_cmp.report.exports.write import write_exports
+
+    export = flight(samples)
+    with tempfile.TemporaryDirectory() as folder:
+        start = time.process_time()
+        files = write_exports(export, Path(folder), [] if name == "none" else [name])
+        found = {"cpu_s": time.process_time() - start, "bytes": sum(path.stat().st_size for path in files)}
+    found["peak_mib"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    print(json.dumps(found))
+
+
+def main() -> None:
+    from aerpaw_cmp.report.exports.write import FORMATS
+
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--samples", type=int, default=100_000)
+    parser.add_argument("--formats", default=",".join(FORMATS))
+    parser.add_argument("--one")
+    given = parser.parse_args()
+    if given.one:
+        one(given.one, given.samples)
+        return
+    print(
+        f"{given.samples} samples of one link, six numbers each; Python {sys.version.split()[0]}, "
+        f"NumPy {np.__version__}"
+    )
+    base = None
+    for name in ["none", *given.formats.split(",")]:
+        command = [sys.executable, __file__, "--one", name, "--samples", str(given.samples)]
+        found = json.loads(subprocess.run(command, check=True, capture_output=True, text=True).stdout)
+        base = base or found["peak_mib"]
+        size, peak = found["bytes"] / 2**20, found["peak_mib"]
+        print(f"{name:11s} {found['cpu_s']:7.1f} s CPU {size:8.1f} MiB, peak {peak:6.0f} MiB ({peak - base:+.0f})")
+    print("in brackets: beyond a process that makes the samples and no file")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,104 @@
+"""A text format from its parts: the regular expression of its rows, what marks it, and the streams of its columns.
+
+:func:`reader` does the rest: sniffing, the account of all lines, times, torn last lines, and reading in blocks.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Sequence
+
+from aerpaw_cmp.common.units import BoolArray, IntArray
+from aerpaw_cmp.logs import blocks
+from aerpaw_cmp.logs.readers import Reader, ReadOptions
+from aerpaw_cmp.logs.records import Kind, ReadResult, Stream
+
+from . import _lines, _rows
+
+Pattern = re.Pattern[bytes]
+BOM = rb"(?:\xef\xbb\xbf)?"
+
+
+def reader(
+    name: str,
+    title: str,
+    *,
+    kinds: tuple[Kind, ...],
+    sample: str,
+    row: Pattern | Callable[[bytes], Pattern],
+    streams: Callable[[_rows.Rows], Iterable[Stream | None]],
+    sniff: Callable[[bytes], bool] | None = None,
+    header: Pattern | None = None,
+    mark: Pattern | None = None,
+    torn: Pattern | None = None,
+    otherwise: str = "of another form than the format's rows (torn line?)",
+    fields: int = 0,
+    clock: str = "wall",
+    skip: Callable[[bytes, IntArray], BoolArray] | None = None,
+    keep: Sequence[Pattern] = (),
+    settle: Callable[[ReadResult], ReadResult] | None = None,
+) -> Reader:
+    r"""A reader of lines that a pattern describes.
+
+    Parameters
+    ----------
+    name, title, kinds, sample
+        As of :class:`aerpaw_cmp.logs.readers.Reader`.
+    row : re.Pattern or callable
+        See :func:`_rows.matched`; a callable makes it of the beginning of the file (of its header, say).
+    streams : callable
+        ``streams(rows)``: the streams of the rows; its docstring is the reader's.
+    sniff : callable, optional
+        By default a file is known by its first line where there is a ``header``, by ``mark`` where there is one, else
+        by most of its first lines being rows.
+    header : re.Pattern, optional
+        The whole line above a table: a comment wherever it stands, and part of every block of a large file.
+    mark : re.Pattern, optional
+        MULTILINE; a line by which a console is known.
+    torn : re.Pattern, optional
+        How a row of a console begins: such a line that is no row is rejected, all other lines are talk. Without it
+        every line that is neither row nor header is rejected.
+    otherwise : str
+        Reason of rejected lines.
+    fields : int
+        Number of fields of a table: lines with others are rejected with their number.
+    clock : str
+        See :func:`_rows.times`.
+    skip : callable, optional
+        ``skip(data, lines)``: which of the matching lines (0-based) are comments after all.
+    keep : sequence of re.Pattern
+    settle : callable, optional
+        See :func:`aerpaw_cmp.logs.blocks.by_lines`.
+    """
+
+    def reason(line: bytes) -> str | None:
+        if header is not None and header.fullmatch(line):
+            return None
+        if torn is not None:
+            return "an incomplete row (torn line?)" if torn.match(line) else None
+        count = line.count(b",") + 1
+        return f"{count} fields where {fields} were expected (torn line?)" if fields not in (0, count) else otherwise
+
+    def read(data: bytes, options: ReadOptions) -> ReadResult:
+        pattern = row if isinstance(row, re.Pattern) else row(data)
+        left_out = None if skip is None else lambda lines: skip(data, lines)
+        rows = _rows.matched(data, pattern, options, reader=name, reason=reason, clock=clock, skip=left_out)
+        return rows.result(streams(rows))
+
+    def known(head: bytes) -> bool:
+        if header is not None:
+            return header.fullmatch(head[:4000].split(b"\n", 1)[0]) is not None
+        return _lines.mostly(head, row) if isinstance(row, re.Pattern) else False
+
+    def marked(head: bytes) -> bool:
+        return mark is not None and mark.search(head) is not None
+
+    return Reader(
+        name=name,
+        title=title,
+        kinds=kinds,
+        sample=sample,
+        sniff=sniff or (known if mark is None else marked),
+        read=read,
+        in_blocks=blocks.by_lines(read, head=None if header is None else blocks.first_line, keep=keep, settle=settle),
+    )

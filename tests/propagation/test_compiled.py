@@ -1,0 +1,326 @@
+"""Compiled kernels against NumPy: the same numbers, whatever the arrays, threads and chunks; and doing without them."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib.util
+import sys
+import types
+import warnings
+
+import numpy as np
+import pytest
+import shapely
+from shapely.geometry import box
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.compare.rank import channel_rank
+from aerpaw_cmp.propagation import channel, compiled, compiled_field, compiled_search, image
+from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.bench import random_scene
+from aerpaw_cmp.propagation.faces import site_faces
+from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
+from aerpaw_cmp.site.installed import InstalledPattern
+from aerpaw_cmp.site.site import Building
+
+needs_numba = pytest.mark.skipif(
+    importlib.util.find_spec("numba") is None, reason="numba is not installed (extra fast)"
+)
+
+
+def measured(seed=1, polarised=True):
+    """A smooth field without symmetry."""
+    rng = np.random.default_rng(seed)
+    theta, phi = np.meshgrid(np.linspace(0, np.pi, 19), np.arange(36) * np.radians(10), indexing="ij")
+    fields = []
+    for _ in range(2 if polarised else 1):
+        a = rng.normal(size=(2, 3))
+        fields.append(
+            (a[0, 0] + 1j * a[1, 0]) * np.sin(theta)
+            + (a[0, 1] + 1j * a[1, 1]) * np.sin(theta) * np.cos(phi)
+            + (a[0, 2] + 1j * a[1, 2]) * np.sin(2 * theta) * np.sin(phi)
+        )
+    return MeasuredPattern("smooth", fields[0], fields[1] if polarised else None)
+
+
+class Foreign(HalfWaveDipole):
+    """A class the kernel does not know, with both components."""
+
+    def field(self, theta_rad, phi_rad):
+        theta, phi = np.broadcast_arrays(theta_rad, phi_rad)
+        return np.sin(theta) * (1 + 0.3j * np.cos(phi)), 0.5j * np.sin(phi) + 0.2
+
+
+PATTERNS = {
+    "iso": (Isotropic(),),
+    "dipole": (HalfWaveDipole(),),
+    "tr38901": (TR38901(),),
+    "field grid": (measured(),),
+    "gain grid": (measured(2, polarised=False),),
+    "installed": (InstalledPattern(TR38901(), (1.0, -2.0, 0.5, 0.3)),),
+    "foreign": (Foreign(),),
+    "one each": (Isotropic(), measured(3), Foreign(), TR38901()),
+}
+
+
+@pytest.fixture(scope="module")
+def case():
+    """Poses, paths and scene of three towers; most paths have reflections at slabs and at the ground."""
+    site, link, poses = random_scene(60, towers=3)
+    paths = replay(site, link, poses).paths
+    assert set(paths.depth) == {0, 1, 2}
+    return site, link, poses, paths
+
+
+def with_patterns(link, patterns, **changes):
+    lam = wavelength_m(link.carrier_hz)
+    tower = dataclasses.replace(tower_comparison_array(), patterns=patterns)
+    uav = dataclasses.replace(uav_comparison_array(lam), patterns=patterns[::-1])
+    return dataclasses.replace(link, tower_arrays=dict.fromkeys(link.tower_arrays, tower), uav_array=uav, **changes)
+
+
+def both(monkeypatch, case, link, loss_db=None, **options):
+    site, _, poses, paths = case
+    scene = Scene.of(site, link, poses)
+    arguments = (paths, scene.faces, scene.sources_m, poses, link, loss_db)
+    monkeypatch.setenv(compiled.SWITCH, "never")
+    numpy = channel.channel_matrices(*arguments)
+    monkeypatch.setenv(compiled.SWITCH, "always")
+    return numpy, channel.channel_matrices(*arguments, **options), scene
+
+
+def bound(case, link, scene, gain):
+    """Rounding of lengths, as phases, times the largest field of a link: some units of the last place."""
+    _, _, poses, paths = case
+    length = np.linalg.norm(poses.position_m[paths.pose] - scene.sources_m[paths.tower], axis=1)
+    far = length.max() + 100.0
+    lam = wavelength_m(link.carrier_hz)
+    return 16 * np.finfo(float).eps * (2 * np.pi * far / lam) * gain * 6 * lam / (4 * np.pi * length.min())
+
+
+@needs_numba
+@pytest.mark.parametrize("name", PATTERNS)
+@pytest.mark.parametrize("uav_transmits", [False, True])
+def test_compiled_equals_numpy(monkeypatch, case, name, uav_transmits):
+    link = with_patterns(case[1], PATTERNS[name], uav_transmits=uav_transmits)
+    loss = np.random.default_rng(4).uniform(0, 20, len(case[3]))
+    loss[::7] = np.inf
+    numpy, ours, scene = both(monkeypatch, case, link, loss)
+    assert ours.h.shape == numpy.h.shape
+    assert np.abs(ours.h - numpy.h).max() < bound(case, link, scene, gain=10.0)
+    size = np.abs(numpy.h).max(axis=(2, 3), keepdims=True)
+    assert (np.abs(ours.h - numpy.h) <= 1e-10 * size).all()
+    np.testing.assert_allclose(ours.path_power, numpy.path_power, rtol=1e-11, atol=1e-30)
+    np.testing.assert_allclose(ours.power, numpy.power, rtol=1e-11, atol=1e-30)
+    for k in (10, 100, 1000):
+        assert (channel_rank(ours.h, k) == channel_rank(numpy.h, k)).all()
+
+
+@needs_numba
+def test_threads_and_chunks_change_no_bit(monkeypatch, case):
+    link = with_patterns(case[1], PATTERNS["one each"])
+    found = []
+    for chunk, threads in ((10_000, 1), (7, 1), (7, 3), (64, 2)):
+        monkeypatch.setattr(compiled_field, "PATHS_PER_CHUNK", chunk)
+        found.append(both(monkeypatch, case, link, threads=threads)[1])
+    for other in found[1:]:
+        assert np.array_equal(other.h, found[0].h)
+        assert np.array_equal(other.path_power, found[0].path_power)
+        assert np.array_equal(other.power, found[0].power)
+
+
+@needs_numba
+def test_more_pairs_than_lanes_and_paths_in_any_order(monkeypatch, case):
+    site, link, poses, paths = case
+    rng = np.random.default_rng(8)
+    large = Array(rng.normal(size=(11, 3)), rng.uniform(0, np.pi, 11))
+    link = dataclasses.replace(link, tower_arrays=dict.fromkeys(link.tower_arrays, large), uav_array=large)
+    mixed = rng.permutation(len(paths))
+    numpy, ours, scene = both(
+        monkeypatch, (site, link, poses, paths.select(mixed)), link, rng.uniform(0, 3, len(paths))
+    )
+    assert np.abs(ours.h - numpy.h).max() < bound(case, link, scene, gain=1.0)
+    np.testing.assert_allclose(ours.path_power, numpy.path_power, rtol=1e-11)
+
+
+@needs_numba
+def test_read_only_arrays_are_taken_and_nothing_is_written_to_arguments(monkeypatch, case):
+    _, link, poses, paths = case
+    before = poses.position_m.copy(), paths.faces.copy()
+    for array in (poses.position_m, poses.rotation, paths.pose):
+        array.flags.writeable = False
+    try:
+        numpy, ours, scene = both(monkeypatch, case, link)
+    finally:
+        for array in (poses.position_m, poses.rotation, paths.pose):
+            array.flags.writeable = True
+    assert np.abs(ours.h - numpy.h).max() < bound(case, link, scene, gain=1.0)
+    assert np.array_equal(before[0], poses.position_m)
+    assert np.array_equal(before[1], paths.faces)
+
+
+@needs_numba
+def test_no_paths_no_poses(monkeypatch, case):
+    site, link, poses, paths = case
+    numpy, ours, _ = both(monkeypatch, (site, link, poses, paths.select(slice(0, 0))), link)
+    assert not ours.h.any()
+    assert ours.h.shape == numpy.h.shape
+    none = Poses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    assert both(monkeypatch, (site, link, none, paths.select(slice(0, 0))), link)[1].h.shape == (0, 3, 4, 4)
+
+
+@needs_numba
+def test_sine_and_cosine_of_turns_within_one_unit_of_the_last_place():
+    from aerpaw_cmp.propagation.kernels import turn_sine_cosine
+
+    turns = np.concatenate([np.linspace(-0.5, 0.5, 4001), [0.125, -0.125, 0.375, 1e-300, 0.0]])
+    ours = np.array([turn_sine_cosine(t) for t in turns])
+    exact = np.exp(2j * np.pi * turns.astype(np.longdouble) + 0)
+    assert np.abs(ours[:, 0] - np.float64(exact.imag)).max() < 3e-16
+    assert np.abs(ours[:, 1] - np.float64(exact.real)).max() < 3e-16
+
+
+# ---------------------------------------------------------------- paths
+
+
+def same_paths(one, two):
+    for column in ("pose", "tower", "depth", "faces"):
+        np.testing.assert_array_equal(getattr(one, column), getattr(two, column))
+    np.testing.assert_allclose(one.vertices_m, two.vertices_m, rtol=0, atol=1e-9)
+
+
+def searched(monkeypatch, faces, sources, targets, **options):
+    monkeypatch.setenv(compiled.SWITCH, "never")
+    numpy = image.find_paths(faces, sources, targets, **options)
+    monkeypatch.setenv(compiled.SWITCH, "always")
+    ours = image.find_paths(faces, sources, targets, **options, threads=2)
+    same_paths(numpy, ours)
+    return ours
+
+
+def whole_metres(rng, buildings):
+    """Boxes, L shapes and towers on a grid of whole metres, so that walls, edges, roofs and ends coincide."""
+    found = []
+    for _ in range(buildings):
+        east, north = rng.integers(-6, 6, 2)
+        shape = box(east, north, east + rng.integers(1, 4), north + rng.integers(1, 4))
+        if rng.uniform() < 0.5:
+            shape = shapely.union(shape, box(east, north, east + 1, north + 5))
+        if not any(shapely.area(shapely.intersection(shape, other.footprint)) > 0 for other in found):
+            found.append(Building(f"b{len(found)}", shape, float(rng.integers(1, 4))))
+    return tuple(found)
+
+
+@needs_numba
+@pytest.mark.parametrize("seed", range(6))
+def test_the_same_paths_among_aligned_and_touching_buildings(monkeypatch, scenes, seed):
+    rng = np.random.default_rng(seed)
+    faces = site_faces(scenes.site(whole_metres(rng, 7)))
+    targets = rng.integers(-8, 9, (120, 3)).astype(float)
+    targets[:, 2] = np.abs(targets[:, 2]) // 2
+    targets[5] = np.nan
+    sources = np.array([[0.0, 0.0, 5.0], [-7.0, 3.0, 2.0], [8.0, 8.0, 1.0]])
+    found = searched(monkeypatch, faces, sources, targets, max_depth=2)
+    assert len(found) > 100
+
+
+@needs_numba
+@pytest.mark.parametrize("max_depth", [0, 1, 3])
+def test_the_same_paths_at_any_depth_and_with_links_left_out(monkeypatch, case, max_depth):
+    site, link, poses, _ = case
+    scene = Scene.of(site, link, poses)
+    usable = scene.usable.copy()
+    usable[1, ::3] = False
+    excluded = scene.excluded.copy()
+    excluded[0, ::4] = True
+    monkeypatch.setattr(compiled_search, "POSES_PER_CHUNK", 13)
+    found = searched(
+        monkeypatch, scene.faces, scene.sources_m, poses.position_m[:40],
+        max_depth=max_depth, usable=usable, excluded=excluded[:, :40],
+    )  # fmt: skip
+    assert found.depth.max() == min(max_depth, 2) or max_depth == 3
+
+
+@needs_numba
+def test_towers_searched_one_by_one_give_the_same_set(monkeypatch, case):
+    site, link, poses, paths = case
+    scene = Scene.of(site, link, poses)
+    monkeypatch.setattr(image, "SEQUENCES_AT_ONCE", 1)
+    found = searched(
+        monkeypatch, scene.faces, scene.sources_m, poses.position_m, usable=scene.usable, excluded=scene.excluded
+    )
+    same_paths(found, paths)
+
+
+@needs_numba
+def test_nothing_to_search(monkeypatch, scenes):
+    faces = site_faces(scenes.site())
+    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.zeros((0, 3))))
+    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
+
+
+# ---------------------------------------------------------------- choosing and doing without
+
+
+@pytest.fixture
+def fresh():
+    """Nothing remembered, before and after."""
+    compiled.load.cache_clear()
+    compiled._warn_once.cache_clear()
+    yield
+    compiled.load.cache_clear()
+    compiled._warn_once.cache_clear()
+
+
+def test_a_missing_numba_is_no_error(monkeypatch, fresh, case):
+    monkeypatch.setattr(compiled, "find_spec", lambda _: None)
+    monkeypatch.delenv(compiled.SWITCH, raising=False)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert compiled.kernels_for(10**9) is None  # nobody asked for it
+    monkeypatch.setenv(compiled.SWITCH, "always")
+    with pytest.warns(RuntimeWarning, match=r"aerpaw-cmp\[fast\]"):
+        assert compiled.kernels_for(1) is None
+
+
+@pytest.mark.parametrize(
+    "error", [ImportError("Numba needs NumPy 2.4 or less"), RuntimeError("no locator"), EOFError()]
+)
+def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, case, error):
+    def broken():
+        raise error
+
+    monkeypatch.setattr(compiled, "find_spec", lambda _: True)
+    for name in ("kernels", "search_kernels"):
+        module = types.ModuleType(name)
+        module.try_out = broken
+        monkeypatch.setitem(sys.modules, f"aerpaw_cmp.propagation.{name}", module)
+    monkeypatch.setattr(compiled, "ENOUGH_WORK", 1)
+    monkeypatch.delenv(compiled.SWITCH, raising=False)
+    site, link, poses, paths = case
+    with pytest.warns(RuntimeWarning, match="cannot run"):
+        result = replay(site, link, poses)
+    assert len(result.paths) == len(paths)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        replay(site, link, poses)
+
+
+def test_only_large_work_is_compiled(monkeypatch):
+    monkeypatch.delenv(compiled.SWITCH, raising=False)
+    monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
+    assert compiled.kernels_for(compiled.ENOUGH_WORK - 1) is None
+    assert compiled.kernels_for(compiled.ENOUGH_WORK) is not None
+    monkeypatch.setenv(compiled.SWITCH, "never")
+    assert compiled.kernels_for(10**9) is None
+
+
+def test_wrong_settings_are_named(monkeypatch):
+    monkeypatch.setenv(compiled.SWITCH, "sometimes")
+    with pytest.raises(UsageError, match="AERPAW_CMP_COMPILED=sometimes"):
+        compiled.kernels_for(1)
+    with pytest.raises(UsageError, match="0 threads"):
+        compiled.thread_count(0)

@@ -1,0 +1,89 @@
+"""A real browser for the pages: started, asked, looked at. Tests skip where it is not installed."""
+
+from __future__ import annotations
+
+import json
+import shutil
+from importlib import resources
+
+import pytest
+
+BROWSER, DRIVER = shutil.which("chromium"), shutil.which("chromedriver")
+
+needs_browser = pytest.mark.skipif(not (BROWSER and DRIVER), reason="no chromium with chromedriver on this machine")
+
+
+def start(*arguments: str, scripts: bool = True):
+    from selenium.webdriver import Chrome, ChromeOptions
+    from selenium.webdriver.chrome.service import Service
+
+    options = ChromeOptions()
+    options.binary_location = BROWSER
+    for argument in ("--headless=new", "--no-sandbox", "--disable-gpu", "--disable-dev-shm-usage", *arguments):
+        options.add_argument(argument)
+    options.set_capability("goog:loggingPrefs", {"browser": "ALL", "performance": "ALL"})
+    if not scripts:
+        options.add_experimental_option("prefs", {"profile.managed_default_content_settings.javascript": 2})
+    return Chrome(options=options, service=Service(DRIVER))
+
+
+def open_page(driver, path, ready: str) -> None:
+    """Open a page and wait until its script says so: ``ready`` is an expression."""
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    driver.get(path.as_uri())
+    WebDriverWait(driver, 20, 0.02).until(lambda d: d.execute_script(f"return Boolean({ready})"))
+
+
+def choose(driver, element: str, text: str) -> None:
+    from selenium.webdriver.support.ui import Select
+
+    Select(driver.find_element("id", element)).select_by_visible_text(text)
+
+
+def frame(driver) -> None:
+    driver.execute_async_script("const done = arguments[0]; requestAnimationFrame(() => requestAnimationFrame(done));")
+
+
+def complaints(driver) -> list[dict]:
+    return [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+
+
+def asked_outside(driver) -> list[str]:
+    """Addresses that the page asked for and that are no part of it."""
+    messages = (json.loads(entry["message"])["message"] for entry in driver.get_log("performance"))
+    asked = [m["params"]["request"]["url"] for m in messages if m["method"] == "Network.requestWillBeSent"]
+    return [url for url in asked if not url.startswith(("file:", "data:", "chrome:"))]
+
+
+def serious_findings(driver) -> dict[str, list[str]]:
+    """Findings of axe-core that are serious or critical, by rule."""
+    axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is not installed")
+    source = resources.files(axe) / "node_modules" / "axe-core" / "axe.min.js"
+    driver.execute_script(source.read_text(encoding="utf-8"))
+    # HTML 5.2 lets <div> group the items of a <dl>, which the packaged axe does not know yet
+    rules = {"rules": {"dlitem": {"enabled": False}}}
+    found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
+    return {
+        v["id"]: [n["html"][:120] for n in v["nodes"]]
+        for v in found["violations"]
+        if v["impact"] in ("serious", "critical")
+    }
+
+
+def set_width(driver, width: int, height: int = 1000) -> None:
+    driver.execute_cdp_cmd(
+        "Emulation.setDeviceMetricsOverride",
+        {"width": width, "height": height, "deviceScaleFactor": 1, "mobile": False},
+    )
+    frame(driver)
+
+
+def usual_width(driver) -> None:
+    driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
+
+
+def set_scheme(driver, *schemes: str) -> None:
+    features = [{"name": "prefers-color-scheme", "value": scheme} for scheme in schemes]
+    driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})
+    frame(driver)

@@ -1,0 +1,486 @@
+"""Exports are read back with the programs that others use, compared with the CSVs, and faults planted in them are seen."""
+
+from __future__ import annotations
+
+import dataclasses
+import errno
+import json
+import sqlite3
+import sys
+import typing
+import zipfile
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.flight.settings import ReportSettings
+from aerpaw_cmp.report.export import rank_frame, rss_frame
+from aerpaw_cmp.report.exports import geojson, geopackage, gpx, kmz, matlab, netcdf, parquet, samples, write
+
+ODD = 'LW<4> & "ö"'
+DBM = "0.1 lg(re 1 mW)"
+
+
+def thinned(panel, every, **change):
+    """Every so many samples of a panel."""
+    n = len(panel.time)
+    cut = {
+        f.name: value[::every]
+        for f in dataclasses.fields(panel)
+        if isinstance(value := getattr(panel, f.name), np.ndarray) and len(value) == n
+    }
+    if hasattr(panel, "baselines"):
+        cut["baselines"] = tuple(dataclasses.replace(b, level_dbm=b.level_dbm[::every]) for b in panel.baselines)
+    if hasattr(panel, "simulated"):
+        cut["simulated"] = tuple(dataclasses.replace(at, rank=at.rank[::every]) for at in panel.simulated)
+    return dataclasses.replace(panel, **cut, **change)
+
+
+@pytest.fixture(scope="module")
+def data(report_data):
+    """A short flight: a name that must be escaped, a position that is unknown, levels out of coverage, no CSI."""
+    first, last = thinned(report_data.rss[0], 60), thinned(report_data.rss[2], 60, tower=ODD)
+    east, north, up = (np.array(v) for v in (first.east_m, first.north_m, first.up_m))
+    east[7] = north[7] = up[7] = np.nan
+    first = dataclasses.replace(
+        first,
+        east_m=east,
+        north_m=north,
+        up_m=up,
+        unit="dBm",
+        per_sample={"simulated_sd_db": np.full(len(first.time), 2.5)},
+    )
+    rank = thinned(report_data.rank[0], 10, values={"level_dbm": np.linspace(-90, -50, 100)})
+    track = thinned(report_data.track, 30)
+    return dataclasses.replace(
+        report_data, track=track, rss=(first, last), rank=(rank,), synthetic=True, title="Flight <1> & more"
+    )
+
+
+@pytest.fixture(scope="module")
+def frames(data, tmp_path_factory):
+    """rss.csv and rank.csv as a user reads them, with where each sample is."""
+    found = {}
+    for kind, frame in (("rss", rss_frame(data.rss)), ("rank", rank_frame(data.rank))):
+        path = tmp_path_factory.mktemp("csv") / f"{kind}.csv"
+        frame.to_csv(path, index=False)
+        table = pd.read_csv(path)
+        table["time"] = pd.to_datetime(table["time_utc"]).astype("datetime64[ns, UTC]")
+        found[kind] = table
+    return found
+
+
+FRAME = SiteFrame(35.7275, -78.6960)
+
+
+def same(table, column, values, *, atol=1e-9):
+    np.testing.assert_allclose(
+        np.asarray(values, dtype=float), table[column].to_numpy(float), rtol=0, atol=atol, err_msg=column
+    )
+
+
+def same_places(table, latitude, longitude, atol=2e-3):
+    """Back to metres with the site's own projection, from what the file says."""
+    east, north = FRAME.to_local(np.asarray(latitude, dtype=float), np.asarray(longitude, dtype=float))
+    same(table, "east_m", east, atol=atol)
+    same(table, "north_m", north, atol=atol)
+
+
+def same_times(table, times):
+    seconds = (
+        pd.to_datetime(pd.Series(list(times)), utc=True).astype("datetime64[ns, UTC]")
+        - table["time"].reset_index(drop=True)
+    ).dt.total_seconds()
+    assert seconds.abs().max() < 2e-3
+
+
+COLUMNS = {
+    "rss": ["measured_db", "calibrated_db", "simulated_dbm", "residual_db", "measured_out_of_coverage", "simulated_out_of_coverage", "free_space_dbm", "two_ray_dbm", "simulated_sd_db", "up_m"],
+    "rank": ["measured_rank", "simulated_rank_k10", "simulated_rank_k100", "simulated_rank_k1000", "level_dbm", "up_m"],
+}  # fmt: skip
+
+
+# --- one check per format, each against the CSVs ---------------------------------------------------------------------
+
+
+def check_vector(path, layer, kind, table, units):
+    """GeoJSON and GeoPackage, through GDAL."""
+    pyogrio = pytest.importorskip("pyogrio")
+    meta, _, shapes, columns = pyogrio.raw.read(path, layer=layer)
+    found = dict(zip(meta["fields"], columns, strict=True))
+    assert meta["crs"] == "EPSG:4326"
+    for name in COLUMNS[kind]:
+        same(table, name, found[name])
+    same_times(table, found["time"])
+    assert found["tower"].tolist() == table["tower"].tolist()
+    places = np.array([np.frombuffer(s[5:21]) if s is not None else [np.nan, np.nan] for s in shapes])
+    same_places(table, places[:, 1], places[:, 0])
+    assert units["simulated_dbm" if kind == "rss" else "level_dbm"] == "dBm"
+
+
+def check_geojson(folder, frames):
+    for kind, table in frames.items():
+        path = folder / f"{kind}.geojson"
+        text = path.read_text(encoding="utf-8")
+        head = json.loads(text, parse_constant=lambda name: pytest.fail(name))
+        assert head["features"][0]["geometry"]["coordinates"][0] < -78, "longitude first (RFC 7946)"
+        check_vector(path, None, kind, table, {name: c["unit"] for name, c in head["columns"].items()})
+    assert head["columns"]["simulated_rank_k10"]["codes"][0] == "out_of_coverage"
+    towers = json.loads((folder / "towers.geojson").read_text())["features"]
+    assert [t["properties"]["name"] for t in towers] == ["LW1", "LW2", "LW3", "LW4", "LW5"]
+    assert towers[0]["geometry"]["coordinates"] == pytest.approx([-78.6960, 35.7275], abs=1e-7)
+
+
+def check_geopackage(folder, frames):
+    pyogrio = pytest.importorskip("pyogrio")
+    path = folder / "samples.gpkg"
+    assert [name for name, _ in pyogrio.list_layers(path)] == ["towers", "track", "rss", "rank"]
+    with sqlite3.connect(path) as book:
+        assert book.execute("PRAGMA integrity_check").fetchone() == ("ok",)
+        titles = book.execute("SELECT table_name, column_name, title FROM gpkg_data_columns").fetchall()
+    book.close()
+    for kind, table in frames.items():
+        units = {column: title.rsplit("[", 1)[-1].rstrip("]") for name, column, title in titles if name == kind}
+        check_vector(path, kind, kind, table, units)
+        box = pyogrio.read_info(path, layer=kind)["total_bounds"]
+        assert -78.71 < box[0] < box[2] < -78.68
+        assert 35.72 < box[1] < box[3] < 35.74
+    _, _, lines, _ = pyogrio.raw.read(path, layer="track")
+    assert len(lines) == 1
+
+
+def check_netcdf(folder, frames):
+    xr = pytest.importorskip("xarray")
+    for kind, table in frames.items():
+        with xr.open_dataset(folder / f"{kind}.nc", decode_coords="all") as book:
+            assert book.attrs["featureType"] == "trajectory"
+            assert book.attrs["history"]
+            for name in COLUMNS[kind]:
+                same(table, name, book["up" if name == "up_m" else name])
+            same_times(table, book["time"].values)
+            same_places(table, book["latitude"], book["longitude"])
+            towers = np.repeat(book["tower"].values.astype(str), book["row_size"].values)
+            assert towers.tolist() == table["tower"].tolist()
+            level = book["simulated_dbm" if kind == "rss" else "level_dbm"]
+            assert level.attrs["units"] == DBM
+            assert book["latitude"].attrs["units"] == "degrees_north"
+            if kind == "rank":
+                codes = book["simulated_rank_k10"].attrs
+                assert codes["flag_meanings"].split()[0] == "out_of_coverage"
+                assert codes["flag_values"][0] == 0
+                assert np.isnan(book["measured_rank"].values).any(), "no CSI stays missing"
+
+
+def check_parquet(folder, frames):
+    parquet_ = pytest.importorskip("pyarrow.parquet")
+    for kind, table in frames.items():
+        found = parquet_.read_table(folder / f"{kind}.parquet")
+        for name in COLUMNS[kind]:
+            same(table, name, found[name].to_pandas())
+        same_times(table, found["time"].to_pandas())
+        same_places(table, found["latitude_deg"].to_pandas(), found["longitude_deg"].to_pandas())
+        assert found["tower"].to_pylist() == table["tower"].tolist()
+        level = found.schema.field("simulated_dbm" if kind == "rss" else "level_dbm")
+        assert level.metadata[b"unit"] == b"dBm"
+        assert json.loads(found.schema.metadata[b"geo"])["columns"]["geometry"]["encoding"] == "WKB"
+        shape = found["geometry"][0].as_py()
+        assert np.frombuffer(shape[5:13])[0] == found["longitude_deg"][0].as_py()
+        assert found.column(COLUMNS[kind][0]).null_count == table[COLUMNS[kind][0]].isna().sum(), "null, not NaN"
+
+
+def check_mat(folder, frames):
+    from scipy.io import loadmat
+
+    book = loadmat(folder / "samples.mat", simplify_cells=True)
+    for kind, table in frames.items():
+        links = np.atleast_1d(book[kind])
+
+        def all_of(name, links=links):
+            return np.concatenate([np.atleast_1d(link[name]) for link in links])
+
+        for name in COLUMNS[kind]:
+            same(table, name, all_of(name))
+        same_times(table, pd.to_datetime(all_of("time_posix_s"), unit="s", utc=True))
+        same_places(table, all_of("latitude_deg"), all_of("longitude_deg"))
+        assert list(dict.fromkeys(link["tower"] for link in links)) == list(dict.fromkeys(table["tower"]))
+        assert book[f"{kind}_units"]["simulated_dbm" if kind == "rss" else "level_dbm"] == "dBm"
+    assert "synthetic" in book["about"]["remarks"]
+    assert book["towers"]["latitude_deg"][0] == pytest.approx(35.7275)
+
+
+def check_gpx(folder, frames, data):
+    gpxpy = pytest.importorskip("gpxpy")
+    del frames
+    with (folder / "track.gpx").open(encoding="utf-8") as stream:
+        book = gpxpy.parse(stream)
+    points = [point for track in book.tracks for segment in track.segments for point in segment.points]
+    line = pd.DataFrame({"east_m": data.track.east_m, "north_m": data.track.north_m, "up_m": data.track.up_m})
+    line["time"] = pd.to_datetime(data.track.time).tz_localize("UTC")
+    same_places(line, [p.latitude for p in points], [p.longitude for p in points])
+    same(line, "up_m", [p.elevation for p in points], atol=1e-3)
+    same_times(line, [p.time for p in points])
+    assert [w.name for w in book.waypoints] == list(data.site.towers)
+    assert "above the ground" in book.tracks[0].description
+
+
+def check_kmz(folder, frames, data):
+    fastkml = pytest.importorskip("fastkml")
+    with zipfile.ZipFile(folder / "samples.kmz") as archive:
+        assert archive.namelist()[0] == "doc.kml"
+        text = archive.read("doc.kml").decode()
+        legends = [name for name in archive.namelist() if name.startswith("legends/")]
+    book = fastkml.KML.from_string(text.split("?>\n", 1)[1])
+    document = book.features[0]
+    folders = {f.name: f for f in document.features if isinstance(f, fastkml.Folder)}
+    towers = folders.pop("Towers")
+    assert [p.name for p in towers.features] == list(data.site.towers)
+    assert towers.features[0].geometry.coords[0][:2] == pytest.approx((-78.6960, 35.7275), abs=1e-6)
+    flown = next(f for f in document.features if isinstance(f, fastkml.Placemark))
+    table = frames["rss"].query("channel == 'USRP1' and tower == 'LW1'").reset_index(drop=True)
+    assert "gx:Track" in text
+    del flown
+    lines = folders["LW1 USRP1, Residual"].features
+    spans = [line for line in lines if isinstance(line, fastkml.Placemark)]
+    at = np.concatenate(
+        [np.array(line.geometry.coords)[: -1 if i < len(spans) - 1 else None] for i, line in enumerate(spans)]
+    )
+    known = table[table["east_m"].notna()].reset_index(drop=True)
+    same_places(known, at[:, 1], at[:, 0], atol=0.02)
+    same(known, "up_m", at[:, 2], atol=0.06)
+    same_times(known.iloc[[0, -1]], [spans[0].times.begin.dt, spans[-1].times.end.dt])
+    worst = known["residual_db"].abs().max()
+    said = [
+        float(number)
+        for line in spans
+        if line.name.endswith(" dB")
+        for number in line.name.removesuffix(" dB").split(" to ")
+    ]
+    assert max(map(abs, said)) == pytest.approx(worst, abs=0.06), "the largest residual is there"
+    styles = {style.id for style in document.styles}
+    assert {
+        line.style_url.url.removeprefix("#")
+        for f in folders.values()
+        for line in f.features
+        if isinstance(line, fastkml.Placemark)
+    } <= styles
+    assert sorted(legends) == ["legends/level.png", "legends/rank.png", "legends/residual.png"]
+    assert f"{ODD} USRP1, Residual" in folders
+
+
+CHECKS = {
+    "geojson": check_geojson,
+    "geopackage": check_geopackage,
+    "netcdf": check_netcdf,
+    "parquet": check_parquet,
+    "mat": check_mat,
+    "gpx": check_gpx,
+    "kmz": check_kmz,
+}  # fmt: skip
+
+
+def checked(name, folder, frames, data):
+    more = (data,) if name in ("gpx", "kmz") else ()
+    CHECKS[name](folder / write.FOLDER, frames, *more)
+
+
+@pytest.mark.parametrize("name", write.FORMATS)
+def test_an_independent_reader_finds_what_the_csvs_hold(name, data, frames, tmp_path):
+    written = write.write_exports(samples.of_report(data), tmp_path, [name])
+    assert written
+    assert all(path.is_file() and path.parent.name == "exports" for path in written)
+    checked(name, tmp_path, frames, data)
+
+
+MODULES = (geojson, geopackage, gpx, kmz, matlab, netcdf, parquet)
+
+
+def swap_places(monkeypatch, data):
+    def swapped(frame, east_m, north_m):
+        return samples.latitude_longitude(frame, east_m, north_m)[::-1]
+
+    for module in MODULES:
+        monkeypatch.setattr(module, "latitude_longitude", swapped)
+    return samples.of_report(data)
+
+
+def shift_time(monkeypatch, data):
+    del monkeypatch
+    export = samples.of_report(data)
+    one_hour = np.timedelta64(3600, "s")
+    later = [
+        dataclasses.replace(s, series=tuple(dataclasses.replace(x, time=x.time + one_hour) for x in s.series))
+        for s in export.sets
+    ]
+    lines = tuple(dataclasses.replace(line, time=line.time + one_hour) for line in export.lines)
+    return dataclasses.replace(export, sets=tuple(later), lines=lines)
+
+
+def wrong_unit(monkeypatch, data):
+    monkeypatch.setattr(samples, "DBM", "W")
+    monkeypatch.setattr(samples, "_UNITS", ((r"_dbm$", "W", "W"), *samples._UNITS[1:]))
+    return samples.of_report(data)
+
+
+def zeros_for_missing(monkeypatch, data):
+    del monkeypatch
+    export = samples.of_report(data)
+    filled = [
+        dataclasses.replace(
+            s,
+            series=tuple(
+                dataclasses.replace(x, values={n: np.nan_to_num(v) for n, v in x.values.items()}) for x in s.series
+            ),
+        )
+        for s in export.sets
+    ]
+    return dataclasses.replace(export, sets=tuple(filled))
+
+
+WITHOUT_UNITS = ("gpx", "kmz")
+"""Their lines show no missing value either."""
+
+
+SHOWN = [(name, fault) for fault in (swap_places, shift_time, wrong_unit, zeros_for_missing) for name in write.FORMATS
+         if fault in (swap_places, shift_time) or name not in WITHOUT_UNITS]  # fmt: skip
+
+
+@pytest.mark.parametrize(("name", "fault"), SHOWN)
+def test_a_planted_fault_is_seen(name, fault, data, frames, tmp_path, monkeypatch):
+    export = fault(monkeypatch, data)
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    write.write_exports(export, tmp_path, [name])
+    with pytest.raises((AssertionError, KeyError, IndexError)):
+        checked(name, tmp_path, frames, data)
+
+
+def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, cf_faults):
+    write.write_exports(samples.of_report(data), tmp_path, ["netcdf"])
+    assert cf_faults(tmp_path / "exports" / "rss.nc") == []
+    assert cf_faults(tmp_path / "exports" / "rank.nc") == []
+
+
+def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path, cf_faults):
+    export = samples.of_report(data)
+    rss, rank = export.sets
+    wrong = [dataclasses.replace(c, unit="decibels of something") for c in rss.columns]
+    wrong = dataclasses.replace(export, sets=(dataclasses.replace(rss, columns=tuple(wrong)), rank))
+    write.write_exports(wrong, tmp_path, ["netcdf"])
+    assert any("decibels" in text for text in cf_faults(tmp_path / "exports" / "rss.nc"))
+
+
+# --- what else may happen --------------------------------------------------------------------------------------------
+
+
+def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch, cf_faults):
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    epoch = np.datetime64(0, "ns")
+
+    def moved(panel):
+        return dataclasses.replace(panel, time=epoch + (panel.time - panel.time[0]))
+
+    relative = dataclasses.replace(
+        data, rss=tuple(map(moved, data.rss)), rank=tuple(map(moved, data.rank)), track=moved(data.track)
+    )
+    export = samples.of_report(relative)
+    assert not export.clock
+    write.write_exports(export, tmp_path, ["gpx", "kmz", "netcdf"])
+    place = tmp_path / "exports"
+    assert "<time>" not in (place / "track.gpx").read_text()
+    with zipfile.ZipFile(place / "samples.kmz") as archive:
+        text = archive.read("doc.kml").decode()
+    assert "TimeSpan" not in text
+    assert "no origin" in text
+    assert cf_faults(place / "rss.nc") == []
+
+
+def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    alone = dataclasses.replace(data, rss=())
+    (tmp_path / "a").mkdir()
+    names = {p.name for p in write.write_exports(samples.of_report(alone), tmp_path / "a", write.FORMATS)}
+    assert "rank.nc" in names
+    assert "rss.nc" not in names
+    nothing = dataclasses.replace(data, rss=(), rank=(), track=None)
+    (tmp_path / "b").mkdir()
+    assert write.write_exports(samples.of_report(nothing), tmp_path / "b", write.FORMATS)
+    silent = dataclasses.replace(
+        data.rss[0],
+        **{
+            name: np.full(len(data.rss[0].time), np.nan)
+            for name in ("measured_db", "simulated_dbm", "east_m", "north_m", "up_m")
+        },
+    )
+    (tmp_path / "c").mkdir()
+    assert write.write_exports(
+        samples.of_report(dataclasses.replace(data, rss=(silent,), rank=())), tmp_path / "c", write.FORMATS
+    )
+
+
+def test_same_flight_same_kmz(data, tmp_path):
+    for name in ("a", "b"):
+        (tmp_path / name).mkdir()
+        write.write_exports(samples.of_report(data), tmp_path / name, ["kmz", "gpx", "geojson"])
+    for path in sorted((tmp_path / "a" / "exports").iterdir()):
+        assert path.read_bytes() == (tmp_path / "b" / "exports" / path.name).read_bytes()
+
+
+def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(kmz, "POINTS", 600)
+    folder = tmp_path / "exports"
+    folder.mkdir()
+    panel = data.rss[0]
+    level = np.array(panel.measured_db)
+    level[61] += 60.0  # one sample among many
+    export = samples.of_report(
+        dataclasses.replace(data, rss=(dataclasses.replace(panel, measured_db=level), data.rss[1]))
+    )
+    kmz.write_kmz(export, folder)
+    with zipfile.ZipFile(folder / "samples.kmz") as archive:
+        text = archive.read("doc.kml").decode()
+    largest = float(np.nanmax(level + panel.offset_db - panel.simulated_dbm))
+    assert f"{largest:.1f} dB</name>" in text
+    assert "Thinned to about" in text
+    lines = text.split("LW1 USRP1, Residual")[1].split("</Folder>")[0]
+    assert lines.count(" ") < 600
+
+
+def test_formats_are_chosen_by_name():
+    assert write.chosen_formats(["KMZ, gpx", "gpx"]) == ("kmz", "gpx")
+    assert write.chosen_formats(["all"]) == write.FORMATS
+    assert write.chosen_formats([]) == ()
+    with pytest.raises(UsageError, match=r"'shapefile'.*geopackage"):
+        write.chosen_formats(["shapefile"])
+    asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
+    assert set(asked) == {*write.FORMATS, write.ALL}
+
+
+@pytest.mark.parametrize(("name", "module"), [("netcdf", "netCDF4"), ("parquet", "pyarrow")])
+def test_a_missing_library_is_named_with_its_extra(name, module, data, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, module, None)
+    with pytest.raises(UsageError, match=rf"{module}.*aerpaw-cmp\[geo\]"):
+        write.chosen_formats([name])
+    told = []
+    write.write_exports(
+        samples.of_report(data), tmp_path, write.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
+    )
+    assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
+    assert not list((tmp_path / "exports").glob("*.nc" if name == "netcdf" else "*.parquet"))
+
+
+def test_a_full_disk_is_an_oserror_for_sqlite_too(data, tmp_path, monkeypatch):
+    def full(*_):
+        raise sqlite3.OperationalError("database or disk is full")
+
+    monkeypatch.setattr(geopackage, "_fill", full)
+    with pytest.raises(OSError, match="full") as caught:
+        geopackage.write_geopackage(samples.of_report(data), tmp_path)
+    assert caught.value.errno == errno.ENOSPC
+
+
+def test_a_flight_too_long_for_matlab_is_told(data, tmp_path, monkeypatch):
+    monkeypatch.setattr(matlab, "LARGEST", 1000)
+    with pytest.raises(UsageError, match="MATLAB 5"):
+        matlab.write_mat(samples.of_report(data), tmp_path)

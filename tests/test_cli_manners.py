@@ -1,0 +1,202 @@
+"""What every command has: -h, examples that parse, --quiet, --json; completion; what is said when it is interrupted."""
+
+from __future__ import annotations
+
+import json
+import os
+import shlex
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.cli.app import app
+from aerpaw_cmp.common.commands import COMMANDS
+
+ROOT = Path(__file__).parents[1]
+SAMPLE = ROOT / "sample_logs"
+
+
+def leaves(group: Any, *names: str) -> dict[tuple[str, ...], Any]:
+    """Every command of the program by its words."""
+    found: dict[tuple[str, ...], Any] = {}
+    for name, command in group.commands.items():
+        found |= leaves(command, *names, name) if hasattr(command, "commands") else {(*names, name): command}
+    return found
+
+
+PROGRAM: Any = typer.main.get_command(app)
+LEAVES = leaves(PROGRAM)
+EACH = pytest.mark.parametrize("words", LEAVES, ids=" ".join)
+
+
+def parse(line: str) -> dict[str, Any]:
+    """The values that a command line gives its command, which does not run; an exception for a wrong one."""
+    program, *words = shlex.split(line)
+    assert program == "aerpaw-cmp"
+    command, context = PROGRAM, PROGRAM.make_context("aerpaw-cmp", [], resilient_parsing=True)
+    while hasattr(command, "commands"):
+        name = words.pop(0)
+        command = command.commands[name]
+        group = hasattr(command, "commands")
+        context = command.make_context(name, [] if group else words, parent=context, resilient_parsing=group)
+    return dict(context.params)
+
+
+def examples_of(words: tuple[str, ...]) -> list[str]:
+    return [line.strip() for line in (LEAVES[words].epilog or "").splitlines() if line.startswith("  ")]
+
+
+def test_the_table_of_commands_and_the_program_agree() -> None:
+    assert set(PROGRAM.commands) == set(COMMANDS)
+
+
+@EACH
+def test_every_command_has_help_quiet_json_and_examples_that_parse(words: tuple[str, ...]) -> None:
+    options = {option for one in LEAVES[words].params for option in one.opts}
+    assert {"--quiet", "-q", "--json"} <= options
+    lines = examples_of(words)
+    assert lines
+    for line in lines:
+        assert shlex.split(line)[1 : 1 + len(words)] == list(words), "an example shows its own command"
+        assert parse(line)
+
+
+@EACH
+@pytest.mark.parametrize("flag", ["-h", "--help"])
+def test_help_with_both_names(words: tuple[str, ...], flag: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([*words, flag]) == 0
+    shown = capsys.readouterr().out
+    assert shown.startswith(f"Usage: aerpaw-cmp {' '.join(words)}")
+    for line in examples_of(words):
+        assert line in shown.splitlines() or f"    {line}" in shown.splitlines(), "not broken"
+
+
+@pytest.mark.parametrize(
+    "line",
+    [
+        "aerpaw-cmp report f.yaml --figure none",
+        "aerpaw-cmp report",
+        "aerpaw-cmp site shown",
+        "aerpaw-cmp map --engine x",
+    ],
+)
+def test_a_wrong_example_would_be_seen(line: str) -> None:
+    with pytest.raises(Exception, match=r".*"):
+        parse(line)
+
+
+def cheap(tmp: Path) -> dict[str, tuple[list[str], list[str]]]:
+    """Commands that are cheap to run: their line, and what puts their input there."""
+    barn = [[-78.6975, 35.7280], [-78.6972, 35.7280], [-78.6972, 35.7282], [-78.6975, 35.7280]]
+    shape = {
+        "type": "Feature",
+        "properties": {"building": "yes"},
+        "geometry": {"type": "Polygon", "coordinates": [barn]},
+    }
+    (tmp / "map.geojson").write_text(json.dumps({"type": "FeatureCollection", "features": [shape]}))
+    return {
+        "formats": [],
+        "sample": ["-o", f"{tmp}/sample"],
+        "ingest": [f"{SAMPLE}/LW1", "--timezone", "America/New_York", "-o", f"{tmp}/f.h5", "--draft", f"{tmp}/f.yaml"],
+        "site import": [f"{tmp}/map.geojson", "-o", f"{tmp}/site.yaml"],
+    }
+
+
+@pytest.mark.parametrize("words", ["formats", "sample", "ingest", "site import"])
+def test_json_is_one_object_and_quiet_says_nothing(
+    words: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    line = [*words.split(), *cheap(tmp_path)[words]]
+    assert main(line) in (0, 1)
+    loud = capsys.readouterr()
+    assert main([*line, "--json", "--quiet"]) in (0, 1)
+    out, err = capsys.readouterr()
+    assert isinstance(json.loads(out), dict)
+    assert err == ""
+    assert main([*line, "-q"]) in (0, 1)
+    hushed = capsys.readouterr()
+    assert hushed.err == ""
+    assert hushed.out == loud.out, "what was asked for is still shown"
+    if words == "site import":
+        assert "kept from the base 'lake_wheeler': the name 'Lake Wheeler" in loud.err
+        assert "LW1, LW2" in loud.err
+
+
+def test_json_of_the_commands_that_only_write_files(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from aerpaw_cmp.jobs import run
+
+    for name, line in (("run_site_show", ["site", "show"]), ("run_simulate", ["simulate", "plan.yaml"])):
+        monkeypatch.setattr(run, name, lambda *_, **__: [Path("a.txt"), Path("b.txt")])
+        assert main([*line, "--json"]) == 0
+        assert json.loads(capsys.readouterr().out) == {"files": ["a.txt", "b.txt"]}
+        assert main(line) == 0
+        assert capsys.readouterr().out.split() == ["a.txt", "b.txt"]
+
+
+def shell(shell_name: str, words: str) -> subprocess.CompletedProcess[str]:
+    environ = {**os.environ, "_AERPAW_CMP_COMPLETE": f"complete_{shell_name}", "_TYPER_COMPLETE_ARGS": words}
+    environ |= {"COMP_WORDS": words, "COMP_CWORD": str(len(words.split(" ")) - 1)}
+    code = (
+        "import sys; from aerpaw_cmp.__main__ import main\ntry: main([])\nfinally: print(*sys.modules, file=sys.stderr)"
+    )
+    return subprocess.run([sys.executable, "-c", code], env=environ, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.parametrize(
+    ("words", "offered"),
+    [("aerpaw-cmp rep", "report"), ("aerpaw-cmp site s", "show"), ("aerpaw-cmp report --qui", "--quiet"),
+     ("aerpaw-cmp report f.yaml --engine s", "sionna")],
+)  # fmt: skip
+def test_tab_offers_commands_options_and_values_and_loads_nothing_heavy(words: str, offered: str) -> None:
+    done = shell("bash", words)
+    assert done.stdout.split() == [offered]
+    loaded = {name.partition(".")[0] for name in done.stderr.split()}
+    assert loaded.isdisjoint({"numpy", "pandas", "matplotlib", "sionna", "mitsuba", "scipy", "h5py"})
+
+
+@pytest.mark.parametrize("name", ["bash", "zsh", "fish"])
+def test_a_completion_script_for_each_shell(name: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "aerpaw_cmp", "--show-completion", name], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0
+    assert "aerpaw-cmp" in done.stdout
+    assert "_AERPAW_CMP_COMPLETE" in done.stdout
+
+
+def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
+    before = tmp_path / "r" / "note.txt"
+    before.parent.mkdir()
+    before.write_text("mine")
+    flight = str(SAMPLE / "flight.yaml")
+    line = [
+        sys.executable,
+        "-m",
+        "aerpaw_cmp",
+        "report",
+        flight,
+        "--audit",
+        "none",
+        "-o",
+        str(before.parent),
+        "--force",
+    ]
+    run = subprocess.Popen(line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True)
+    assert run.stderr is not None
+    assert run.stderr.readline() == "read\n"
+    time.sleep(0.3)
+    run.send_signal(signal.SIGINT)
+    out, err = run.communicate(timeout=60)
+    assert (run.returncode, out) == (130, "")
+    assert err.splitlines()[-1] == f"aerpaw-cmp: interrupted; {before.parent} is as it was before"
+    assert [path.name for path in before.parent.iterdir()] == ["note.txt"]
+    assert [path.name for path in tmp_path.iterdir()] == ["r"]

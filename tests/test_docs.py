@@ -25,6 +25,7 @@ PAGES = [
     *sorted((ROOT / "reports" / "lake_wheeler").glob("*.md")),
 ]
 PROGRAM: Any = typer.main.get_command(app)
+_NUMBERS = {"N", "DB", "S", "HZ", "M", "K"}
 STARTS = ("aerpaw-cmp ", "python benchmarks/", "python tools/", "pytest ", "make ")
 
 
@@ -38,9 +39,9 @@ def commands(text: str) -> list[tuple[str, bool]]:
 
 
 def words_of(line: str) -> list[str]:
-    """Words of a line without comment, pipe, and the brackets and dots of a synopsis; N is a number."""
+    """Words of a line without comment, pipe, and the brackets and dots of a synopsis; N, DB and the like are numbers."""
     line = re.split(r"\s#|\s\||\s>|\s&", line)[0].replace("[", " ").replace("]", " ").replace("...", " ")
-    return ["1" if word == "N" else word for word in shlex.split(line)]
+    return ["1" if word in _NUMBERS else word for word in shlex.split(line)]
 
 
 def check(line: str, in_block: bool) -> None:

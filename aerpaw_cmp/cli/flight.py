@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import Export, Force, Json, LogsRoot, Out, command
-from .shown import number, print_files, print_json, say, table
+from .app import DryRun, Export, Force, Json, LogsRoot, Out, command
+from .shown import number, print_files, print_json, print_plan, say, table
 
 
 @command(
@@ -18,6 +18,7 @@ from .shown import number, print_files, print_json, say, table
     examples=[
         "aerpaw-cmp report sample_logs/flight.yaml",
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
+        "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all --style paper",
         "aerpaw-cmp report flight.yaml --export geopackage,kmz",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
@@ -49,12 +50,19 @@ def report(
         typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
     ] = "screen",
     export: Export = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
     from ..jobs import run
 
+    if dry_run:
+        plan = run.plan_report(
+            flight, out=out, logs_root=logs_root, engine=engine, audit=audit, figures=figures, force=force
+        )
+        print_plan(plan, as_json)
+        return 0
     outcome = run.run_report(
         flight,
         out=out,

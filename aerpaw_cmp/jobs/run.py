@@ -223,6 +223,32 @@ def run_report(
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
 
 
+def plan_report(
+    flight: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    engine: str | None = None,
+    audit: str | None = None,
+    figures: str = "page",
+    force: bool = False,
+) -> Any:
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
+    from ..flight.settings import load_flight
+    from .plan import report_plan
+
+    settings = _overridden(load_flight(flight), engine, audit)
+    return report_plan(
+        settings,
+        flight,
+        inputs=input_files(settings, flight, logs_root),
+        out=out or Path("reports") / settings.flight.name,
+        logs_root=logs_root,
+        figures=figures,
+        force=force,
+    )
+
+
 def run_audit(
     target: Path,
     *,
@@ -625,11 +651,10 @@ def run_map(
     from . import coverage_map as mapping
     from .paper_table import paper_markdown, paper_rows
 
-    given = {name: value for name, value in options.items() if value is not None}
-    settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+    settings = _map_settings(quick, options)
     place = load_site(site)
     name = Path(site).stem
-    folder = out or Path("reports") / f"map-{name}"
+    folder = out or _map_folder(site)
     inputs = [Path(site), *([] if flight is None else [flight])]
     stages = Stages(progress)
     with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
@@ -657,6 +682,30 @@ def run_map(
             written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     results = tuple(folder / path.relative_to(part) for path in (*written, *files))
     return MapsOutcome(folder, results, maps_metrics(record))
+
+
+def _map_settings(quick: bool, options: dict[str, Any]) -> Any:
+    """The settings of a map from what was given; None leaves the default."""
+    from . import coverage_map as mapping
+
+    given = {name: value for name, value in options.items() if value is not None}
+    return mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+
+
+def _map_folder(site: str) -> Path:
+    return Path("reports") / f"map-{Path(site).stem}"
+
+
+def plan_map(
+    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None, force: bool = False,
+    **options: Any,
+) -> Any:  # fmt: skip
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing."""
+    from .plan import map_plan
+
+    inputs = [Path(site), *([] if flight is None else [flight])]
+    settings = _map_settings(quick, options)
+    return map_plan(site, settings, inputs=inputs, out=out or _map_folder(site), flight=flight, force=force)
 
 
 def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:

@@ -7,6 +7,7 @@ doing: those tasks run again, a last time alone, and only one that loses its wor
 from __future__ import annotations
 
 import contextlib
+import logging
 import os
 import platform
 import shutil
@@ -16,7 +17,7 @@ import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ProcessPoolExecutor, as_completed
+from concurrent.futures import BrokenExecutor, CancelledError, ProcessPoolExecutor, as_completed
 from dataclasses import dataclass
 from multiprocessing import get_context
 from pathlib import Path
@@ -145,6 +146,8 @@ def _marked(function: Callable[[Item], Result], item: Item, mark: str) -> Result
 
 
 def _ended(error: BaseException) -> Lost:
+    if type(error).__name__ == "KilledWorker":
+        return Lost("its worker process ended, time after time: out of memory, or killed")
     return Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}")
 
 
@@ -212,12 +215,14 @@ class Cluster:
             came.clear()
             for future in [f for f in active if f.done()]:
                 number = active.pop(future)
-                if future.status in ("cancelled", "lost"):
+                try:
+                    error = future.exception() if future.status == "error" else None
+                    result: Any = future.result() if error is None else None
+                except (CancelledError, OSError, TimeoutError):  # finished, and the way back was cut
                     waiting.appendleft(number)
                     continue
-                error = future.exception() if future.status == "error" else None
                 if error is None:
-                    done(number, future.result())
+                    done(number, result)
                 elif type(error).__name__ == "KilledWorker" and not alone:
                     killed.append(number)
                 else:
@@ -314,6 +319,7 @@ def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
     from distributed import Client, LocalCluster
     from distributed.system import MEMORY_LIMIT
 
+    _quiet()
     settings = {
         "distributed.scheduler.allowed-failures": TRIES - 1,
         "distributed.scheduler.worker-saturation": 1.0,  # what waits at a worker is not lost with it
@@ -345,6 +351,13 @@ def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
         shutil.rmtree(scratch, ignore_errors=True)
 
 
+def _quiet() -> None:
+    """No log lines of distributed on the terminal: what matters is told once, in our words."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
 def _has_dashboard() -> bool:
     from importlib.util import find_spec
 
@@ -356,6 +369,8 @@ def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: 
     """Workers of a running scheduler."""
     try:
         from distributed import Client
+
+        _quiet()
     except ImportError:
         raise UsageError(
             f"--scheduler {address!r} needs the package 'distributed'", expected="pip install 'aerpaw-cmp[cluster]'"

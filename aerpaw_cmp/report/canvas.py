@@ -11,6 +11,7 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
+from .drawing import in_order
 from .export import write_file
 
 if TYPE_CHECKING:
@@ -202,7 +204,7 @@ def write_plates(
     kind: str = "screen",
     progress: Progress = silent,
 ) -> tuple[list[Picture], list[Path]]:
-    """Draw plates one after the other and write each in its formats; gives the pictures and the files.
+    """Draw plates and write each in its formats; gives the pictures and the files.
 
     Parameters
     ----------
@@ -216,10 +218,13 @@ def write_plates(
     progress : Progress
         Share of the figures that are drawn.
     """
-    drawn, written = [], []
-    for number, plate in enumerate(plates):
-        progress("figures", number / len(plates))
-        picture = render(plate, formats, kind)
+    drawn: list[Picture] = []
+    written: list[Path] = []
+    if plates:
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure  # noqa: F401  once, before further processes are made
+    for picture in in_order([partial(render, plate, formats, kind) for plate in plates]):
+        progress("figures", len(drawn) / len(plates))
         drawn.append(picture)
         written += [write_file(folder / f"{picture.name}.{name}", content) for name, content in picture.formats.items()]
     if plates:

@@ -9,7 +9,7 @@ import typer
 
 from ..common.errors import UsageError
 from ..common.stages import duration
-from .app import Export, Force, Json, LogsRoot, Out, command
+from .app import Export, Force, Json, LogsRoot, Out, Scheduler, Workers, command
 from .shown import number, print_json, say, table
 
 
@@ -32,11 +32,8 @@ def campaign(
     ],
     out: Out = None,
     logs_root: LogsRoot = None,
-    workers: Annotated[int, typer.Option(min=1, help="Workers of this machine that share the tasks.")] = 1,
-    scheduler: Annotated[
-        Optional[str],  # noqa: UP045
-        typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, in place of workers here."),
-    ] = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
     keep: Annotated[
         Optional[str],  # noqa: UP045
         typer.Option(help="Folder or URL of the outcomes of tasks; a rerun computes only what is missing there."),

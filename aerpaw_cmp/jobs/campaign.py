@@ -134,7 +134,7 @@ def run(
         Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
     """
     if scheduler is not None:  # workers may stand in another folder
-        folder, logs_root, keep = _absolute(folder), _absolute(logs_root), _absolute(keep)
+        folder, logs_root, keep = absolute(folder), absolute(logs_root), absolute(keep)
     tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {AS_WRITTEN: {}}
     where = None if keep is None else str(keep)
@@ -198,7 +198,7 @@ def run(
     )
 
 
-def _absolute(path: Any) -> Any:
+def absolute(path: Any) -> Any:
     """A path as every process understands it; URLs stay."""
     if path is None or "://" in str(path):
         return path

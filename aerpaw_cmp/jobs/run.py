@@ -628,7 +628,8 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, force: bool = False, progress: Progress = silent, **options: Any,
+    logs_root: Path | None = None, workers: int = 1, scheduler: str | None = None, force: bool = False,
+    progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -642,6 +643,8 @@ def run_map(
         A coarse map; what ``options`` state still counts.
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
+    workers, scheduler
+        Who evaluates the pieces of the grid: workers of this machine, or of a Dask scheduler.
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
     """
@@ -650,6 +653,7 @@ def run_map(
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
     from .paper_table import paper_markdown, paper_rows
+    from .workers import open_workers
 
     settings = _map_settings(quick, options)
     place = load_site(site)
@@ -658,7 +662,9 @@ def run_map(
     inputs = [Path(site), *([] if flight is None else [flight])]
     stages = Stages(progress)
     with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
-        outcome = mapping.make_maps(place, settings, stages)
+        file = [Path(site).absolute()] if Path(site).is_file() else []
+        with open_workers(workers, scheduler, paths=file, progress=progress) as crew:
+            outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
         if settings.study:
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
@@ -868,6 +874,8 @@ def run_calibrate(
     *,
     out: Path | None = None,
     logs_root: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CalibrateOutcome:
@@ -881,6 +889,8 @@ def run_calibrate(
         The file to write; the folder lies beside it.
     logs_root : Path, optional
         Where the paths of logs and antennas resolve.
+    workers, scheduler
+        Who computes the scores: workers of this machine, or of a Dask scheduler.
     force : bool
         Replace also what this tool did not write; never an input.
     progress : Progress
@@ -895,6 +905,8 @@ def run_calibrate(
     from ..report.calibration_html import calibration_metrics
     from .calibrate import calibrate, load_calibration
     from .calibration_files import MARK, write_files
+    from .campaign import absolute
+    from .workers import open_workers
 
     settings = load_calibration(path)
     target = out or Path(f"{settings.calibration}.calibrated.yaml")
@@ -918,7 +930,9 @@ def run_calibrate(
                 (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
                 (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
         else:
-            found = calibrate(path, logs_root=logs_root, stages=stages)
+            path, logs_root = (path, logs_root) if scheduler is None else (absolute(path), absolute(logs_root))
+            with open_workers(workers, scheduler, paths=[path], progress=progress) as crew:
+                found = calibrate(path, logs_root=logs_root, stages=stages, workers=crew)
             if ranked is not None:
                 found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
             with output.filling() as place:

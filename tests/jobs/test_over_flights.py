@@ -2,32 +2,15 @@
 
 from __future__ import annotations
 
-import pickle
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.jobs import over_flights
 from aerpaw_cmp.jobs.over_flights import PairsOrder, RepeatSettings, pairs_of, rank_repeats, repeats
-from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownRank, RssRow
-
-
-class Two(Here):
-    """Two at a time, as far as the caller can tell; orders go through pickle, as to a process."""
-
-    count = 2
-
-    def __init__(self) -> None:
-        self.sizes: list[int] = []
-
-    def run(self, function: Any, items: Any, done: Any) -> None:
-        for number, item in enumerate(items):
-            sent = pickle.dumps(item)
-            self.sizes.append(len(sent))
-            done(number, function(pickle.loads(sent)))
+from tests.jobs.sent_by_pickle import SentByPickle
 
 
 def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
@@ -56,7 +39,7 @@ def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
 @pytest.mark.parametrize("shared", [False, True])
 def test_workers_find_the_pairs_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: bool) -> None:
     monkeypatch.setattr(over_flights, "WORTH_WORKERS", 0)
-    series, settings, crew = rows(), RepeatSettings(), Two()
+    series, settings, crew = rows(), RepeatSettings(), SentByPickle()
     alone = repeats(series, settings)
     spread = repeats(series, settings, crew, str(tmp_path) if shared else None)
     assert len(alone) == 30

@@ -29,6 +29,9 @@ from .names import k_key
 FEW, MANY = 8, 200
 """Warnings that stand open, and that stand on the page at all."""
 
+FEW_SETTINGS = 4
+"""Settings that a sentence names."""
+
 FEW_FLIGHTS = 20
 """Flights of a table that has a column or a heading for each."""
 
@@ -203,11 +206,13 @@ def headline(data: CampaignData) -> list[str]:
     if means:
         best = min(means, key=lambda s: float(means[s].mean()))
         spread = np.ptp([v.mean() for v in means.values()])
+        shown = means if len(means) <= FEW_SETTINGS else {best: means[best], data.reference: means.get(data.reference)}
         out.append(
-            "Mean RMSE over flights and links: "
-            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in means.items())
+            ("Mean RMSE over flights and links" + ("" if shown is means else f", {len(means)} settings") + ": ")
+            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in shown.items() if v is not None)
             + (f". Least: {best}." if spread > 0.005 else ".")
         )
+    out += _ranked_words(data)
     for setting in data.settings:
         moved = [t for t in data.rank_transfers if t.setting == setting]
         if moved:
@@ -237,9 +242,27 @@ def headline(data: CampaignData) -> list[str]:
     return out
 
 
+def _ranked_words(data: CampaignData) -> list[str]:
+    """What the ranking by held-out error shows, and what it does not."""
+    ranking = data.season.over_all()
+    if len(ranking) < 2 or not data.season.held_out:
+        return []
+    like = [entry.setting for entry in ranking[1:] if entry.verdict != "worse"]
+    named = ", ".join(like[:FEW_SETTINGS]) + (
+        f" and {len(like) - FEW_SETTINGS} more" if len(like) > FEW_SETTINGS else ""
+    )
+    return [
+        f"With the offset of the other flights, {ranking[0].setting} errs least ({ranking[0].mean_db:.2f} dB over "
+        f"{ranking[0].n_flights} flights); "
+        + (f"not shown to be worse: {named}." if like else "every other setting is shown to be worse.")
+    ]
+
+
 def warnings(data: CampaignData) -> list[str]:
     """What must be known before the numbers are believed."""
-    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
+    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
+    if len(data.failures) > FEW:
+        out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]
     if data.held_out_failure:
         out.append(f"Held-out fit: {data.held_out_failure}")
     for fold in data.held_out:

@@ -20,16 +20,28 @@
   const wanted = link => (state.tower === ALL || links[link].tower === state.tower) && (state.channel === ALL || links[link].channel === state.channel);
   const chosenLinks = () => links.map((_, i) => i).filter(wanted);
   const errorOf = i => state.measure === "held" && Number.isFinite(rows.held[i]) ? rows.held[i] : rows.own[i];
-  // per flight: mean error over the chosen links, mean own offset, worst link
+  // per flight: mean error over the chosen links, mean own offset, worst link; kept until the choice changes
+  let kept = new Map(), keptFor = "";
   function perFlight(setting) {
-    const found = flights.map(() => ({ n: 0, error: 0, offset: 0, worst: -1, most: -Infinity, by: new Map() }));
-    for (const i of bySetting[setting]) {
-      const e = errorOf(i), f = found[rows.flight[i]];
-      if (!wanted(rows.link[i]) || !Number.isFinite(e)) continue;
-      f.n++; f.error += e; f.offset += rows.offset[i]; f.by.set(rows.link[i], e);
-      if (e > f.most) { f.most = e; f.worst = rows.link[i]; }
+    const choice = [state.tower, state.channel, state.measure].join("|");
+    if (choice !== keptFor) { kept = new Map(); keptFor = choice; }
+    if (!kept.has(setting)) {
+      const found = flights.map(() => ({ n: 0, error: 0, offset: 0, worst: -1, most: -Infinity })), use = links.map((_, l) => wanted(l));
+      for (const i of bySetting[setting]) {
+        const l = rows.link[i], e = errorOf(i);
+        if (!use[l] || !Number.isFinite(e)) continue;
+        const f = found[rows.flight[i]];
+        f.n++; f.error += e; f.offset += rows.offset[i];
+        if (e > f.most) { f.most = e; f.worst = l; }
+      }
+      for (const f of found) { f.error = f.n ? f.error / f.n : NaN; f.offset = f.n ? f.offset / f.n : NaN; }
+      kept.set(setting, found);
     }
-    for (const f of found) { f.error = f.n ? f.error / f.n : NaN; f.offset = f.n ? f.offset / f.n : NaN; }
+    return kept.get(setting);
+  }
+  function byLink(setting) { // per flight: error of each chosen link
+    const found = flights.map(() => new Map());
+    for (const i of bySetting[setting]) { const e = errorOf(i); if (wanted(rows.link[i]) && Number.isFinite(e)) found[rows.flight[i]].set(rows.link[i], e); }
     return found;
   }
   // the ranking of the record where it has this choice (held out; all links or one), else means alone
@@ -41,9 +53,9 @@
       const e = perFlight(s).map(f => f.error).filter(Number.isFinite).sort((x, y) => x - y);
       return { setting: s, n: e.length, mean: e.reduce((t, v) => t + v, 0) / e.length, quantiles: [0, 0.1, 0.25, 0.5, 0.75, 0.9, 1].map(q => quantile(e, q)), difference: NaN, ci: null, verdict: "" };
     }).filter(r => r.n).sort((x, y) => x.mean - y.mean);
-    const first = found.length ? perFlight(found[0].setting) : [];
+    const first = found.length ? byLink(found[0].setting) : [];
     for (const r of found) {
-      const d = perFlight(r.setting).map((f, i) => { const both = [...f.by.keys()].filter(k => first[i].by.has(k)); return both.length ? both.reduce((t, k) => t + f.by.get(k) - first[i].by.get(k), 0) / both.length : NaN; }).filter(Number.isFinite);
+      const d = byLink(r.setting).map((by, i) => { const both = [...by.keys()].filter(k => first[i].has(k)); return both.length ? both.reduce((t, k) => t + by.get(k) - first[i].get(k), 0) / both.length : NaN; }).filter(Number.isFinite);
       r.difference = d.reduce((t, v) => t + v, 0) / d.length;
     }
     return found;
@@ -81,7 +93,7 @@
       const tr = document.createElement("tr"), head = document.createElement("th"), flight = flights[f.i];
       head.scope = "row"; tr.dataset.flight = f.i;
       if (flight.href) { const a = document.createElement("a"); a.href = flight.href; a.textContent = flight.name; head.append(a); } else head.textContent = flight.name;
-      tr.append(head, cell(dated(flight), "", flight.t ?? ""), ofNumber(f.error), ofNumber(f.to), ofNumber(f.offset), cell(f.worst < 0 ? "" : links[f.worst].name), ofNumber(f.worst < 0 ? NaN : f.most), cell(String(failed[f.i]), "n", failed[f.i]));
+      tr.append(head, cell(dated(flight), "when", flight.t ?? ""), ofNumber(f.error), ofNumber(f.to), ofNumber(f.offset), cell(f.worst < 0 ? "" : links[f.worst].name), ofNumber(f.worst < 0 ? NaN : f.most), cell(String(failed[f.i]), "n", failed[f.i]));
       return tr;
     }));
     resort(at("flights"));
@@ -260,7 +272,7 @@
     const flight = flights[state.flight], f = perFlight(state.setting)[state.flight], out = [["Flight", flight.name]];
     if (flight.t !== null) out.push(["Start", new Date(flight.t).toISOString().slice(0, 16).replace("T", " ") + " UTC"]);
     out.push([`Error, “${data.settings[state.setting]}”`, number(f.error, 2, "dB")], ["Mean offset", number(f.offset, 1, "dB")]);
-    for (const [l, e] of [...f.by].sort((a, b) => b[1] - a[1]).slice(0, 6)) out.push([links[l].name, number(e, 2, "dB")]);
+    for (const [l, e] of [...byLink(state.setting)[state.flight]].sort((a, b) => b[1] - a[1]).slice(0, 6)) out.push([links[l].name, number(e, 2, "dB")]);
     for (const [who, setting, message] of data.failures.filter(x => x[0] === state.flight).slice(0, 2)) out.push([`Failed: ${setting}`, data.messages[message]]);
     cells(at("marked"), out);
     if (flight.href) { const a = document.createElement("a"); a.href = flight.href; a.textContent = `Report of ${flight.name}`; link.append(a); }

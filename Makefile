@@ -6,6 +6,7 @@ PYTHON ?= python3
 BIN := .venv/bin
 READY := .venv/.ready
 READY_DEV := .venv/.ready-dev
+READY_DOCS := .venv/.ready-docs
 LLVM := .venv/.llvm
 REPORT := reports/sample
 
@@ -13,13 +14,14 @@ REPORT := reports/sample
 unexport PYTHONPATH PYTHONHOME PIP_USER
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup report test bench clean
+.PHONY: help setup report test bench docs clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make report   replay the sample flight and write $(REPORT)/report.html"
 	@echo "make test     ruff, mypy, import-linter, pytest"
 	@echo "make setup    only the environment, developers' tools included: .venv and an LLVM for Dr.Jit"
+	@echo "make docs     the documentation as pages, build/site/index.html"
 	@echo "make bench    speed against error on this machine"
 	@echo "make clean    remove .venv, caches and $(REPORT)/"
 
@@ -48,6 +50,15 @@ test: setup
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 	$(BIN)/python -m pytest -q -n auto --dist loadfile
+
+$(READY_DOCS): $(READY)
+	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs
+	@touch $@
+
+# strict: a dead link or anchor, or a script of the gallery that fails, ends it
+docs: $(READY_DOCS)
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	@echo "The documentation: $(CURDIR)/build/site/index.html"
 
 bench: $(READY_DEV) $(LLVM)
 	$(BIN)/aerpaw-cmp bench

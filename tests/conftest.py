@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import pytest
 from hypothesis import settings
 
 # In CI the same examples run every time, so that a red run can be repeated; elsewhere every run looks further.
@@ -15,3 +19,37 @@ settings.load_profile("fixed" if os.environ.get("CI") else "further")
 
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache.
 os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
+
+
+@pytest.fixture
+def cf_faults() -> Callable[[Path], list[str]]:
+    """What the checker of the CF conventions has against a NetCDF file."""
+    return _cf_faults
+
+
+def _cf_faults(path: Path) -> list[str]:
+    """What compliance-checker has against a file, at the version that the file claims."""
+    import netCDF4
+
+    pytest.importorskip("compliance_checker")
+    from compliance_checker.runner import CheckSuite
+
+    with netCDF4.Dataset(path) as book:
+        version = book.Conventions.removeprefix("CF-")
+    suite = CheckSuite()
+    suite.load_all_available_checkers()
+    book = suite.load_dataset(str(path))
+    scores = suite.run_all(book, [f"cf:{version}"], skip_checks=[])
+    book.close()
+    found, errors = scores[f"cf:{version}"]
+    assert not errors
+    return [text for group in found for text in _messages(group)]
+
+
+def _messages(result: Any) -> list[str]:
+    """Of every result that did not get all its points."""
+    if result.children:
+        return [text for child in result.children for text in _messages(child)]
+    value = result.value
+    full = value[0] == value[1] if isinstance(value, tuple) else bool(value)
+    return [] if full else list(result.msgs or [f"{result.name}: {value}"])

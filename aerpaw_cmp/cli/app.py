@@ -51,6 +51,9 @@ LogsRoot = Annotated[
 ]
 
 
+DryRun = Annotated[
+    bool, typer.Option("--dry-run", help="Only say what would run and about how long; nothing is written.")
+]
 Quiet = Annotated[
     bool,
     typer.Option("-q", "--quiet", help="No progress and no remarks; results, warnings and failures are still shown."),

@@ -9,8 +9,8 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import Export, Force, Json, LogsRoot, Out, command
-from .shown import number, print_files, print_json, say, table
+from .app import DryRun, Export, Force, Json, LogsRoot, Out, command
+from .shown import number, print_files, print_json, print_plan, say, table
 
 
 @command(
@@ -18,6 +18,7 @@ from .shown import number, print_files, print_json, say, table
     examples=[
         "aerpaw-cmp report sample_logs/flight.yaml",
         "aerpaw-cmp report flight.yaml -o reports/mine --audit none",
+        "aerpaw-cmp report flight.yaml --dry-run",
         "aerpaw-cmp report flight.yaml --figures all --style paper",
         "aerpaw-cmp report flight.yaml --export geopackage,kmz",
         "aerpaw-cmp report flight.yaml --strict --json --quiet",
@@ -31,7 +32,10 @@ def report(
         Optional[Literal["image", "sionna"]],  # noqa: UP045
         typer.Option(help="In place of rt.engine."),
     ] = None,
-    audit: Annotated[Optional[str], typer.Option(help="Number of audited links, 'full' or 'none'.")] = None,  # noqa: UP045
+    audit: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Number of audited links, 'full', 'none', or 'later' (the command audit fills it in)."),
+    ] = None,
     recommend: Annotated[
         Optional[Path],  # noqa: UP045
         typer.Option("--recommend", help="Write the flight file with the settings of the model that the scene needs."),
@@ -46,12 +50,19 @@ def report(
         typer.Option(help="Look of the figures: screen, or paper (IEEE width, fonts embedded)."),
     ] = "screen",
     export: Export = None,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Replay a flight, calibrate, compare, report."""
     from ..jobs import run
 
+    if dry_run:
+        plan = run.plan_report(
+            flight, out=out, logs_root=logs_root, engine=engine, audit=audit, figures=figures, force=force
+        )
+        print_plan(plan, as_json)
+        return 0
     outcome = run.run_report(
         flight,
         out=out,
@@ -69,10 +80,51 @@ def report(
         print_json(outcome.metrics)
     else:
         _print_report_summary(outcome)
-    failed = outcome.failed_checks
-    for check in failed:
+    return _verdict(outcome, strict)
+
+
+def _verdict(outcome: Any, strict: bool) -> int:
+    """Say each stated check that failed; 1 where that is asked to be a failure."""
+    for check in outcome.failed_checks:
         say.warn(f"check failed: {check}")
-    return 1 if strict and failed else 0
+    return 1 if strict and outcome.failed_checks else 0
+
+
+@command(
+    "audit",
+    examples=[
+        "aerpaw-cmp audit reports/mine",
+        "aerpaw-cmp audit flight.yaml -o reports/mine --strict",
+        "aerpaw-cmp audit reports/mine --links full --json",
+    ],
+)
+def audit(
+    target: Annotated[Path, typer.Argument(metavar="REPORT_OR_FLIGHT", help="A report's folder, or its flight.yaml.")],
+    out: Out = None,
+    logs_root: LogsRoot = None,
+    links: Annotated[Optional[str], typer.Option(help="Number of audited links, or 'full'.")] = None,  # noqa: UP045
+    strict: Annotated[bool, typer.Option("--strict", help="Exit code 1 when a stated check failed.")] = False,
+    force: Force = False,
+    as_json: Json = False,
+) -> int:
+    """Fill the audit into a report."""
+    from ..jobs import run
+
+    outcome = run.run_audit(target, out=out, logs_root=logs_root, links=links, force=force, progress=say)
+    if as_json:
+        print_json(outcome.metrics)
+        return _verdict(outcome, strict)
+    found = (outcome.metrics["rt"] or {}).get("audit")
+    if found is None:
+        print("nothing to audit: no link was replayed")
+    else:
+        field = found["field"] or {}
+        print(
+            f"audit: {found['links']} links against {found['reference']}, {found['missing_paths']} paths missing, "
+            f"{found['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
+        )
+    print(f"report: {outcome.folder / 'report.html'}")
+    return _verdict(outcome, strict)
 
 
 _WARNINGS = 10
@@ -136,6 +188,8 @@ def _print_report_summary(outcome: Any) -> None:
     if len(warnings) > _WARNINGS:
         say.warn(f"and {len(warnings) - _WARNINGS} more warnings, all in the report")
     print(f"report: {outcome.folder / 'report.html'}")
+    if outcome.metrics.get("audit_command"):
+        print(f"next: {outcome.metrics['audit_command']}")
 
 
 @command(

@@ -77,6 +77,18 @@ def print_json(value: dict[str, Any]) -> None:
     print(json.dumps(value, indent=1, allow_nan=False), flush=True)
 
 
+def print_plan(plan: Any, as_json: bool = False) -> None:
+    """What a command would do: a table of stages with their seconds, or one object."""
+    if as_json:
+        print_json(plan.as_dict())
+        return
+    rows = [[stage.name, stage.work, number(stage.seconds, "{:.1f}")] for stage in plan.stages]
+    unknown = "" if all(stage.seconds is not None for stage in plan.stages) else " and what has a dash"
+    table(["stage", "work", "s"], [*rows, ["all", "", f"{plan.seconds:.0f}{unknown}"]], f"{plan.job}, not run")
+    print(plan.measured)
+    print(f"reads {len(plan.inputs)} files; would write {plan.output}")
+
+
 def print_files(paths: Sequence[Path], as_json: bool = False) -> None:
     """What was written: a line each, or one object."""
     if as_json:

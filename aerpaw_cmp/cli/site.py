@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal, Optional
+from typing import Annotated, Any, Literal, Optional
 
 import typer
 
-from .app import Force, Json, LogsRoot, Out, command, site_app
-from .shown import print_files, print_json, say, table
+from .app import DryRun, Force, Json, LogsRoot, Out, command, site_app
+from .shown import print_files, print_json, print_plan, say, table
 
 
 @command(
@@ -74,6 +74,7 @@ def site_show(
     "map",
     examples=[
         "aerpaw-cmp map --quick",
+        "aerpaw-cmp map site.yaml --spacing 15 --dry-run",
         "aerpaw-cmp map site.yaml -o reports/map --spacing 20 --rank-altitude 30 --rank-altitude 70",
         "aerpaw-cmp map lake_wheeler --flight flight.yaml --foliage none --no-study --json",
     ],
@@ -119,6 +120,7 @@ def map_(
         typer.Option(help="A level below it is out of coverage. Default: only no path is."),
     ] = None,
     study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
@@ -126,26 +128,25 @@ def map_(
     from ..jobs import run
 
     modes = None if not foliage or "all" in foliage else tuple(dict.fromkeys(foliage))
+    wanted: dict[str, Any] = {
+        "foliage": modes,
+        "crown_reflections": crown_reflections,
+        "spacing_m": spacing,
+        "rss_altitudes_m": tuple(sorted(set(rss_altitude))) if rss_altitude else None,
+        "rank_altitudes_m": tuple(sorted(set(rank_altitude))) if rank_altitude else None,
+        "ks": tuple(sorted(set(k))) if k else None,
+        "carrier_hz": None if carrier_ghz is None else carrier_ghz * 1e9,
+        "engine": engine,
+        "max_depth": max_depth,
+        "samples": samples,
+        "threshold_dbm": threshold_dbm,
+        "study": study,
+    }
+    if dry_run:
+        print_plan(run.plan_map(site, out=out, quick=quick, flight=flight, force=force, **wanted), as_json)
+        return
     outcome = run.run_map(
-        site,
-        out=out,
-        quick=quick,
-        flight=flight,
-        logs_root=logs_root,
-        force=force,
-        progress=say,
-        foliage=modes,
-        crown_reflections=crown_reflections,
-        spacing_m=spacing,
-        rss_altitudes_m=tuple(sorted(set(rss_altitude))) if rss_altitude else None,
-        rank_altitudes_m=tuple(sorted(set(rank_altitude))) if rank_altitude else None,
-        ks=tuple(sorted(set(k))) if k else None,
-        carrier_hz=None if carrier_ghz is None else carrier_ghz * 1e9,
-        engine=engine,
-        max_depth=max_depth,
-        samples=samples,
-        threshold_dbm=threshold_dbm,
-        study=study,
+        site, out=out, quick=quick, flight=flight, logs_root=logs_root, force=force, progress=say, **wanted
     )
     if as_json:
         print_json(outcome.metrics)

@@ -306,6 +306,12 @@ class OutputFolder:
                 raise
         return self
 
+    def refuse(self) -> None:
+        """UsageError where a run with this output would be refused; writes nothing."""
+        with told(self.named):
+            self._refuse_shape()
+            self._refuse_content()
+
     def _refuse_shape(self) -> None:
         """UsageError for a name that no folder of results can have."""
         if os.path.lexists(self.target) and not self.target.is_dir():

@@ -90,6 +90,11 @@ class Learned:
         gain, sd = self.fit.predict(samples)
         return known + gain, sd
 
+    def mean(self, samples: LinkSamples) -> FloatArray:
+        """The gain of :meth:`predict` alone, at a hundredth of the cost."""
+        known = self.pattern_db("uav", samples.at_uav) + self.pattern_db(samples.antenna, samples.at_tower)
+        return known if self.fit is None else known + self.fit.mean(samples)
+
 
 def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None = None) -> Learned:
     """Mounts, then the gain over direction on top of the patterns.
@@ -108,7 +113,7 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
     bare = Learned(recipe, Choice(recipe.model, 1.0, {}, 1.0), mounts, None)
     if not recipe.model.terms:
         return bare
-    left = [dataclasses.replace(s, residual_db=s.residual_db - bare.predict(s)[0]) for s in series]
+    left = [dataclasses.replace(s, residual_db=s.residual_db - bare.mean(s)) for s in series]
     choice = choice or choose_model(left, recipe.model)
     return Learned(recipe, choice, mounts, fit_gain(left, choice.model))
 
@@ -199,7 +204,7 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     """Mean over flights of measured minus predicted, per antenna [dB]."""
     each: dict[str, list[float]] = {}
     for samples in train:
-        error = samples.residual_db - learned.predict(samples)[0]
+        error = samples.residual_db - learned.mean(samples)
         each.setdefault(samples.antenna, []).append(float(np.nanmean(error)) if np.isfinite(error).any() else math.nan)
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
@@ -270,7 +275,7 @@ def parts_left_out(
                 inside, outside = parts(o, o)[k]
                 if o.samples.antenna not in known or not inside.any():
                     continue
-                gain = learned.predict(o.samples)[0]
+                gain = learned.mean(o.samples)
                 rest = (o.samples.residual_db - gain)[outside]
                 if np.isfinite(rest).sum() >= LEAST_SAMPLES:
                     whole[inside] = gain[inside] + np.nanmean(rest)

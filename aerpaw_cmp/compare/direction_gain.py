@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
@@ -342,6 +342,20 @@ class GainFit:
         UsageError
             If no flight of the fit had this tower and channel.
         """
+        gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
+        for rows, design in self._designs(samples, frames):
+            gain[rows], sd[rows] = self._moments(design)
+        return gain, sd
+
+    def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
+        """The gain of :meth:`predict` alone (n,) [dB]: the standard deviation costs a hundred times as much."""
+        gain = np.full(len(samples), np.nan)
+        for rows, design in self._designs(samples, frames):
+            gain[rows] = design @ self._weights
+        return gain
+
+    def _designs(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Rows that have every direction, some thousand at a time, and their features about the centre."""
         if samples.antenna not in self.antennas:
             raise UsageError(
                 f"tower and channel {samples.antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
@@ -349,11 +363,9 @@ class GainFit:
         chosen = set(frames) if frames is not None else {"body", "mast", "world", "place"}
         finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
         good = np.flatnonzero(finite.all(axis=1))
-        gain, sd = np.full(len(samples), np.nan), np.full(len(samples), np.nan)
         for start in range(0, len(good), 2000):
             rows = good[start : start + 2000]
-            gain[rows], sd[rows] = self._moments(self._about_centre(samples.part(rows), chosen))
-        return gain, sd
+            yield rows, self._about_centre(samples.part(rows), chosen)
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain at one end over directions (n, 3): posterior mean and standard deviation (n,) [dB].
@@ -540,7 +552,7 @@ def _left_out_squares(train: Sequence[LinkSamples], test: Sequence[LinkSamples],
     if not scored or not any(np.isfinite(s.residual_db).any() for s in train):
         return 0.0, 0
     fit = fit_gain(train, model)
-    left = [s.residual_db - fit.predict(s)[0] for s in scored]
+    left = [s.residual_db - fit.mean(s) for s in scored]
     return float(sum(((r - r.mean()) ** 2).sum() for r in left)), sum(map(len, left))
 
 

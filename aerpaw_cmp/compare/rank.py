@@ -968,3 +968,23 @@ def _pair_statistics(
         ((one - two) @ np.sign(p - q), distance, (0.0, 1.0)),
         (np.cumsum(one - two, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class KappaParts:
+    """Kappa of paired ranks as a function of column means, for a bootstrap.
+
+    ``columns`` (n, 1 + 2 MAX_RANK): agreement, indicators of either rank; ``influence`` (n,): what a pose adds to
+    kappa, to first order; ``kappa`` takes means (r, 1 + 2 MAX_RANK).
+    """
+
+    columns: FloatArray
+    influence: FloatArray
+    kappa: Callable[[FloatArray], FloatArray]
+
+
+def kappa_parts(measured: IntArray, simulated: IntArray) -> KappaParts:
+    """Parts of kappa of paired ranks (n,), each 1 .. ``MAX_RANK``."""
+    equal, one, two = (measured == simulated).astype(np.float64), _indicators(measured), _indicators(simulated)
+    influence, kappa, _ = _pair_statistics(equal, one, two)[1]
+    return KappaParts(columns=np.column_stack([equal, one, two]), influence=influence, kappa=kappa)

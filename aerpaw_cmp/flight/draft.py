@@ -33,6 +33,10 @@ link:
 """
 NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
+LATER = "report: {audit: later}  # 'aerpaw-cmp audit' then fills in what costs more than so short a report\n"
+
+AUDIT_NOW_FROM = 50_000
+"""With so many samples a report costs more than its audit, which does not grow with the flight."""
 
 
 Span = tuple[np.datetime64, np.datetime64]
@@ -88,6 +92,7 @@ def draft(
     parts += [LINK] if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
     parts += _settings(entries)
+    parts += [LATER] if entries.samples < AUDIT_NOW_FROM else []
     text = "".join(parts)
     parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
     asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
@@ -224,6 +229,8 @@ class _Entries:
     """By tower, kind and channel: when, and from which log."""
     contents: dict[str, str] = field(default_factory=dict)
     """Path by SHA-256."""
+    samples: int = 0
+    """Of RSS and rank, in all logs."""
 
     def leads(self, file: IngestedFile) -> bool:
         """Whether the track is in this file."""
@@ -278,6 +285,7 @@ class _Entries:
             asked += " a ratio to the noise as a level?" if asked else "  # a ratio to the noise as a level?"
         self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
         self.kinds |= {s.kind for s in kept}
+        self.samples += sum(len(s.frame) for s in kept if s.kind in ("rss", "rank"))
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
     def _origin(self, streams: Sequence[Stream]) -> Origin | None:

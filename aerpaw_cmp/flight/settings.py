@@ -455,6 +455,8 @@ class ReportSettings(Settings):
     title: str | None = None
     waypoints: list[Waypoint] = []
     speed_table: bool = True
+    audit: Literal["now", "later"] = "now"
+    """``later``: the report is written without the audit and the table of speed; ``aerpaw-cmp audit`` fills them in."""
     export: list[Literal["geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""
 

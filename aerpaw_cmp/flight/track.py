@@ -346,11 +346,13 @@ class Track:
 
     def _rotations(self, t: FloatArray) -> tuple[FloatArray, BoolArray]:
         """Rotation at every instant (n, 3, 3) and whether it comes from logged attitude."""
-        course = body_rotation(0.0 * t, 0.0 * t, self._course_at(t))
         at = self._time_s[self._known]
-        if not len(at):
-            return course, np.zeros(len(t), dtype=bool)
-        near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, self.maximum_gap_s)
+        near = np.zeros(len(t), dtype=bool)
+        if len(at):
+            near = (t >= at[0]) & (t <= at[-1]) & ~_in_gap(t, at, self.maximum_gap_s)
+        if near.all() and len(t):
+            return _slerp(t, at, self._attitude[self._known]), near
+        course = body_rotation(0.0 * t, 0.0 * t, self._course_at(t))
         if near.any():
             course[near] = _slerp(t[near], at, self._attitude[self._known])
         return course, near
@@ -379,6 +381,9 @@ def _slerp(t: FloatArray, at: FloatArray, attitude_deg: FloatArray) -> FloatArra
     """Rotations at t (n, 3, 3) from roll, pitch, yaw (rows, 3) at ``at``."""
     from scipy.spatial.transform import Rotation, Slerp
 
+    # only the rows around t: a part of a long flight does not turn the whole
+    part = slice(max(int(np.searchsorted(at, t.min(), side="right")) - 1, 0), int(np.searchsorted(at, t.max())) + 1)
+    at, attitude_deg = at[part], attitude_deg[part]
     matrices = body_rotation(attitude_deg[:, 0], attitude_deg[:, 1], attitude_deg[:, 2])
     if len(at) == 1:
         return np.broadcast_to(matrices, (len(t), 3, 3))

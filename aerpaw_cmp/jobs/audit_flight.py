@@ -54,8 +54,8 @@ NOT_COVERED = (
 
 
 def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progress = silent) -> EngineResult:
-    """The engine record, with the audit where ``rt.audit_links`` asks for one."""
-    rt = data.settings.rt
+    """The engine record, with the audit where ``rt.audit_links`` asks for one and ``report.audit`` is not ``later``."""
+    rt, now = data.settings.rt, data.settings.report.audit == "now"
     return EngineResult(
         engine=rt.engine,
         links=sum(len(r.poses) for r in replays),
@@ -69,7 +69,7 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
             **_crown_settings(rt, replays),
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
-        audit=_audit(data, replays, progress) if rt.audit_links else None,
+        audit=_audit(data, replays, progress) if rt.audit_links and now else None,
     )
 
 

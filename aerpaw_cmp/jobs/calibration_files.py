@@ -152,7 +152,7 @@ def _place(found: Calibration, place: Learned) -> dict[str, FloatArray]:
     first = place.fit.antennas[0]
     own = [o.samples for o in found.observed if o.samples.antenna == first]
     thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
-    gain = [place.fit.predict(s, ("place",))[0] for s in thin]
+    gain = [place.fit.mean(s, ("place",)) for s in thin]
     position = np.concatenate([s.position_m for s in thin])
     return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 

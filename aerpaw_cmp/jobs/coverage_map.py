@@ -36,6 +36,7 @@ from ..maps.job import (
     PAPER_KS,
     PAPER_RANK_ALTITUDES_M,
     PAPER_RSS_ALTITUDES_M,
+    RATIO_LIMIT_DB,
     Antennas,
     Evaluate,
     Evaluation,
@@ -44,6 +45,7 @@ from ..maps.job import (
     layers_of,
     map_job,
 )
+from ..maps.netcdf import write_netcdf
 from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
@@ -60,8 +62,6 @@ from .what_if import p833_note
 FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
 
-RATIO_LIMIT_DB = 180.0
-"""Largest ratio of singular values that is drawn and exported: values below 1e-9 of the largest are rounding."""
 RATIOS = ("spread", "condition")
 
 
@@ -694,7 +694,8 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         export.write_kmz(folder / "maps.kmz", grid, site.frame, shown, towers, borders, title=site.name),
     ]
     try:
-        written.append(export.write_netcdf(folder / "maps.nc", grid, site.frame, every, site.name))
+        made = {name: str(summary.get(name, "")) for name in ("generated", "version")}
+        written.append(write_netcdf(folder / "maps.nc", dict(outcome.ordered()), site.frame, title=site.name, **made))
         written.append(export.write_geotiff(folder / "maps.tif", grid, site.frame, joint))
     except UsageError as missing:
         progress(str(missing))

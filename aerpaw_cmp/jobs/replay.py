@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from hashlib import sha256
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,7 @@ from ..flight.settings import RtSettings
 from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
-from ..propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
 from ..propagation.tracer import Engine, Loss, Replay, replay
 from ..site.site import Site, Trees
@@ -145,24 +146,66 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
     return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
 
 
+BLOCK = 100_000
+"""Instants of a clock's prediction that are replayed at once: bounds memory on flights of more than half an hour."""
+
+
 class _Predictions:
     """Image-engine RSS along the track; channels with one link that were sampled together share the replay."""
 
     def __init__(self, data: FlightData) -> None:
         self._data = data
         self._kept: dict[tuple[str, str, bytes], dict[str, FloatArray]] = {}
+        self._tracks: dict[bytes, TrackPoses] = {}
 
     def __call__(self, series: RssSeries, field: str, times: Any) -> FloatArray:
         """Level ``rss_dbm`` or ``rss_power_dbm`` at instants (n,) [dBm]; NaN without a pose or path."""
-        key = (series.tower, series.settings_key, np.asarray(times).tobytes())
+        key = (series.tower, series.settings_key, _digest(times))
         if key not in self._kept:
-            data, track = self._data, _track_poses(self._data.track, times)
-            link, poses = series.link.build([series.tower], data.folder), _poses(track, data.settings.rt.attitude)
-            found = replay(data.site, link, poses, engine="image", max_depth=min(data.settings.rt.max_depth, 1))
+            link = series.link.build([series.tower], self._data.folder)
+            parts = [self._levels(link, part) for part in _in_blocks(times)]
             self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
-            levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
-            self._kept[key] = {name: _spread(track.valid, level) for name, level in levels.items()}
+            self._kept[key] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return self._kept[key][field]
+
+    def _levels(self, link: Link, times: Any) -> dict[str, FloatArray]:
+        data, track = self._data, self.track_at(times)
+        poses, depth = _poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
+        found = replay(data.site, link, poses, engine="image", max_depth=depth)
+        levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
+        return {name: _spread(track.valid, level) for name, level in levels.items()}
+
+    def track_at(self, times: Any) -> TrackPoses:
+        """Poses at instants (n,); the last few answers are kept, as channels and models ask for the same ones."""
+        key = _digest(times)
+        if key not in self._tracks:
+            kept = list(self._tracks.items())[-_TRACKS_KEPT + 1 :]
+            self._tracks = {**dict(kept), key: _track_poses(self._data.track, times)}
+        return self._tracks[key]
+
+    def terms_at(self, place_m: FloatArray, times: Any) -> FloatArray:
+        """Terms of direction (n, 12) as seen from a tower, for antennas that are not known."""
+        found = []
+        for part in _in_blocks(times):
+            track = self.track_at(part)
+            line = track.position_m - place_m
+            azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+            elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
+            found.append(direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg))
+        return np.concatenate(found)
+
+
+_TRACKS_KEPT = 4
+"""Coherent and power-sum predictions of two channels."""
+
+
+def _digest(times: Any) -> bytes:
+    return sha256(np.asarray(times).tobytes()).digest()
+
+
+def _in_blocks(times: Any) -> list[Any]:
+    """Instants (n,) in as few parts of about one size as :data:`BLOCK` allows, one at least."""
+    return np.array_split(times, max(1, -(-len(times) // BLOCK)))
 
 
 def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], predictions: _Predictions) -> ClockEstimate:
@@ -173,20 +216,13 @@ def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], prediction
     """
     place = data.site.towers[channels[0].tower].position_m
 
-    def terms(times: Any) -> FloatArray:
-        track = _track_poses(data.track, times)
-        line = track.position_m - place
-        azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
-        elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
-        return direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
-
     def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
         return ClockChannel(
             name=series.channel,
             times=series.time,
             measured_db=_high_enough(data, series),
             predictor=lambda times: predictions(series, field, times),
-            terms=terms,
+            terms=lambda times: predictions.terms_at(place, times),
             resolution_s=resolution_s,
         )
 
@@ -382,7 +418,7 @@ def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str,
         gamma_db_per_m=rt.gamma_db_per_m if own else None,
         maximum_db=rt.maximum_loss_db if own else None,
     )
-    index = CrownIndex(trees)
+    index = crown_index(trees)
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         source, target = sources_m[paths.tower], targets_m[paths.pose]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -155,6 +155,7 @@ def run_report(
     figures: str = "page",
     style: str = "screen",
     export: Sequence[str] = (),
+    same_inputs: Sequence[Mapping[str, Any]] | None = None,
     progress: Progress = silent,
 ) -> ReportOutcome:
     """Replay a flight, calibrate, compare, report.
@@ -167,7 +168,8 @@ def run_report(
     out, logs_root : Path, optional
         Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
-        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number).
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit and the
+        table of speed are left to :func:`run_audit`.
     recommend : Path, optional
         Where to write it.
     force : bool
@@ -177,6 +179,8 @@ def run_report(
     style : {"screen", "paper"}
     export : sequence of str
         Formats of the samples besides those of ``report.export``.
+    same_inputs : sequence of mapping, optional
+        ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
     progress : Progress
 
     Raises
@@ -188,6 +192,7 @@ def run_report(
     from ..report.export import metrics as metrics_of
     from ..report.exports.write import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
+    from .later_audit import refuse_changed, with_later_audit
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
@@ -204,6 +209,10 @@ def run_report(
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
         record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
+        record = with_later_audit(record, settings, flight, folder, logs_root, asked)
+        if same_inputs is not None:
+            refuse_changed(same_inputs, record)
         if target is not None:
             from .ladder import recommended_text
 
@@ -212,6 +221,81 @@ def run_report(
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
     return ReportOutcome(folder, metrics, _failed_checks(metrics))
+
+
+def plan_report(
+    flight: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    engine: str | None = None,
+    audit: str | None = None,
+    figures: str = "page",
+    force: bool = False,
+) -> Any:
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
+    from ..flight.settings import load_flight
+    from .plan import report_plan
+
+    settings = _overridden(load_flight(flight), engine, audit)
+    return report_plan(
+        settings,
+        flight,
+        inputs=input_files(settings, flight, logs_root),
+        out=out or Path("reports") / settings.flight.name,
+        logs_root=logs_root,
+        figures=figures,
+        force=force,
+    )
+
+
+def run_audit(
+    target: Path,
+    *,
+    out: Path | None = None,
+    logs_root: Path | None = None,
+    links: str | None = None,
+    force: bool = False,
+    progress: Progress = silent,
+) -> ReportOutcome:
+    """Fill the audit and the table of speed into an existing report, whose folder is exchanged as a whole.
+
+    Parameters
+    ----------
+    target : Path
+        Folder of a report, or the flight file that it was made from.
+    out : Path, optional
+        Folder of the report, where ``target`` is a flight file (default ``reports/<flight>``).
+    logs_root : Path, optional
+        In place of the one that the report was made with.
+    links : str, optional
+        Number of audited links or "full", in place of ``rt.audit_links``.
+    force : bool
+        Replace also what was changed in the folder by hand.
+    progress : Progress
+
+    Raises
+    ------
+    UsageError
+        No report there, or no number of links.
+    InputError
+        An input is gone, or has changed since.
+    """
+    from .later_audit import earlier_report
+
+    if links is not None and links != "full" and not (links.isdecimal() and int(links)):
+        raise UsageError(f"--links {links!r}", expected="a number of links above 0, or 'full'")
+    earlier = earlier_report(target, out)
+    return run_report(
+        earlier.flight,
+        out=earlier.folder,
+        logs_root=logs_root or earlier.logs_root,
+        audit=links or str(earlier.audit_links),
+        force=force,
+        same_inputs=earlier.inputs,
+        progress=progress,
+        **earlier.asked,
+    )
 
 
 def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
@@ -245,7 +329,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     found = run_flight(data, stages, ladder=True)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
-    if settings.report.speed_table and settings.rt.audit_links:
+    if settings.report.speed_table and settings.rt.audit_links and settings.report.audit == "now":
         with stages("speed"):
             from .speed_table import speed_rows
 
@@ -273,12 +357,14 @@ def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
         if engine not in ("image", "sionna"):
             raise UsageError(f"--engine {engine!r}", expected="image or sionna")
         change["engine"] = engine
+    report = settings.report
     if audit is not None:
-        numbers = {"full": 10**9, "none": 0}
-        if audit not in numbers and not audit.isdigit():
-            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full' or 'none'")
-        change["audit_links"] = numbers.get(audit, int(audit) if audit.isdigit() else 0)
-    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change)})
+        numbers = {"full": 10**9, "none": 0, "later": settings.rt.audit_links}
+        if audit not in numbers and not audit.isdecimal():
+            raise UsageError(f"--audit {audit!r}", expected="a number of links, 'full', 'none' or 'later'")
+        change["audit_links"] = numbers[audit] if audit in numbers else int(audit)
+        report = report.model_copy(update={"audit": "later" if audit == "later" else "now"})
+    return settings.model_copy(update={"rt": settings.rt.model_copy(update=change), "report": report})
 
 
 def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
@@ -290,6 +376,8 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
                 failed.append(f"{tower} {channel}: no sample could be compared")
             elif m["at_search_edge"]:
                 failed.append(f"{tower} {channel}: the best offset lies at the edge of the searched span")
+    if metrics.get("audit_command"):
+        failed.append(f"the replay engine is not audited yet: run {metrics['audit_command']}")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")
@@ -563,11 +651,10 @@ def run_map(
     from . import coverage_map as mapping
     from .paper_table import paper_markdown, paper_rows
 
-    given = {name: value for name, value in options.items() if value is not None}
-    settings = mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+    settings = _map_settings(quick, options)
     place = load_site(site)
     name = Path(site).stem
-    folder = out or Path("reports") / f"map-{name}"
+    folder = out or _map_folder(site)
     inputs = [Path(site), *([] if flight is None else [flight])]
     stages = Stages(progress)
     with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
@@ -579,7 +666,8 @@ def run_map(
         generated = datetime.now(timezone.utc).isoformat(timespec="seconds")
         with output.filling() as part:
             with stages("export"):
-                files = mapping.export_maps(outcome, part, {"site": place.name, "generated": generated}, progress)
+                about = {"site": place.name, "generated": generated, "version": versions()["aerpaw-cmp"]}
+                files = mapping.export_maps(outcome, part, about, progress)
             progress("page")
             record = mapping.maps_record(
                 outcome,
@@ -594,6 +682,30 @@ def run_map(
             written[-1].write_text(paper_markdown(record.paper), encoding="utf-8")
     results = tuple(folder / path.relative_to(part) for path in (*written, *files))
     return MapsOutcome(folder, results, maps_metrics(record))
+
+
+def _map_settings(quick: bool, options: dict[str, Any]) -> Any:
+    """The settings of a map from what was given; None leaves the default."""
+    from . import coverage_map as mapping
+
+    given = {name: value for name, value in options.items() if value is not None}
+    return mapping.MapSettings(**({**mapping.QUICK, **given} if quick else given))
+
+
+def _map_folder(site: str) -> Path:
+    return Path("reports") / f"map-{Path(site).stem}"
+
+
+def plan_map(
+    site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None, force: bool = False,
+    **options: Any,
+) -> Any:  # fmt: skip
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing."""
+    from .plan import map_plan
+
+    inputs = [Path(site), *([] if flight is None else [flight])]
+    settings = _map_settings(quick, options)
+    return map_plan(site, settings, inputs=inputs, out=out or _map_folder(site), flight=flight, force=force)
 
 
 def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:

@@ -1,9 +1,9 @@
-"""Maps as files that other programs open: CSV, GeoJSON, JSON, KMZ, NetCDF-CF, GeoTIFF.
+"""Maps as files that other programs open: CSV, GeoJSON, JSON, KMZ, GeoTIFF (NetCDF: ``netcdf.py``).
 
 Arrays in, files out. Each function takes a :class:`~aerpaw_cmp.maps.grid.Grid`, the site's frame and layers. Out of
-coverage is an empty cell (CSV), ``null`` (JSON), NaN (NetCDF, GeoTIFF), and in layers of classes the class 0, "Z".
+coverage is an empty cell (CSV), ``null`` (JSON), NaN (GeoTIFF), and in layers of classes the class 0, "Z".
 
-NetCDF needs xarray and netCDF4, GeoTIFF needs rasterio: ``pip install aerpaw-cmp[geo]``.
+GeoTIFF needs rasterio: ``pip install aerpaw-cmp[geo]``.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from ..common.cf import site_crs
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
 from ..common.jsonable import json_safe
@@ -355,86 +356,11 @@ def _legend(layer: Layer, low: float, high: float) -> bytes:
 # --- optional extras ------------------------------------------------------------------------------------------------
 
 
-def write_netcdf(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer], title: str = "") -> Path:
-    """NetCDF following CF-1.10: (north, east) grids in the site's azimuthal equidistant projection, with lat/lon.
-
-    Parameters
-    ----------
-    path : path
-        The file; replaced where it exists.
-    grid : Grid
-    frame : SiteFrame
-        From local metres to latitude and longitude.
-    layers : sequence of Layer
-        Values in index order, (positions,), NaN out of coverage.
-    title : str
-        Attribute of the file.
-
-    Raises
-    ------
-    UsageError
-        If xarray or netCDF4 is not installed.
-    """
-    _check(grid, layers)
-    try:
-        import netCDF4
-        import xarray as xr
-    except ImportError as missing:
-        raise _extra_missing("NetCDF", missing) from None
-    points = grid.points_m
-    latitude, longitude = frame.to_geographic(points[:, 0], points[:, 1])
-    place = ("north", "east")
-    variables: dict[str, Any] = {"crs": ((), np.int32(0), _cf_projection(frame))}
-    for layer in layers:
-        variables[layer.name] = (place, *_cf_values(grid, layer))
-    dataset = xr.Dataset(
-        variables,
-        coords={
-            "north": ("north", grid.north_m, _cf_axis("projection_y_coordinate", "m", "north of the site origin")),
-            "east": ("east", grid.east_m, _cf_axis("projection_x_coordinate", "m", "east of the site origin")),
-            "latitude": (place, grid.raster(latitude), _cf_axis("latitude", "degrees_north", "WGS84 latitude")),
-            "longitude": (place, grid.raster(longitude), _cf_axis("longitude", "degrees_east", "WGS84 longitude")),
-        },
-        attrs={"Conventions": "CF-1.10", "title": title or "Coverage and rank maps", "source": "aerpaw-cmp"},
-    )
-    target = Path(path)
-    encoding = {layer.name: {"zlib": True, "_FillValue": None if layer.classes else np.nan} for layer in layers}
-    encoding |= {name: {"_FillValue": None} for name in ("north", "east", "latitude", "longitude")}
-    # in memory: HDF5 ends the process where a disk is full
-    book = netCDF4.Dataset("maps", "w", memory=1 << 16)
-    dataset.dump_to_store(xr.backends.NetCDF4DataStore(book), encoding=encoding)
-    target.write_bytes(book.close())
-    return target
-
-
-def _cf_axis(standard_name: str, units: str, long_name: str) -> dict[str, str]:
-    return {"standard_name": standard_name, "units": units, "long_name": long_name}
-
-
-def _cf_projection(frame: SiteFrame) -> dict[str, Any]:
-    """Attributes of the grid mapping (CF appendix F, azimuthal equidistant)."""
-    return {
-        "grid_mapping_name": "azimuthal_equidistant",
-        "latitude_of_projection_origin": frame.latitude_deg,
-        "longitude_of_projection_origin": frame.longitude_deg,
-        "false_easting": 0.0,
-        "false_northing": 0.0,
-        "semi_major_axis": 6378137.0,
-        "inverse_flattening": 298.257223563,
-    }
-
-
-def _cf_values(grid: Grid, layer: Layer) -> tuple[AnyArray, dict[str, Any]]:
-    attributes: dict[str, Any] = {"long_name": layer.title, "units": layer.unit, "grid_mapping": "crs"}
-    if not layer.classes:
-        return grid.raster(np.asarray(layer.values, dtype=np.float64)), attributes
-    names = ["out_of_coverage" if name == "Z" else name.replace(" ", "_") for name in layer.classes]
-    attributes |= {"flag_values": np.arange(len(names), dtype=np.int8), "flag_meanings": " ".join(names)}
-    return grid.raster(np.asarray(layer.values, dtype=np.int8)), attributes
-
-
 def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[Layer]) -> Path:
-    """GeoTIFF with one float32 band per layer (its name and unit in the tags), north up, NaN out of coverage.
+    """Cloud-optimised GeoTIFF, one float32 band per layer with name, unit, title and classes; north up.
+
+    NaN is out of coverage. A band of classes has no missing value: its 0 is the class "Z", which its tag ``classes``
+    names.
 
     Parameters
     ----------
@@ -455,33 +381,32 @@ def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequen
     try:
         import rasterio
         from rasterio.io import MemoryFile
+        from rasterio.shutil import copy
     except ImportError as missing:
-        raise _extra_missing("GeoTIFF", missing) from None
-    half = grid.spacing_m / 2
-    step = grid.spacing_m
+        raise UsageError(
+            f"GeoTIFF needs {missing.name}, which is not installed",
+            expected="pip install 'aerpaw-cmp[geo]', or another format",
+        ) from None
+    half, step = grid.spacing_m / 2, grid.spacing_m
     corner = rasterio.Affine(step, 0.0, grid.east_m[0] - half, 0.0, -step, grid.north_m[-1] + half)
-    crs = f"+proj=aeqd +lat_0={frame.latitude_deg!r} +lon_0={frame.longitude_deg!r} +ellps=WGS84 +units=m +no_defs"
     rows, columns = grid.shape
     target = Path(path)
-    with MemoryFile() as memory:  # GDAL says nothing of what a full disk did not take
+    # GDAL says nothing of what a full disk did not take: made in memory, the layout by a copy
+    with MemoryFile() as memory, MemoryFile(ext=".tif") as ordered:
         with memory.open(
-            driver="GTiff", width=columns, height=rows, count=len(layers), dtype="float32", crs=crs,
-            transform=corner, nodata=np.nan, compress="deflate",
+            driver="GTiff", width=columns, height=rows, count=len(layers), dtype="float32",
+            crs=site_crs(frame).to_wkt("WKT2_2019"), transform=corner, nodata=np.nan,
         ) as file:  # fmt: skip
             for band, layer in enumerate(layers, start=1):
                 values = np.asarray(layer.values, dtype=np.float32)
                 file.write(grid.raster(values)[::-1], band)
                 file.set_band_description(band, layer.name)
+                file.set_band_unit(band, layer.unit)
                 file.update_tags(band, title=layer.title, unit=layer.unit, classes=" ".join(layer.classes))
-        target.write_bytes(memory.read())
+        with memory.open() as file:
+            copy(file, ordered.name, driver="COG", compress="deflate", overview_resampling="nearest")
+        target.write_bytes(ordered.read())
     return target
-
-
-def _extra_missing(what: str, missing: ImportError) -> UsageError:
-    return UsageError(
-        f"{what} needs {missing.name}, which is not installed",
-        expected="pip install 'aerpaw-cmp[geo]', or another format",
-    )
 
 
 # --- shared ---------------------------------------------------------------------------------------------------------

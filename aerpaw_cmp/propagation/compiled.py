@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import lru_cache
+from importlib import import_module
 from importlib.util import find_spec
 from types import ModuleType
 from typing import Any
@@ -52,19 +53,28 @@ def switch() -> str:
 
 
 def kernels_for(work: int) -> ModuleType | None:
-    """The module of compiled kernels, or None: the work (element pairs of links) is too small, or they cannot run."""
+    """Compiled kernels of the field, or None: the work (element pairs of links) is too small, or they cannot run."""
+    return _chosen("kernels", work)
+
+
+def search_kernels_for(work: int) -> ModuleType | None:
+    """Those of the path search."""
+    return _chosen("search_kernels", work)
+
+
+def _chosen(name: str, work: int) -> ModuleType | None:
     chosen = switch()
     if chosen == "never" or (chosen == "auto" and work < ENOUGH_WORK):
         return None
-    state = load()
+    state = load(name)
     if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
         _warn_once(state.reason)
     return state.kernels
 
 
-@lru_cache(maxsize=1)
-def load() -> State:
-    """Import the kernels and try them; whatever goes wrong there is a reason to do without, not an error.
+@lru_cache(maxsize=2)
+def load(name: str) -> State:
+    """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
 
     A broken installation shows itself in many ways (no LLVM for this processor, a NumPy too new, a cache cut short),
     and NumPy gives the same answer.
@@ -74,11 +84,11 @@ def load() -> State:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # numba's own, about its cache
-            from . import kernels
-
+            kernels = import_module(f".{name}", __package__)
             kernels.try_out()
     except Exception as error:
-        return State(None, f"the compiled kernels cannot run ({type(error).__name__}: {str(error).splitlines()[:1]})")
+        line = (str(error).splitlines() or [""])[0]
+        return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")
     return State(kernels, "")
 
 

@@ -27,7 +27,7 @@ from ..site.dem import Dem
 from ..site.materials import CROWN
 from ..site.meshes import CROWN_SIDES, crown_corners_m
 from ..site.site import Trees
-from .foliage import CrownIndex
+from .foliage import crown_index
 from .image import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, merge
 from .paths import Faces, PathSet, joined
 from .solids import Occlusion
@@ -94,7 +94,7 @@ class Crowns:
 
     def __init__(self, trees: Trees) -> None:
         self.trees = trees
-        self.index = CrownIndex(trees)
+        self.index = crown_index(trees)
         solid = np.flatnonzero((trees.crown_diameter_m > 0) & (trees.height_m > trees.crown_base_m))
         rim, tip = crown_corners_m(trees)
         rim, tip = rim[solid], tip[solid]

@@ -224,7 +224,7 @@ def foliage_loss_db(
     if isinstance(model, NoFoliage):
         loss = np.zeros(len(source_m))
     else:
-        index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+        index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
         depth = foliage_depth_m(source_m, vertices_m, target_m, index, bounced if opaque else None)
         if opaque:
             depth = depth + foliage_depth_m(source_m, vertices_m, target_m, index.trunks())
@@ -257,7 +257,7 @@ def foliage_depth_m(
     """
     source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
     vertices = np.asarray(vertices_m, dtype=np.float64)
-    index = trees if isinstance(trees, CrownIndex) else CrownIndex(trees)
+    index = trees if isinstance(trees, CrownIndex) else crown_index(trees)
     depth = np.zeros(len(source))
     end = target
     last = vertices.shape[1] - 1
@@ -269,6 +269,18 @@ def foliage_depth_m(
         end = start
     depth[~(np.isfinite(source).all(axis=1) & np.isfinite(target).all(axis=1))] = np.nan
     return depth
+
+
+_last_index: list[CrownIndex] = []
+
+
+def crown_index(trees: Trees) -> CrownIndex:
+    """The index of cones of these trees; that of the trees asked for last is kept, as a flight asks many times."""
+    kept = next((one for one in _last_index if one.trees is trees), None)
+    if kept is None:
+        kept = CrownIndex(trees)
+        _last_index[:] = [kept]
+    return kept
 
 
 class CrownIndex:

@@ -15,13 +15,14 @@ lands.
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
+from . import compiled
 from .faces import corners, inside
 from .paths import Faces, PathSet
 from .solids import Occlusion
@@ -34,6 +35,12 @@ MINIMUM_LENGTH_M = 0.01
 
 SEQUENCE_BUDGET = 200_000
 """Face sequences per tower beyond which the ``image`` engine gives up."""
+
+SEQUENCES_AT_ONCE = 100_000
+"""Sequences of several towers that are held at once."""
+
+TESTS_PER_PAIR = 20
+"""A sequence tried for a pose costs NumPy this part of what the field of an element pair of a link does."""
 
 CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
@@ -52,6 +59,9 @@ def find_paths(
     excluded: BoolArray | None = None,
     budget: int = SEQUENCE_BUDGET,
     select: Select | None = None,
+    extent_m: FloatArray | None = None,
+    work: int = 0,
+    threads: int | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
@@ -73,6 +83,13 @@ def find_paths(
         Largest number of sequences followed per tower.
     select : callable, optional
         ``select(tower, levels)`` gives the sequences to follow of those that geometry allows.
+    extent_m : (points, 3), optional
+        Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
+    work : int
+        Element pairs of all links of the replay that this search is a part of, besides its own work; decides whether
+        compiled code is worth loading (:mod:`aerpaw_cmp.propagation.compiled`). The paths are the same.
+    threads : int, optional
+        Of compiled code.
     progress : callable, optional
         Called with the share done.
 
@@ -88,29 +105,63 @@ def find_paths(
     """
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
-    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
+    known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
+    tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
-    known = targets_m[np.isfinite(targets_m).all(axis=1)]
     box = corners(faces, 10.0 * float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
-    found: list[PathSet] = []
-    for tower, source in enumerate(sources_m):
+    alive = _alive(sources_m, targets_m, excluded)
+
+    def sequences(tower: int) -> list[Sequences]:
         usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
-        gap = np.linalg.norm(targets_m - source, axis=1)
-        alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
-        if excluded is not None:
-            alive &= ~excluded[tower]
-        poses = np.flatnonzero(alive)
-        if len(poses):
-            tree = Sequences.of(
-                faces, box, facing, source, targets_m[poses], usable_faces, max_depth, budget, tolerance_m
+        targets = targets_m[alive[tower]]
+        if not len(targets):
+            return []
+        tree = Sequences.of(faces, box, facing, sources_m[tower], targets, usable_faces, max_depth, budget, tolerance_m)
+        return select(tower, tree) if select else tree
+
+    found: list[PathSet] = []
+    for group, levels in _groups(sequences, len(sources_m)):
+        tests = sum(
+            int(alive[t].sum()) * sum(len(x.faces) for x in tree) for t, tree in zip(group, levels, strict=True)
+        )
+        compiled_code = compiled.search_kernels_for(work + tests // TESTS_PER_PAIR)
+        if compiled_code is not None:
+            from .compiled_search import find
+
+            plain = [[(level.faces, level.images_m) for level in tree] for tree in levels]
+            some = np.array(group)
+            pieces = find(
+                compiled_code, faces, plain, sources_m[some], targets_m, alive[some], max_depth, hiding, threads
             )
-            for level in select(tower, tree) if select else tree:
-                found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
+            found += [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
+        else:
+            for tower, tree in zip(group, levels, strict=True):
+                poses, source = np.flatnonzero(alive[tower]), sources_m[tower]
+                for level in tree:
+                    found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
-            progress((tower + 1) / len(sources_m))
+            progress((group[-1] + 1) / len(sources_m))
     return merge(found, max_depth, faces)
+
+
+def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:
+    """Links (towers, poses) that may have paths."""
+    gap = np.stack([np.linalg.norm(targets_m - source, axis=1) for source in sources_m.reshape(-1, 3)])
+    alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
+    return np.asarray(alive if excluded is None else alive & ~excluded)
+
+
+def _groups(sequences: Callable[[int], list[Sequences]], towers: int) -> Iterator[tuple[range, list[list[Sequences]]]]:
+    """Towers that are searched at once, with their sequences: as many as memory bears."""
+    first, levels, total = 0, [], 0
+    for tower in range(towers):
+        levels.append(sequences(tower))
+        total += sum(len(level.faces) for level in levels[-1])
+        if total > SEQUENCES_AT_ONCE or tower == towers - 1:
+            yield range(first, tower + 1), levels
+            first, levels, total = tower + 1, [], 0
 
 
 def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
@@ -418,24 +469,40 @@ def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    pose = np.concatenate([p.pose for p in pieces])
-    tower = np.concatenate([p.tower for p in pieces])
-    depth = np.concatenate([p.depth for p in pieces])
-    sequence = np.concatenate([p.faces for p in pieces])
-    vertices = np.concatenate([p.vertices_m for p in pieces])
-    tree = np.concatenate([p.tree for p in pieces])
-    order = np.lexsort((*sequence.T[::-1], depth, tower, pose))
-    if faces is not None and len(order):
-        plane = planes_of(faces)
-        same = np.append(plane, -1)[sequence[order]]
-        key = np.column_stack([pose[order], tower[order], same])
-        repeated = np.zeros(len(order), dtype=np.bool_)
-        if len(np.unique(plane)) < len(plane):
-            _, first = np.unique(key, axis=0, return_index=True)
-            repeated[:] = True
-            repeated[first] = False
-        order = order[~repeated]
-    return PathSet(pose[order], tower[order], depth[order], sequence[order], vertices[order], tree[order])
+    columns = ("pose", "tower", "depth", "faces", "vertices_m", "tree")
+    whole = PathSet(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in columns})
+    order = _order(whole)
+    if faces is not None:
+        repeated = _repeated(whole, order, faces)
+        if repeated.any():
+            order = order[~repeated[order]]
+    return whole if len(order) == len(whole) and (np.diff(order) == 1).all() else whole.select(order)
+
+
+def _order(paths: PathSet) -> IntArray:
+    """Rows by pose, tower, depth, faces; at once where they lie so."""
+    keys = [paths.pose, paths.tower, paths.depth, *paths.faces.T]
+    sorted_, tied = np.ones(max(len(paths) - 1, 0), np.bool_), np.ones(max(len(paths) - 1, 0), np.bool_)
+    for key in keys:
+        step = np.diff(key)
+        sorted_ &= ~tied | (step >= 0)
+        tied &= step == 0
+    return np.arange(len(paths)) if sorted_.all() else np.lexsort(keys[::-1])
+
+
+def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
+    """Paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
+    plane = planes_of(faces)
+    shared = np.append(np.bincount(plane)[plane] > 1, False)
+    rows = order[shared[paths.faces[order]].any(axis=1)]
+    repeated = np.zeros(len(paths), dtype=np.bool_)
+    if len(rows):
+        same = np.append(plane, -1)[paths.faces[rows]]
+        key = np.column_stack([paths.pose[rows], paths.tower[rows], same])
+        by_key = np.lexsort(key.T[::-1])  # stable: the first in order stays
+        twin = (np.diff(key[by_key], axis=0) == 0).all(axis=1)
+        repeated[rows[by_key[1:][twin]]] = True
+    return repeated
 
 
 def planes_of(faces: Faces) -> IntArray:

@@ -24,6 +24,7 @@ class Settings:
     samples: int = 1_000_000
     batch: int = 50
     variant: str | None = None
+    threads: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

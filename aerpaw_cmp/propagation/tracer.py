@@ -204,7 +204,7 @@ def replay(
     scene = Scene.of(site, link, poses)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant)
+    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
     choice = None
     if relevance_db is not None:
         paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
@@ -398,6 +398,8 @@ def _search_relevant(
         usable=scene.usable,
         excluded=scene.excluded,
         select=chooser,
+        work=_pairs(link, poses),
+        threads=settings.threads,
         progress=progress,
     )
     again = np.zeros(len(poses), dtype=np.bool_)
@@ -446,6 +448,8 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
+            work=_pairs(link, poses),
+            threads=settings.threads,
             progress=progress,
         )
     from . import sionna
@@ -463,6 +467,11 @@ def _search(
         variant=settings.variant,
         progress=progress,
     )
+
+
+def _pairs(link: Link, poses: Poses) -> int:
+    """Element pairs of all links."""
+    return len(poses) * sum(len(array) for array in link.tower_arrays.values()) * len(link.uav_array)
 
 
 def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:

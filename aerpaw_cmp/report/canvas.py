@@ -145,8 +145,6 @@ def save(fig: Figure) -> tuple[bytes, bytes]:
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
     """The figure in some of :data:`FORMATS`; on paper as wide as two columns of an IEEE page."""
     from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.backends.backend_pdf import FigureCanvasPdf
-    from matplotlib.backends.backend_svg import FigureCanvasSVG
 
     if kind == "paper":
         width, height = fig.get_size_inches()
@@ -161,8 +159,12 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         agg.draw()  # the layout is made here
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
     if "svg" in found:
+        from matplotlib.backends.backend_svg import FigureCanvasSVG
+
         FigureCanvasSVG(fig).print_svg(found["svg"], metadata={"Date": None})
     if "pdf" in found:
+        from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools: as much as a figure
+
         FigureCanvasPdf(fig).print_pdf(found["pdf"], metadata={"CreationDate": None})
     return {name: file.getvalue() for name, file in found.items()}
 
@@ -173,7 +175,9 @@ def smaller(png: bytes, colours: int = 128) -> bytes:
 
     out = io.BytesIO()
     with Image.open(io.BytesIO(png)) as picture:
-        picture.convert("RGB").quantize(colours).save(out, "PNG", optimize=True)
+        # an octree takes a tenth of the time of a median cut, and fewer pixels are far off; level 9 gains 5 %
+        few = picture.convert("RGB").quantize(colours, method=Image.Quantize.FASTOCTREE)
+        few.save(out, "PNG", compress_level=6)
     return min(out.getvalue(), png, key=len)
 
 

@@ -451,6 +451,8 @@ class ReportData:
         Seconds per named stage.
     extra_metrics : mapping
         Merged into ``metrics.json`` last, key by key.
+    audit_command : str
+        The command that fills in the audit and the table of speed, where they were put off; else empty.
     """
 
     title: str
@@ -474,3 +476,4 @@ class ReportData:
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
+    audit_command: str = ""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -166,17 +166,37 @@ def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:
 
 def rss_frame(panels: Iterable[RssPanel]) -> Any:
     """All RSS samples as one table with the columns of :data:`RSS_COLUMNS` and one per baseline."""
-    import pandas as pd
+    return _whole(_rss_tables(list(panels)), RSS_COLUMNS)
 
-    panels = list(panels)
+
+def rss_csv(panels: Iterable[RssPanel]) -> Iterator[str]:
+    """The text of :func:`rss_frame` in pieces of bounded size."""
+    return _text(_rss_tables(list(panels)), RSS_COLUMNS)
+
+
+def rank_frame(panels: Iterable[RankPanel]) -> Any:
+    """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
+    return _whole(_rank_tables(list(panels)), RANK_COLUMNS)
+
+
+def rank_csv(panels: Iterable[RankPanel]) -> Iterator[str]:
+    """The text of :func:`rank_frame` in pieces of bounded size."""
+    return _text(_rank_tables(list(panels)), RANK_COLUMNS)
+
+
+_Table = tuple[Any, dict[str, Any]]
+"""Times (n,) of a panel, and its further columns: arrays (n,), or one value for all rows."""
+
+_ROWS = 50_000
+"""Rows that are text at once."""
+
+
+def _rss_tables(panels: list[RssPanel]) -> Iterator[_Table]:
     names = list(dict.fromkeys(b.name for panel in panels for b in panel.baselines))
     further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
-    frames = []
     for panel in panels:
-        n = len(panel.time)
-        nowhere = np.full(n, np.nan)
+        nowhere = np.full(len(panel.time), np.nan)
         columns: dict[str, Any] = {
-            **_times(panel.time),
             "tower": panel.tower,
             "channel": panel.channel,
             "unit": panel.unit,
@@ -193,24 +213,20 @@ def rss_frame(panels: Iterable[RssPanel]) -> Any:
         levels = {b.name: b.level_dbm for b in panel.baselines}
         columns.update({f"{name}_dbm": levels.get(name, nowhere) for name in names})
         columns.update({name: panel.per_sample.get(name, nowhere) for name in further})
-        frames.append(pd.DataFrame(columns, index=range(n)))
-    return _stacked(frames, RSS_COLUMNS)
+        yield panel.time, columns
 
 
-def rank_frame(panels: Iterable[RankPanel]) -> Any:
-    """All rank samples as one table with the columns of :data:`RANK_COLUMNS` and one per K."""
+def _rank_tables(panels: list[RankPanel]) -> Iterator[_Table]:
     import pandas as pd
 
     def integers(values: Any) -> Any:
-        return pd.Series(values, dtype="float64").astype("Int64")  # NaN becomes an empty cell, 2.0 becomes 2
+        return pd.Series(values, dtype="float64").astype("Int64").array  # NaN becomes an empty cell, 2.0 becomes 2
 
-    panels = list(panels)
     ks = sorted({at.k for panel in panels for at in panel.simulated})
     further = list(dict.fromkeys(name for panel in panels for name in panel.per_sample))
-    frames = []
+    values = list(dict.fromkeys(name for panel in panels for name in panel.values))
     for panel in panels:
         columns: dict[str, Any] = {
-            **_times(panel.time),
             "tower": panel.tower,
             "east_m": panel.east_m,
             "north_m": panel.north_m,
@@ -223,35 +239,61 @@ def rank_frame(panels: Iterable[RankPanel]) -> Any:
         nowhere = np.full(len(panel.time), np.nan)
         columns.update({name: integers(panel.per_sample.get(name, nowhere)) for name in further})
         # no path: no level, and a ratio of nothing; a vanishing singular value is an empty cell, too
-        columns.update({name: np.where(np.isfinite(v), v, np.nan) for name, v in panel.values.items()})
-        frames.append(pd.DataFrame(columns, index=range(len(panel.time))))
-    return _stacked(frames, RANK_COLUMNS)
+        seen = {name: panel.values.get(name, nowhere) for name in values}
+        columns.update({name: np.where(np.isfinite(v), v, np.nan) for name, v in seen.items()})
+        yield panel.time, columns
 
 
-def _stacked(frames: list[Any], columns: Iterable[str]) -> Any:
-    """Frames below each other, rounded; without any, the bare columns."""
+def _whole(tables: Iterator[_Table], columns: Iterable[str]) -> Any:
+    """Tables below each other, rounded; without any, the bare columns."""
     import pandas as pd
 
-    table = pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
-    return table.round(_DECIMALS)
+    frames = [_rows(table, slice(None)) for table in tables]
+    return pd.concat(frames, ignore_index=True) if frames else pd.DataFrame(columns=list(columns))
 
 
-def _times(time: Any) -> dict[str, Any]:
-    """Columns ``time_utc`` and ``time_s``."""
+def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
+    """The same as CSV, some rows at a time: a day of samples as text would not fit into memory."""
+    head = True
+    for table in tables:
+        for start in range(0, len(table[0]), _ROWS):
+            yield _rows(table, slice(start, start + _ROWS)).to_csv(index=False, header=head, lineterminator="\n")
+            head = False
+    if head:
+        yield _whole(iter(()), columns).to_csv(index=False, lineterminator="\n")
+
+
+def _rows(table: _Table, part: slice) -> Any:
+    """Some rows of a table, rounded."""
+    import pandas as pd
+
+    time, columns = table
+    parts = {name: value if isinstance(value, str) else value[part] for name, value in columns.items()}
+    frame = pd.DataFrame({**_times(time, part), **parts}, index=range(len(time[part])))
+    return frame.round(_DECIMALS)
+
+
+def _times(time: Any, part: slice) -> dict[str, Any]:
+    """Columns ``time_utc`` and ``time_s`` of some rows; seconds count from the first instant of all."""
     instants = np.asarray(time, dtype="datetime64[ns]")
     known = instants[~np.isnat(instants)]
     if not len(known):
-        return {"time_utc": "", "time_s": np.full(len(instants), np.nan)}
+        return {"time_utc": "", "time_s": np.full(len(instants[part]), np.nan)}
     first = known.min()
-    seconds = (instants - first) / np.timedelta64(1, "s")
-    return {"time_utc": iso_time(instants) if has_wall_clock(first) else "", "time_s": seconds}
+    seconds = (instants[part] - first) / np.timedelta64(1, "s")
+    return {"time_utc": iso_time(instants[part]) if has_wall_clock(first) else "", "time_s": seconds}
 
 
-def write_file(path: Path, content: str | bytes) -> Path:
+def write_file(path: Path, content: str | bytes | Iterator[str]) -> Path:
     """Write one file of a folder of results; its own folder is made when missing, but not that one's parent.
+
+    Text may come in pieces.
 
     The set becomes whole, and errors become messages, in :class:`~aerpaw_cmp.common.outputs.OutputFolder`.
     """
     path.parent.mkdir(exist_ok=True)
-    path.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
+    pieces = iter([content]) if isinstance(content, (str, bytes)) else content
+    with path.open("wb") as file:
+        for piece in pieces:
+            file.write(piece.encode("utf-8") if isinstance(piece, str) else piece)
     return path

@@ -127,7 +127,7 @@ def _trust(data: ReportData) -> str:
         doubts.append("a channel could not be scored")
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        doubts.append("the engine was not audited")
+        doubts.append("the engine is not audited yet" if data.audit_command else "the engine was not audited")
     if audit is not None and audit.missing_paths:
         doubts.append(f"the audit misses {count(audit.missing_paths)} paths")
     if audit is not None and audit.fields is not None and audit.fields.failures:

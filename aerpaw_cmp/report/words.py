@@ -180,7 +180,11 @@ def warnings(data: ReportData) -> list[str]:
         found += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        found.append("The replay engine was not audited against the other engine in this report.")
+        found.append(
+            f"The replay engine is not audited yet: run {data.audit_command}."
+            if data.audit_command
+            else "The replay engine was not audited against the other engine in this report."
+        )
     if audit is not None and (audit.missing_paths or audit.extra_paths):
         found.append(
             f"The audit found {count(audit.missing_paths)} paths that only the {audit.reference} engine has and "

@@ -12,7 +12,7 @@ from ..common.stages import Stages
 from . import figures, html
 from .canvas import FORMATS, STYLES, write_plates
 from .data import ReportData
-from .export import metrics, rank_frame, rss_frame, write_file
+from .export import metrics, rank_csv, rss_csv, write_file
 from .exports.samples import of_report
 from .exports.write import FOLDER, write_exports
 
@@ -68,9 +68,9 @@ def write_report(
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
     written = []
     with stages("report"):
-        for name, frame in (("rss.csv", rss_frame(data.rss)), ("rank.csv", rank_frame(data.rank))):
+        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
             # written even without rows: a reader finds the same files in every report
-            written.append(write_file(folder / name, frame.to_csv(index=False, lineterminator="\n")))
+            written.append(write_file(folder / name, text))
         plates = [] if drawn == "none" else [p for p in figures.plates(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
         pictures, paths = write_plates(plates, folder / "figures", formats, style, stages.progress)

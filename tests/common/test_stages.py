@@ -54,3 +54,12 @@ def test_a_terminal_gets_one_bar_with_the_time_left(
     err = capsys.readouterr().err
     assert "maps" in err
     assert "page" in err
+
+
+def test_quiet_leaves_warnings(capsys: pytest.CaptureFixture[str]) -> None:
+    progress = shown.ProgressLines()
+    progress.quiet = True
+    progress("read")
+    progress("maps", 0.5)
+    progress.warn("warning: a clock is off")
+    assert capsys.readouterr().err == "warning: a clock is off\n"

@@ -72,3 +72,11 @@ def test_few_flights_are_left_out_one_by_one_and_many_are_sampled_over_the_seaso
     some = spread_flights(names)
     assert len(some) == len(set(some)) == calibration.MOST_SCORED
     assert (some[0], some[-1]) == ("0", "19")
+
+
+def test_the_mean_alone_is_that_of_the_prediction() -> None:
+    learned = calibration.learn([observed("a", seed=1).samples, observed("b", seed=2).samples], RECIPE)
+    other = observed("c", seed=3).samples
+    lost = dataclasses.replace(other, at_uav=np.where(np.arange(len(other))[:, None] < 5, np.nan, other.at_uav))
+    np.testing.assert_array_equal(learned.mean(lost), learned.predict(lost)[0])
+    assert np.isnan(learned.mean(lost)).sum() == 5

@@ -7,6 +7,7 @@ import json
 import numpy as np
 import pytest
 
+from aerpaw_cmp.flight import lag
 from aerpaw_cmp.flight.lag import combine_lags, direction_terms, estimate_lag
 from tests.flight.test_track import START, at, real_flight
 
@@ -239,3 +240,26 @@ def test_real_clocks_agree_as_far_as_the_data_can_tell(name):
     assert both.ci95_s[1] > -1.0
     assert np.ptp(both.ci95_s) < 0.6 * np.ptp(alone.ci95_s)
     assert both.rmse_db < 3.7
+
+
+@pytest.mark.parametrize("gaps", [0, 7, 400])
+def test_the_search_in_blocks_gives_the_costs_of_one_lag_after_the_other(gaps):
+    """Whole rows together, rows with gaps alone: to the last digit what each row costs by itself."""
+    rng = np.random.default_rng(3)
+    rows = rng.normal(-70, 5, (11, 800))
+    rows[[0, 4, 10], :gaps] = np.nan
+    rows[3] = np.nan
+    one_by_one = [lag._cost(row, 0.4, 500) for row in rows]
+    assert lag._costs(rows, 0.4, 500).tolist() == one_by_one
+    assert np.isinf(one_by_one[3])
+    assert np.isfinite(one_by_one[0]) == (gaps < 300)
+
+
+def test_a_flight_searched_in_blocks_of_one_lag_gives_the_same_fit(monkeypatch):
+    level = two_ray_flight(700)
+    t = np.arange(0, 700, 0.1)
+    measured = level(t - 1.3) + np.random.default_rng(4).normal(0, 3, len(t))
+    whole = estimate_lag(t, measured, level)
+    monkeypatch.setattr(lag, "_HELD", 1)
+    assert estimate_lag(t, measured, level).as_dict() == whole.as_dict()
+    assert abs(whole.radio_minus_telemetry_s - 1.3) < 0.1

@@ -26,6 +26,8 @@ from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
 FADING_DB = 1.0
+START_POSIX_S = 1_748_786_400
+"""The start of the plan: 2025-06-01 10:00 in New York, 14:00 UTC."""
 YAW = "link.rss.tower.yaw_deg"
 
 
@@ -103,7 +105,25 @@ def whole(folder: Path) -> dict[str, Any]:
         settings={"as written": {}, "right azimuth": {YAW: YAW_DEG}},
         calibration="channel",
         held_out={"fit": {YAW: list(range(0, 360, 10))}, "fit_on": ["first"], "samples": 100},
+        export=["mat", "gpx"],
     )
+
+
+def test_the_samples_of_all_flights_are_exported(whole: dict[str, Any], folder: Path) -> None:
+    """Read by SciPy: each link's residual gives the RMSE of its row, and its times are those of the plan."""
+    from scipy.io import loadmat
+
+    place = folder / "whole_out" / "exports"
+    links = loadmat(place / "samples.mat", simplify_cells=True)["rss"]
+    rows = {(r["flight"], f"{r['tower']} {r['channel']}"): r for r in whole["rss"] if r["setting"] == "as written"}
+    assert {(link["flight"], f"{link['tower']} {link['channel']}") for link in links} == set(rows)
+    for link in links:
+        rmse = np.sqrt(np.nanmean(link["residual_db"] ** 2))
+        assert rmse == pytest.approx(rows[link["flight"], f"{link['tower']} {link['channel']}"]["rmse_db"], abs=1e-3)
+        assert link["time_posix_s"][0] == pytest.approx(START_POSIX_S, abs=60)
+    assert (place / "track.gpx").read_text().count("<trk>") == 2
+    assert "exports/samples.mat" in (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
+    assert "exports/samples.mat" in (folder / "whole_out" / "SHA256SUMS").read_text(encoding="utf-8")
 
 
 def test_the_planted_azimuth_is_recovered_and_holds_on_the_other_flight(whole: dict[str, Any]) -> None:
@@ -482,7 +502,13 @@ def test_a_campaign_of_rank_flights(folder: Path) -> None:
         settings["rank"] = {"k": [10, 100], "bootstrap": 20}
         (folder / f"rank_{name}.yaml").write_text(yaml.safe_dump(settings), encoding="utf-8")
         assert main(["simulate", str(folder / f"rank_{name}.yaml")]) == 0
-    found = result(folder, "ranks", flights=["rank_first.yaml", "rank_second.yaml"])
+    found = result(folder, "ranks", "--export", "geojson", flights=["rank_first.yaml", "rank_second.yaml"])
+    points = json.loads((folder / "ranks_out" / "exports" / "rank.geojson").read_text(encoding="utf-8"))["features"]
+    for row in found["rank"]:
+        ranks = [p["properties"] for p in points if p["properties"]["flight"] == row["flight"]]
+        pairs = [(r["measured_rank"], r[f"simulated_rank_k{row['k']:g}"]) for r in ranks]
+        alike = [a == b for a, b in pairs if a is not None and b]
+        assert sum(alike) / len(alike) == pytest.approx(row["agreement"], abs=1e-9)
     assert found["rss"] == []
     assert {(r["flight"], r["k"]) for r in found["rank"]} == {(f"rank_{n}", k) for n in OFFSETS_DB for k in (10, 100)}
     for transfer in found["rank_transfers"]:

@@ -289,9 +289,19 @@ def test_the_paper_page_has_the_rows_that_a_run_prints(made):
 def test_netcdf_is_written_where_its_library_is(made):
     xarray = pytest.importorskip("xarray")
     pytest.importorskip("netCDF4")
+    import pandas as pd
+
+    table = pd.read_csv(made[0] / "layers.csv")
     with xarray.open_dataset(made[0] / "maps.nc") as data:
-        assert data["rank_k10_h030m_LW3_opaque"].shape == (11, 6)
-        assert data.attrs["Conventions"].startswith("CF-")
+        data = data.assign_coords(tower=data["tower_name"].astype(str), foliage=data["foliage_mode"].astype(str))
+        for mode in ("none", "opaque"):
+            here = data.sel(foliage=mode, y=xarray.DataArray(table["north_m"]), x=xarray.DataArray(table["east_m"]))
+            rank = here["rank"].sel(k=10.0, height_of_rank=30.0, tower="LW3")
+            np.testing.assert_array_equal(rank, table[f"rank_k10_h030m_LW3_{mode}"])
+            level = here["rss_mimo_joint"].sel(height=30.0)
+            np.testing.assert_allclose(level, table[f"rss_mimo_h030m_joint_{mode}"], atol=1e-5)
+        assert data.attrs["Conventions"] == "CF-1.11"
+        assert "T" in data.attrs["history"].split()[0], "when it was made"
 
 
 def test_geotiff_is_written_where_its_library_is(made):

@@ -128,45 +128,56 @@ def test_constant_and_empty_layers_can_be_drawn(tmp_path):
     assert export.write_kmz(tmp_path / "m.kmz", GRID, FRAME, [flat, empty, endless]).stat().st_size > 0
 
 
-def test_netcdf_follows_cf(tmp_path):
-    xr = pytest.importorskip("xarray")
-    pytest.importorskip("netCDF4")
-    path = export.write_netcdf(tmp_path / "m.nc", GRID, FRAME, LAYERS)
-    with xr.open_dataset(path, decode_coords="all") as data:
-        assert data.attrs["Conventions"] == "CF-1.10"
-        np.testing.assert_array_equal(data["rss_h030m_joint"].values.ravel(), RSS)
-        np.testing.assert_array_equal(data["rank_k10_h030m_joint"].values.ravel(), RANK)
-        assert data["rss_h030m_joint"].attrs["units"] == "dBm"
-        rank = data["rank_k10_h030m_joint"].attrs
-        assert rank["flag_meanings"].split()[0] == "out_of_coverage"
-        assert len(rank["flag_values"]) == len(rank["flag_meanings"].split())
-        assert data["rss_h030m_joint"].dims == ("north", "east")
-        import pyproj
-
-        there = pyproj.Proj(pyproj.CRS.from_cf(data["crs"].attrs))(
-            float(data["longitude"][0, 0]), float(data["latitude"][0, 0])
-        )
-        assert there == pytest.approx(tuple(GRID.points_m[0]), abs=1e-3)
-
-
 @pytest.mark.filterwarnings("ignore::PendingDeprecationWarning")  # rasterio's own, of affine
-def test_geotiff_is_north_up(tmp_path):
+def test_geotiff_is_north_up_named_and_has_units(tmp_path):
     rasterio = pytest.importorskip("rasterio")
     path = export.write_geotiff(tmp_path / "m.tif", GRID, FRAME, LAYERS)
     with rasterio.open(path) as file:
         assert file.count == 2
         assert file.descriptions == tuple(layer.name for layer in LAYERS)
+        assert file.units == ("1", "dBm")
         row, column = file.index(*GRID.points_m[6])
         assert file.read(2)[row, column] == pytest.approx(RSS[6], rel=1e-6)
         assert np.isnan(file.read(2)[file.index(*GRID.points_m[3])])
+        np.testing.assert_array_equal(file.read(1)[::-1].ravel(), RANK)
         assert file.tags(1)["classes"].startswith("Z 1")
+        assert file.tags(2)["title"] == LAYERS[1].title
+        wkt = file.crs.to_wkt()
+        assert "Site frame" in wkt
+        assert "unknown" not in wkt.split("GEOGCS")[0]
+        import pyproj
+
+        there = pyproj.Transformer.from_crs(4326, wkt, always_xy=True)
+        latitude, longitude = FRAME.to_geographic(50.0, -20.0)
+        assert there.transform(float(longitude), float(latitude)) == pytest.approx((50.0, -20.0), abs=1e-3)
 
 
-@pytest.mark.parametrize(("writer", "module"), [(export.write_netcdf, "netCDF4"), (export.write_geotiff, "rasterio")])
-def test_missing_extra_is_named(tmp_path, monkeypatch, writer, module):
-    monkeypatch.setitem(sys.modules, module, None)
+@pytest.mark.filterwarnings("ignore::PendingDeprecationWarning", "ignore::DeprecationWarning")
+def test_geotiff_has_the_layout_of_a_cloud_optimised_one(tmp_path):
+    """A large map, since a small one needs neither tiles nor overviews; a plain GeoTIFF of it is none."""
+    rasterio = pytest.importorskip("rasterio")
+    cogeo = pytest.importorskip("rio_cogeo.cogeo")
+    grid = Grid.over_area((0.0, 1100.0, 0.0, 1200.0), 1.0)
+    layer = Layer("level", np.linspace(-120.0, -40.0, len(grid)), "dBm", "Level")
+    path = export.write_geotiff(tmp_path / "m.tif", grid, FRAME, [layer])
+    valid, errors, warnings = cogeo.cog_validate(path, strict=True)
+    assert (valid, errors, warnings) == (True, [], [])
+    with rasterio.open(path) as file:
+        assert file.overviews(1)
+        np.testing.assert_array_equal(file.read(1)[::-1].ravel(), layer.values.astype(np.float32))
+        with rasterio.open(
+            tmp_path / "plain.tif",
+            "w",
+            **{**file.profile, "driver": "GTiff", "tiled": False, "blockxsize": None, "blockysize": None},
+        ) as plain:
+            plain.write(file.read())
+    assert not cogeo.cog_validate(tmp_path / "plain.tif", strict=True)[0]
+
+
+def test_missing_extra_is_named(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "rasterio", None)
     with pytest.raises(UsageError, match=r"aerpaw-cmp\[geo\]"):
-        writer(tmp_path / "m", GRID, FRAME, LAYERS)
+        export.write_geotiff(tmp_path / "m", GRID, FRAME, LAYERS)
 
 
 def test_wrong_layers_are_a_bug(tmp_path):

@@ -10,17 +10,21 @@ import warnings
 
 import numpy as np
 import pytest
+import shapely
+from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import channel, compiled, compiled_field
+from aerpaw_cmp.propagation import channel, compiled, compiled_field, compiled_search, image
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.bench import random_scene
+from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
+from aerpaw_cmp.site.site import Building
 
 needs_numba = pytest.mark.skipif(
     importlib.util.find_spec("numba") is None, reason="numba is not installed (extra fast)"
@@ -179,6 +183,85 @@ def test_sine_and_cosine_of_turns_within_one_unit_of_the_last_place():
     assert np.abs(ours[:, 1] - np.float64(exact.real)).max() < 3e-16
 
 
+# ---------------------------------------------------------------- paths
+
+
+def same_paths(one, two):
+    for column in ("pose", "tower", "depth", "faces"):
+        np.testing.assert_array_equal(getattr(one, column), getattr(two, column))
+    np.testing.assert_allclose(one.vertices_m, two.vertices_m, rtol=0, atol=1e-9)
+
+
+def searched(monkeypatch, faces, sources, targets, **options):
+    monkeypatch.setenv(compiled.SWITCH, "never")
+    numpy = image.find_paths(faces, sources, targets, **options)
+    monkeypatch.setenv(compiled.SWITCH, "always")
+    ours = image.find_paths(faces, sources, targets, **options, threads=2)
+    same_paths(numpy, ours)
+    return ours
+
+
+def whole_metres(rng, buildings):
+    """Boxes, L shapes and towers on a grid of whole metres, so that walls, edges, roofs and ends coincide."""
+    found = []
+    for _ in range(buildings):
+        east, north = rng.integers(-6, 6, 2)
+        shape = box(east, north, east + rng.integers(1, 4), north + rng.integers(1, 4))
+        if rng.uniform() < 0.5:
+            shape = shapely.union(shape, box(east, north, east + 1, north + 5))
+        if not any(shapely.area(shapely.intersection(shape, other.footprint)) > 0 for other in found):
+            found.append(Building(f"b{len(found)}", shape, float(rng.integers(1, 4))))
+    return tuple(found)
+
+
+@needs_numba
+@pytest.mark.parametrize("seed", range(6))
+def test_the_same_paths_among_aligned_and_touching_buildings(monkeypatch, scenes, seed):
+    rng = np.random.default_rng(seed)
+    faces = site_faces(scenes.site(whole_metres(rng, 7)))
+    targets = rng.integers(-8, 9, (120, 3)).astype(float)
+    targets[:, 2] = np.abs(targets[:, 2]) // 2
+    targets[5] = np.nan
+    sources = np.array([[0.0, 0.0, 5.0], [-7.0, 3.0, 2.0], [8.0, 8.0, 1.0]])
+    found = searched(monkeypatch, faces, sources, targets, max_depth=2)
+    assert len(found) > 100
+
+
+@needs_numba
+@pytest.mark.parametrize("max_depth", [0, 1, 3])
+def test_the_same_paths_at_any_depth_and_with_links_left_out(monkeypatch, case, max_depth):
+    site, link, poses, _ = case
+    scene = Scene.of(site, link, poses)
+    usable = scene.usable.copy()
+    usable[1, ::3] = False
+    excluded = scene.excluded.copy()
+    excluded[0, ::4] = True
+    monkeypatch.setattr(compiled_search, "POSES_PER_CHUNK", 13)
+    found = searched(
+        monkeypatch, scene.faces, scene.sources_m, poses.position_m[:40],
+        max_depth=max_depth, usable=usable, excluded=excluded[:, :40],
+    )  # fmt: skip
+    assert found.depth.max() == min(max_depth, 2) or max_depth == 3
+
+
+@needs_numba
+def test_towers_searched_one_by_one_give_the_same_set(monkeypatch, case):
+    site, link, poses, paths = case
+    scene = Scene.of(site, link, poses)
+    monkeypatch.setattr(image, "SEQUENCES_AT_ONCE", 1)
+    found = searched(
+        monkeypatch, scene.faces, scene.sources_m, poses.position_m, usable=scene.usable, excluded=scene.excluded
+    )
+    same_paths(found, paths)
+
+
+@needs_numba
+def test_nothing_to_search(monkeypatch, scenes):
+    faces = site_faces(scenes.site())
+    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.zeros((0, 3))))
+    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
+
+
 # ---------------------------------------------------------------- choosing and doing without
 
 
@@ -210,11 +293,11 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
     def broken():
         raise error
 
-    module = types.ModuleType("aerpaw_cmp.propagation.kernels")
-    module.try_out = broken
     monkeypatch.setattr(compiled, "find_spec", lambda _: True)
-    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.kernels", module)
-    monkeypatch.setattr("aerpaw_cmp.propagation.kernels", module, raising=False)
+    for name in ("kernels", "search_kernels"):
+        module = types.ModuleType(name)
+        module.try_out = broken
+        monkeypatch.setitem(sys.modules, f"aerpaw_cmp.propagation.{name}", module)
     monkeypatch.setattr(compiled, "ENOUGH_WORK", 1)
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     site, link, poses, paths = case
@@ -228,7 +311,7 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
 
 def test_only_large_work_is_compiled(monkeypatch):
     monkeypatch.delenv(compiled.SWITCH, raising=False)
-    monkeypatch.setattr(compiled, "load", lambda: compiled.State(types.ModuleType("kernels"), ""))
+    monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
     assert compiled.kernels_for(compiled.ENOUGH_WORK - 1) is None
     assert compiled.kernels_for(compiled.ENOUGH_WORK) is not None
     monkeypatch.setenv(compiled.SWITCH, "never")

@@ -85,6 +85,32 @@ def test_rss_csv_comes_back_as_it_went(report_data, tmp_path):
     np.testing.assert_allclose(back.calibrated_db - back.simulated_dbm, back.residual_db, atol=2e-4)
 
 
+@pytest.mark.parametrize("rows", [1, 7, 50_000])
+def test_tables_written_in_pieces_are_the_tables(report_data, rows, monkeypatch):
+    """Panels of other lengths, columns and times: the pieces joined are what the whole table would be as text."""
+    monkeypatch.setattr(export, "_ROWS", rows)
+
+    def few(panel, n):
+        cut = {
+            f.name: value[:n] if isinstance(value := getattr(panel, f.name), np.ndarray) and len(value) == len(panel.time)
+            else value
+            for f in dataclasses.fields(panel)
+        }  # fmt: skip
+        others = ("geometry", "baselines") if hasattr(panel, "geometry") else ("values", "simulated")
+        nothing = {name: type(getattr(panel, name))() for name in others}
+        return dataclasses.replace(panel, **{**cut, **nothing})
+
+    bare = [dataclasses.replace(few(p, 9), time=p.time[:9] - p.time[0]) for p in report_data.rss]
+    for panels in ([], bare, [few(report_data.rss[0], 0), *bare], list(report_data.rss[:1]) if rows > 1 else bare):
+        whole = export.rss_frame(panels).to_csv(index=False, lineterminator="\n")
+        assert "".join(export.rss_csv(panels)) == whole
+    rank = report_data.rank[0]
+    one, two = few(rank, 11), dataclasses.replace(few(rank, 5), values={"level_dbm": np.arange(5.0)})
+    for ranks in ([], [one, two], [two, one]):
+        whole = export.rank_frame(ranks).to_csv(index=False, lineterminator="\n")
+        assert "".join(export.rank_csv(ranks)) == whole
+
+
 def test_relative_times_are_no_times_of_day(report_data):
     panel = report_data.rss[0]
     start = panel.time[0] - np.datetime64("1969-12-31T23:57:00", "ns")

@@ -356,13 +356,13 @@ def test_a_planted_fault_is_seen(name, fault, data, frames, tmp_path, monkeypatc
         checked(name, tmp_path, frames, data)
 
 
-def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path):
+def test_netcdf_passes_the_checker_of_the_conventions_it_claims(data, tmp_path, cf_faults):
     write.write_exports(samples.of_report(data), tmp_path, ["netcdf"])
     assert cf_faults(tmp_path / "exports" / "rss.nc") == []
     assert cf_faults(tmp_path / "exports" / "rank.nc") == []
 
 
-def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path):
+def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path, cf_faults):
     export = samples.of_report(data)
     rss, rank = export.sets
     wrong = [dataclasses.replace(c, unit="decibels of something") for c in rss.columns]
@@ -371,38 +371,10 @@ def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path)
     assert any("decibels" in text for text in cf_faults(tmp_path / "exports" / "rss.nc"))
 
 
-def cf_faults(path):
-    """What compliance-checker has against a file, at the version that the file claims."""
-    import netCDF4
-
-    pytest.importorskip("compliance_checker")
-    from compliance_checker.runner import CheckSuite
-
-    with netCDF4.Dataset(path) as book:
-        version = book.Conventions.removeprefix("CF-")
-    suite = CheckSuite()
-    suite.load_all_available_checkers()
-    book = suite.load_dataset(str(path))
-    scores = suite.run_all(book, [f"cf:{version}"], skip_checks=[])
-    book.close()
-    found, errors = scores[f"cf:{version}"]
-    assert not errors
-    return [text for group in found for text in messages(group)]
-
-
-def messages(result):
-    """Of every result that did not get all its points."""
-    if result.children:
-        return [text for child in result.children for text in messages(child)]
-    value = result.value
-    full = value[0] == value[1] if isinstance(value, tuple) else bool(value)
-    return [] if full else list(result.msgs or [f"{result.name}: {value}"])
-
-
 # --- what else may happen --------------------------------------------------------------------------------------------
 
 
-def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch):
+def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch, cf_faults):
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     epoch = np.datetime64(0, "ns")
 

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ...common.cf import CONVENTIONS, WGS84, write_text
 from ...common.units import AnyArray
 from .samples import Column, Export, SampleSet, Series, latitude_longitude
 
-CONVENTIONS = "CF-1.11"
 NO_CODE = -1
 """Stands for a missing code; attribute ``_FillValue``."""
 
@@ -75,31 +75,6 @@ def _labels(book: Any, samples: SampleSet) -> None:
     rows[:] = [len(s) for s in samples.series]
 
 
-def write_text(book: Any, name: str, dimensions: tuple[str, ...], values: AnyArray, meaning: str) -> None:
-    """Text as characters, which every reader of CF takes.
-
-    Parameters
-    ----------
-    book : netCDF4.Dataset
-    name : str
-        Of the variable.
-    dimensions : tuple of str
-    values : (...)
-        Turned into text.
-    meaning : str
-        ``long_name``.
-    """
-    encoded = [str(value).encode("utf-8") for value in values.ravel()]
-    width = max([1, *map(len, encoded)])
-    length = f"{name}_length"
-    book.createDimension(length, width)
-    variable = book.createVariable(name, "S1", (*dimensions, length))
-    variable.setncatts({"long_name": meaning, "_Encoding": "utf-8"})
-    variable.set_auto_chartostring(False)
-    table = np.frombuffer(b"".join(text.ljust(width, b"\0") for text in encoded), dtype="S1")
-    variable[:] = table.reshape(*values.shape, width)
-
-
 def _joined(samples: SampleSet, part: Any) -> AnyArray:
     return np.concatenate([np.asarray(part(series)) for series in samples.series])
 
@@ -144,19 +119,7 @@ def _write_places(book: Any, export: Export, samples: SampleSet) -> None:
         if axis:
             variable.axis = axis
     crs = book.createVariable("crs", "i4")
-    crs.setncatts(
-        {
-            "grid_mapping_name": "latitude_longitude",
-            "geographic_crs_name": "WGS 84",
-            "horizontal_datum_name": "World Geodetic System 1984",
-            "reference_ellipsoid_name": "WGS 84",
-            "semi_major_axis": 6378137.0,
-            "inverse_flattening": 298.257223563,
-            "longitude_of_prime_meridian": 0.0,
-            "prime_meridian_name": "Greenwich",
-            "long_name": "coordinate reference system",
-        }
-    )
+    crs.setncatts(WGS84)
     crs[...] = 0
 
 

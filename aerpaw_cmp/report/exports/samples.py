@@ -12,6 +12,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ...common.cf import DB, DBM
 from ...common.errors import one_line
 from ...common.geodesy import SiteFrame
 from ...common.units import AnyArray, FloatArray
@@ -25,9 +26,6 @@ DECIMALS = 4
 """As in rss.csv and rank.csv."""
 DEGREE_DECIMALS = 8
 """1 mm."""
-
-DBM, DB = "0.1 lg(re 1 mW)", "0.1 lg(re 1)"
-"""dBm and dB as UDUNITS has them."""
 
 RANK_FLAGS = ("out_of_coverage", "rank_1", "rank_2", "rank_3", "rank_4")
 """Meanings of 0 to 4 in a simulated rank."""

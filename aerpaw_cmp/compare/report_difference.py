@@ -1,0 +1,272 @@
+"""Two reports of one flight on the samples that both have: what moved, and how well a change of error is known.
+
+Everywhere the first report is subtracted from the second: a negative difference of an error says that the second is
+better. Errors of both share the measurement and most of the model, so they are compared in pairs.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..common.units import FloatArray, IntArray
+from .rank import MAX_RANK, agreement, cohen_kappa, kappa_parts
+from .statistics import (
+    NO_INTERVAL,
+    REPLICATES,
+    SEED,
+    Interval,
+    PairedDifference,
+    autocorrelation,
+    bootstrap_means,
+    interval,
+    paired_difference,
+)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Changed:
+    """A number before and after: ``difference`` is second minus first; its 95 % interval is NaN where none is given."""
+
+    first: float
+    second: float
+    difference: float
+    ci95: Interval = NO_INTERVAL
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Overlap:
+    """Samples of the first report, of the second, in both, and in one only."""
+
+    first: int
+    second: int
+    common: int
+
+    @property
+    def only_first(self) -> int:
+        """Samples that the second report has not."""
+        return self.first - self.common
+
+    @property
+    def only_second(self) -> int:
+        """Samples that the first report has not."""
+        return self.second - self.common
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelDifference:
+    """RSS of one tower and channel.
+
+    Parameters
+    ----------
+    tower, channel : str
+    samples : Overlap
+    scored : Overlap
+        Of them those with a residual.
+    measured_max_db, simulated_max_db, simulated_rms_db : float
+        Largest and root mean square difference of the levels on common samples [dB]; NaN without one.
+    offset_db : Changed
+        Fitted offset as reported.
+    rmse : PairedDifference
+        On common scored samples, each report with its own best offset on them; first minus second of that record is
+        second minus first report.
+    mae_db : Changed
+        Mean absolute error about the same offsets.
+    """
+
+    tower: str
+    channel: str
+    samples: Overlap
+    scored: Overlap
+    measured_max_db: float
+    simulated_max_db: float
+    simulated_rms_db: float
+    offset_db: Changed
+    rmse: PairedDifference
+    mae_db: Changed
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankDifference:
+    """Rank of one tower and K: ``n_changed`` simulated and ``n_reported_changed`` reported ranks on common samples."""
+
+    tower: str
+    k: str
+    samples: Overlap
+    n_changed: int
+    n_reported_changed: int
+    agreement: Changed
+    kappa: Changed
+
+
+def level_difference(
+    tower: str,
+    channel: str,
+    samples: Overlap,
+    first: tuple[FloatArray, FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray, FloatArray],
+    *,
+    scored: tuple[int, int],
+    offsets_db: tuple[float, float],
+    replicates: int = REPLICATES,
+) -> LevelDifference:
+    """Compare one link.
+
+    Parameters
+    ----------
+    tower, channel : str
+    samples : Overlap
+    first, second : tuple of three (n,)
+        Level measured (without offset), replayed, and residual of each report on the common samples in time order [dB].
+    scored : (int, int)
+        Samples with a residual in each whole report.
+    offsets_db : (float, float)
+        Fitted offset of each [dB].
+    replicates : int
+        Of the bootstrap.
+    """
+    moved = _apart(first[1], second[1])
+    both = np.isfinite(first[2]) & np.isfinite(second[2])
+    one, two = first[2][both], second[2][both]
+    return LevelDifference(
+        tower=tower,
+        channel=channel,
+        samples=samples,
+        scored=Overlap(first=scored[0], second=scored[1], common=int(both.sum())),
+        measured_max_db=_largest(_apart(first[0], second[0])),
+        simulated_max_db=_largest(moved),
+        simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
+        offset_db=_changed(*offsets_db),
+        rmse=paired_difference(two, one, replicates=replicates),
+        mae_db=mae_difference(one, two, replicates=replicates),
+    )
+
+
+def _apart(one: FloatArray, two: FloatArray) -> FloatArray:
+    """Differences where both sides have a value."""
+    both = np.isfinite(one) & np.isfinite(two)
+    return np.asarray(two[both] - one[both], dtype=np.float64)
+
+
+def _largest(values: FloatArray) -> float:
+    return float(np.abs(values).max()) if len(values) else float("nan")
+
+
+def _changed(first: float, second: float) -> Changed:
+    return Changed(first=first, second=second, difference=second - first)
+
+
+def mae_difference(
+    error_db: FloatArray, other_db: FloatArray, *, replicates: int = REPLICATES, seed: int = SEED
+) -> Changed:
+    """Difference of the mean absolute errors about each one's mean, with a 95 % interval by block bootstrap.
+
+    Parameters
+    ----------
+    error_db, other_db : (n,)
+        Errors of the first and of the second model on the same samples in time order, without NaN [dB].
+    replicates, seed : int
+        Of the bootstrap.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> mae_difference(np.array([1.0, -1.0]), np.array([3.0, -3.0])).difference
+    2.0
+    """
+    if not len(error_db):
+        nan = float("nan")
+        return Changed(first=nan, second=nan, difference=nan)
+    one, two = np.abs(error_db - error_db.mean()), np.abs(other_db - other_db.mean())
+    loss = two - one
+    estimate = float(loss.mean())
+    known = autocorrelation(loss)
+    drawn = bootstrap_means(loss[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
+    bounds = interval(estimate, drawn, known)
+    return Changed(first=float(one.mean()), second=float(two.mean()), difference=estimate, ci95=bounds)
+
+
+def pooled_difference(residuals: Sequence[tuple[FloatArray, FloatArray]]) -> PairedDifference:
+    """RMSE of the second report against the first over all links, each link about its own offset.
+
+    Parameters
+    ----------
+    residuals : sequence of two (n,)
+        Residuals of both reports on the common samples of each link, in time order [dB]; NaN takes no part.
+    """
+    one, two = [np.zeros(0)], [np.zeros(0)]
+    for first, second in residuals:
+        both = np.isfinite(first) & np.isfinite(second)
+        if both.any():
+            one.append(first[both] - first[both].mean())
+            two.append(second[both] - second[both].mean())
+    return paired_difference(np.concatenate(two), np.concatenate(one), free_offset=False)
+
+
+def rank_difference(
+    tower: str,
+    k: str,
+    samples: Overlap,
+    first: tuple[FloatArray, FloatArray],
+    second: tuple[FloatArray, FloatArray],
+    *,
+    replicates: int = REPLICATES,
+    seed: int = SEED,
+) -> RankDifference:
+    """Compare the rank of one tower at one K.
+
+    Parameters
+    ----------
+    tower, k : str
+    samples : Overlap
+    first, second : tuple of two (n,)
+        Reported and simulated rank of each report on the common samples in time order; NaN: none, 0: no path.
+    replicates, seed : int
+        Of the bootstrap.
+    """
+    pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
+    usable = np.column_stack([*pairs])
+    both = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
+    one, two = (pair[both].astype(np.int64) for pair in pairs)
+    agree, kappa = _agreement_change(one, two, replicates, seed)
+    return RankDifference(
+        tower=tower,
+        k=k,
+        samples=samples,
+        n_changed=int((pairs[0][:, 1] != pairs[1][:, 1]).sum()),
+        n_reported_changed=int((pairs[0][:, 0] != pairs[1][:, 0]).sum()),
+        agreement=agree,
+        kappa=kappa,
+    )
+
+
+def _agreement_change(one: IntArray, two: IntArray, replicates: int, seed: int) -> tuple[Changed, Changed]:
+    """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
+    agree = [agreement(*pairs.T) for pairs in (one, two)]
+    kappa = [cohen_kappa(*pairs.T) for pairs in (one, two)]
+    if len(one) < 2:
+        return _changed(*agree), _changed(*kappa)
+    parts = [kappa_parts(*pairs.T) for pairs in (one, two)]
+    width = parts[0].columns.shape[1]
+    columns = np.column_stack([part.columns for part in parts])
+
+    def bounds(influence: FloatArray, change: float, statistic: int) -> Interval:
+        known = autocorrelation(influence)
+        drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
+        of = [p.kappa(drawn[:, i * width : (i + 1) * width]) if statistic else drawn[:, i * width]
+              for i, p in enumerate(parts)]  # fmt: skip
+        return interval(change, of[1] - of[0], known)
+
+    shift, turn = agree[1] - agree[0], kappa[1] - kappa[0]
+    return (
+        Changed(
+            first=agree[0], second=agree[1], difference=shift,
+            ci95=bounds(parts[1].columns[:, 0] - parts[0].columns[:, 0], shift, 0),
+        ),
+        Changed(
+            first=kappa[0], second=kappa[1], difference=turn,
+            ci95=bounds(parts[1].influence - parts[0].influence, turn, 1),
+        ),
+    )  # fmt: skip

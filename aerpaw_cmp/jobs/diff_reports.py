@@ -1,0 +1,400 @@
+"""``aerpaw-cmp diff``: two reports of one flight, read back from their folders and compared on common samples."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import InputError, UsageError, one_line
+from ..common.outputs import OutputFolder, changed_files
+from ..common.units import FloatArray
+from ..compare.report_difference import (
+    LevelDifference,
+    Overlap,
+    RankDifference,
+    level_difference,
+    pooled_difference,
+    rank_difference,
+)
+from ..report.diff_data import Entry, InputEntry, ReportDiff, ReportSide
+from ..report.names import RANK_COLUMNS, RSS_COLUMNS
+
+TOLERANCE_DB = 0.01
+"""Differences up to this count as none: the tables hold four decimals, offsets one."""
+
+_NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank", "stages")
+_SIMULATED = "simulated_rank_k"
+_VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings", "speed", "title", "flight")
+"""What changes without meaning anything, or is compared on its own."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ReadReport:
+    """A report as it lies on the disk: metrics.json, and the tables where there are any."""
+
+    place: Path
+    files: tuple[Path, ...]
+    metrics: dict[str, Any]
+    rss: Any
+    rank: Any
+    remarks: tuple[str, ...]
+
+
+def run_diff(
+    first: Path, second: Path, *, out: Path | None = None, tolerance_db: float = TOLERANCE_DB, force: bool = False
+) -> ReportDiff:
+    """Compare two reports; with ``out`` also write ``diff.html`` and ``diff.json`` there.
+
+    Parameters
+    ----------
+    first, second : Path
+        Folders of reports, or their metrics.json (then without samples).
+    out : Path, optional
+        Folder of the results.
+    tolerance_db : float
+        Differences of levels, offsets and errors up to it count as none.
+    force : bool
+        Write into a folder that holds files of others.
+
+    Raises
+    ------
+    UsageError
+        Reports of different flights; a negative tolerance.
+    InputError
+        What is no report, is of an older version, or is damaged.
+    """
+    if not tolerance_db >= 0:
+        raise UsageError(f"a tolerance of {tolerance_db} dB", expected="0 or more")
+    one, two = read_report(first), read_report(second)
+    _same_flight(one, two)
+    if out is None:
+        return compare_reports(one, two, tolerance_db)
+    from ..report.diff_html import write_diff
+
+    with OutputFolder(out, job="diff", inputs=[*one.files, *two.files], force=force) as output:
+        diff = compare_reports(one, two, tolerance_db)
+        with output.filling() as place:
+            write_diff(diff, place)
+    return diff
+
+
+# --- reading --------------------------------------------------------------------------------------------------------
+
+
+def read_report(place: Path) -> ReadReport:
+    """Read what a report wrote.
+
+    Raises
+    ------
+    InputError
+        With what was found, what was expected, and the likely cause.
+    """
+    folder = place if place.is_dir() else None
+    file = place / "metrics.json" if folder else place
+    metrics = _metrics(file, place)
+    remarks = []
+    tables: dict[str, Any] = {"rss": None, "rank": None}
+    files = [file]
+    if folder is not None:
+        for kind, columns in (("rss", RSS_COLUMNS), ("rank", RANK_COLUMNS)):
+            files.append(folder / f"{kind}.csv")
+            tables[kind] = _table(files[-1], kind, columns)
+        changed = [name for name in changed_files(folder) if name in ("metrics.json", "rss.csv", "rank.csv")]
+        remarks = [f"{folder / name} was changed after the report wrote it." for name in changed]
+        remarks += _against_metrics(metrics, tables["rss"], folder)
+    else:
+        remarks.append(f"{file}: no samples beside it were asked for; only the reported numbers are compared.")
+    return ReadReport(
+        place=place, files=tuple(files), metrics=metrics, remarks=tuple(remarks), rss=tables["rss"], rank=tables["rank"]
+    )
+
+
+def _metrics(file: Path, named: Path) -> dict[str, Any]:
+    try:
+        content = json.loads(file.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        other = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
+        raise InputError(
+            "there is no metrics.json" if named.is_dir() else "there is no such file or folder",
+            expected="the folder of a report, or its metrics.json",
+            cause=None if other is None else f"the folder holds {other}: only reports of a flight can be compared",
+            path=named,
+        ) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path=file) from error
+    except ValueError as error:
+        raise InputError(
+            f"is no JSON ({one_line(str(error))})", expected="metrics.json of a report", cause="a torn copy", path=file
+        ) from None
+    if not isinstance(content, dict):
+        raise InputError("is no metrics.json", expected="one JSON object", path=file)
+    missing = [key for key in _NEEDED if key not in content]
+    if "rss" in missing or "rank" in missing or "flight" in missing:
+        kind = "a map" if "grid" in content else "a calibration" if "scores" in content else "no report"
+        raise InputError(
+            f"holds the numbers of {kind}" if kind != "no report" else f"has no {', '.join(map(repr, missing))}",
+            expected="metrics.json of `aerpaw-cmp report`",
+            path=file,
+        )
+    wrong = [k for k in ("rss", "rank") if not isinstance(content[k], dict)]
+    if missing or wrong:
+        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is no mapping"
+        made = (content.get("versions") or {}).get("aerpaw-cmp", "unknown")
+        raise InputError(
+            found, expected="a report of this version", cause=f"made by version {made}: run the report again", path=file
+        )
+    return content
+
+
+def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
+    """A table of samples; every fault of it names its line."""
+    import pandas as pd
+
+    try:
+        with path.open("rb") as stream:
+            stream.seek(0, 2)
+            size = stream.tell()
+            stream.seek(max(0, size - 1))
+            whole = size == 0 or stream.read() == b"\n"
+        if not size:
+            raise InputError("is empty", expected="a header at least", cause="a torn copy", path=path)
+        texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
+        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], encoding="utf-8")
+    except FileNotFoundError:
+        raise InputError("there is no such table", expected=f"{kind}.csv beside metrics.json", path=path) from None
+    except OSError as error:
+        raise InputError(f"cannot be read ({error.strerror})", path=path) from error
+    except (ValueError, UnicodeError) as error:  # pandas' parser errors are ValueErrors
+        raise InputError(f"is no table ({one_line(str(error))})", cause="a damaged or edited file", path=path) from None
+    lines = len(table) + 1
+    if not whole:
+        raise InputError("the last line does not end", cause="a torn copy", path=path, line=lines)
+    missing = [name for name in columns if name not in table.columns]
+    if missing:
+        raise InputError(
+            f"has no column {missing[0]!r}", expected=f"the columns of {kind}.csv", cause="an older version", path=path
+        )
+    for name in table.columns:
+        if name in texts:
+            continue
+        if not pd.api.types.is_numeric_dtype(table[name]) and len(table):
+            bad = pd.to_numeric(table[name], errors="coerce").isna() & table[name].notna()
+            row = int(np.flatnonzero(bad.to_numpy())[0]) if bad.any() else 0
+            found = one_line(str(table[name].iloc[row]))
+            raise InputError(f"column {name!r}: {found!r}", expected="a number", path=path, line=row + 2)
+    torn = table["tower"].isna() | table["time_s"].isna()
+    if torn.any():
+        row = int(np.flatnonzero(torn.to_numpy())[0])
+        raise InputError("a row without a tower or a time", cause="a torn line", path=path, line=row + 2)
+    text = [name for name in texts if name in table]
+    table[text] = table[text].fillna("")
+    return table
+
+
+def _against_metrics(metrics: Mapping[str, Any], rss: Any, folder: Path) -> list[str]:
+    """Links whose table does not have the samples that metrics.json counts."""
+    wrong = []
+    scored = rss["residual_db"].notna().groupby([rss["tower"], rss["channel"]]).sum() if len(rss) else {}
+    for tower, channels in metrics["rss"].items():
+        for channel, numbers in channels.items():
+            n = int(scored.get((tower, channel), 0))
+            if n != numbers.get("n"):
+                wrong.append(f"{tower} {channel} ({n} against {numbers.get('n')})")
+    if not wrong:
+        return []
+    return [f"{folder}: rss.csv and metrics.json do not have the same number of scored samples: {', '.join(wrong)}."]
+
+
+def _same_flight(one: ReadReport, two: ReadReport) -> None:
+    """UsageError for reports that have neither name nor log in common."""
+    names = [side.metrics["flight"] for side in (one, two)]
+    logs = [{i.get("sha256") for i in side.metrics["inputs"] if i.get("reader")} for side in (one, two)]
+    if names[0] != names[1] and not logs[0] & logs[1]:
+        raise UsageError(
+            f"reports of different flights: {one_line(str(names[0]))} and {one_line(str(names[1]))}, without a log "
+            "in common",
+            expected="two reports of one flight (campaign compares flights)",
+            path=two.place,
+        )
+
+
+# --- comparing ------------------------------------------------------------------------------------------------------
+
+
+def compare_reports(one: ReadReport, two: ReadReport, tolerance_db: float = TOLERANCE_DB) -> ReportDiff:
+    """Everything that differs between two reports."""
+    levels, residuals = _levels(one, two)
+    first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (one, two))
+    alone = [sorted(_links(a) - _links(b)) for a, b in ((one, two), (two, one))]
+    return ReportDiff(
+        first=_side(one),
+        second=_side(two),
+        settings=tuple(_entries(one.metrics["settings"], two.metrics["settings"])),
+        inputs=tuple(_inputs(one.metrics["inputs"], two.metrics["inputs"])),
+        versions=tuple(_entries(one.metrics["versions"], two.metrics["versions"])),
+        stages=tuple(_stages(one.metrics["stages"], two.metrics["stages"])),
+        numbers=tuple(_numbers(one.metrics, two.metrics, tolerance_db)),
+        levels=tuple(levels),
+        ranks=tuple(_ranks(one, two)),
+        pooled=pooled_difference(residuals) if residuals else None,
+        new_warnings=tuple(text for text in second_warnings if text not in first_warnings),
+        gone_warnings=tuple(text for text in first_warnings if text not in second_warnings),
+        links_first_only=tuple(alone[0]),
+        links_second_only=tuple(alone[1]),
+        tolerance_db=tolerance_db,
+        remarks=(*one.remarks, *two.remarks),
+    )
+
+
+def _side(side: ReadReport) -> ReportSide:
+    m = side.metrics
+    return ReportSide(
+        folder=str(side.place),
+        flight=str(m["flight"]),
+        generated=str(m.get("generated", "")),
+        version=f"aerpaw-cmp {m['versions'].get('aerpaw-cmp', 'unknown')}",
+    )
+
+
+def _links(side: ReadReport) -> set[str]:
+    rss = {f"{tower} {channel}".strip() for tower, channels in side.metrics["rss"].items() for channel in channels}
+    return rss | {f"{tower} rank" for tower in side.metrics["rank"]}
+
+
+def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
+    """Dotted keys and plain values of nested settings; entries of a list by their number."""
+    if isinstance(value, Mapping) and value:
+        for name, item in value.items():
+            yield from flat(item, f"{key}.{name}" if key else str(name))
+    elif isinstance(value, list) and value and any(isinstance(item, (Mapping, list)) for item in value):
+        for index, item in enumerate(value):
+            yield from flat(item, f"{key}.{index}")
+    else:
+        yield key, value
+
+
+def _entries(first: Any, second: Any) -> Iterator[Entry]:
+    """Keys whose values differ."""
+    one, two = dict(flat(first)), dict(flat(second))
+    for key in [*one, *(key for key in two if key not in one)]:
+        if (key in one) != (key in two) or one[key] != two[key]:
+            yield Entry(key=key, first=one.get(key), second=two.get(key))
+
+
+def _stages(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[Entry]:
+    for key in dict.fromkeys([*first, *second]):
+        yield Entry(key=key.removesuffix("_s"), first=first.get(key), second=second.get(key))
+
+
+def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
+    """Files that were added, removed or changed; one that lies elsewhere with the same content is the same."""
+    one, two = ({(i.get("role", ""), i["path"]): i for i in side} for side in (first, second))
+    for key in dict.fromkeys([*one, *two]):
+        a, b = one.get(key), two.get(key)
+        if a is not None and b is not None and a.get("sha256") == b.get("sha256"):
+            continue
+        here = a or b or {}
+        if a is None or b is None:
+            others = first if a is None else second
+            if any(i.get("sha256") == here.get("sha256") and i.get("role") == here.get("role") for i in others):
+                continue
+        yield InputEntry(
+            role=key[0],
+            path=key[1],
+            what="added" if a is None else "removed" if b is None else "changed",
+            first_sha256=None if a is None else a.get("sha256"),
+            second_sha256=None if b is None else b.get("sha256"),
+            first_lines=None if a is None else a.get("lines"),
+            second_lines=None if b is None else b.get("lines"),
+        )
+
+
+def _numbers(first: Mapping[str, Any], second: Mapping[str, Any], tolerance_db: float) -> Iterator[Entry]:
+    """Reported numbers that differ by more than the tolerance; words, and numbers of time, take no part."""
+    one, two = (dict(flat({k: v for k, v in side.items() if k not in _VOLATILE})) for side in (first, second))
+    for key in dict.fromkeys([*one, *two]):
+        a, b = one.get(key), two.get(key)
+        if "seconds" in key or ((key in one) != (key in two) and (a is None and b is None)):
+            continue
+        if _apart(a, b, tolerance_db):
+            yield Entry(key=key, first=a, second=b)
+
+
+def _apart(a: Any, b: Any, tolerance: float) -> bool:
+    if isinstance(a, list) and isinstance(b, list) and len(a) == len(b):
+        return any(_apart(x, y, tolerance) for x, y in zip(a, b, strict=True))
+    if isinstance(a, str) or isinstance(b, str):
+        return False
+    if isinstance(a, (int, float)) and isinstance(b, (int, float)):
+        # counts and shares: beyond rounding; what is large by its own size
+        return not math.isclose(a, b, rel_tol=1e-6, abs_tol=tolerance if not isinstance(a, int) else 0)
+    return bool(a != b)
+
+
+# --- samples --------------------------------------------------------------------------------------------------------
+
+
+def _matched(one: Any, two: Any) -> tuple[Overlap, Any, Any]:
+    """Rows of two tables of one link at the same instant, in time order; several at one instant in their order."""
+
+    def keyed(table: Any) -> Any:
+        # without times of day the seconds after the first sample say when
+        instant = table["time_utc"].where(table["time_utc"] != "", table["time_s"].map("{:.4f}".format))
+        return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
+
+    first, second = keyed(one), keyed(two)
+    if first.index.equals(second.index):
+        return Overlap(first=len(first), second=len(second), common=len(first)), first, second
+    common = first.index.intersection(second.index, sort=False)
+    overlap = Overlap(first=len(first), second=len(second), common=len(common))
+    return overlap, first.loc[common], second.loc[common]
+
+
+def _values(table: Any, name: str) -> FloatArray:
+    return np.asarray(table[name], dtype=np.float64)
+
+
+def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[tuple[FloatArray, FloatArray]]]:
+    """Each link that both have, and the residuals of its common samples."""
+    found: list[LevelDifference] = []
+    residuals: list[tuple[FloatArray, FloatArray]] = []
+    if one.rss is None or two.rss is None:
+        return found, residuals
+    names = ("measured_db", "simulated_dbm", "residual_db")
+    for tower, channels in one.metrics["rss"].items():
+        for channel, numbers in channels.items():
+            other = two.metrics["rss"].get(tower, {}).get(channel)
+            if other is None:
+                continue
+            tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (one, two)]
+            overlap, a, b = _matched(*tables)
+            first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
+            offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
+            scored = [int(table["residual_db"].notna().sum()) for table in tables]
+            residuals.append((first[2], second[2]))
+            found.append(
+                level_difference(
+                    tower, channel, overlap, first, second,
+                    scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
+                )
+            )  # fmt: skip
+    return found, residuals
+
+
+def _ranks(one: ReadReport, two: ReadReport) -> Iterator[RankDifference]:
+    if one.rank is None or two.rank is None:
+        return
+    ks = [c.removeprefix(_SIMULATED) for c in one.rank.columns if c.startswith(_SIMULATED) and c in two.rank.columns]
+    for tower in one.metrics["rank"]:
+        if tower not in two.metrics["rank"]:
+            continue
+        overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (one, two)))
+        for k in ks:
+            pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
+            yield rank_difference(tower, k, overlap, pairs[0], pairs[1])

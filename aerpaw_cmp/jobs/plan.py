@@ -1,0 +1,284 @@
+"""What a command would do and about how long it would take: ``report --dry-run`` and ``map --dry-run``.
+
+The replay is timed: a few poses of the job itself, on this machine, now. Stages that cannot be tried in a second are
+:data:`MEASURED` CPU seconds per unit of work on the sample flight and site, times what this machine needs for a small
+replay of that site. ``python benchmarks/estimate.py`` measures both again and compares plans with runs.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.outputs import OutputFolder
+from ..common.stages import Stages
+from ..flight.data import FlightData
+from ..flight.settings import FlightFile
+from ..propagation.arrays import Link, Poses, single_element
+from ..propagation.tracer import replay
+from ..site.siteyaml import load_site
+
+MEASURED = {
+    "imports": 2.5,
+    "clocks, per receiver": 0.95,
+    "compare, per RSS sample": 0.08e-3,
+    "compare, per rank sample": 0.2e-3,
+    "ladder, replays of the RSS": 2.5,
+    "audit": 9.0,
+    "audit, per link": 0.02,
+    "speed": 6.0,
+    "page": 0.6,
+    "figures": 2.0,
+    "figures, per channel": 0.61,
+    "study, per position": 5.8e-3,
+    "export, per layer and position": 0.02e-3,
+    "map pages": 4.0,
+}
+"""CPU seconds, measured on the sample flight and the packaged site by ``benchmarks/estimate.py``."""
+
+PROBE_S = 0.024
+"""CPU seconds of :func:`probe` on that machine."""
+
+MEASURED_ON = "2026-11-21, one core of an AMD EPYC, Python 3.11"
+TRIED_POSES = (32, 160)
+"""Of the two replays that a time is extrapolated from."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlannedStage:
+    """A stage: what it works on, and CPU seconds, None where they cannot be told beforehand."""
+
+    name: str
+    work: str
+    seconds: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What a command would do.
+
+    Parameters
+    ----------
+    job : str
+    inputs : tuple of Path
+        Files that would be read.
+    output : Path
+        What would be written; it was looked at and would be taken.
+    stages : tuple of PlannedStage
+    measured : str
+        Where the seconds come from.
+    """
+
+    job: str
+    inputs: tuple[Path, ...]
+    output: Path
+    stages: tuple[PlannedStage, ...]
+    measured: str
+
+    @property
+    def seconds(self) -> float:
+        """CPU seconds of all stages that can be told."""
+        return sum(stage.seconds or 0.0 for stage in self.stages)
+
+    def as_dict(self) -> dict[str, Any]:
+        """The plan as JSON can hold it."""
+        return {
+            "job": self.job,
+            "inputs": [str(path) for path in self.inputs],
+            "output": str(self.output),
+            "stages": [dataclasses.asdict(stage) for stage in self.stages],
+            "seconds": self.seconds,
+            "not_estimated": [stage.name for stage in self.stages if stage.seconds is None],
+            "measured": self.measured,
+        }
+
+
+def probe() -> float:
+    """CPU seconds of a small replay of the packaged site: how fast this machine is."""
+    site = load_site("lake_wheeler")
+    link = Link(3.3e9, {"LW1": single_element()}, single_element())
+    line = np.linspace(50.0, 400.0, 200)
+    poses = Poses(np.column_stack([line, 0.3 * line, np.full(200, 40.0)]), np.tile(np.eye(3), (200, 1, 1)))
+    return min(_cpu_seconds(lambda: replay(site, link, poses, max_depth=2)) for _ in range(5))
+
+
+def _cpu_seconds(work: Any) -> float:
+    start = time.process_time()
+    work()
+    return time.process_time() - start
+
+
+def _measured_text(factor: float) -> str:
+    return (
+        f"CPU seconds: the replay tried on a few poses now, the rest as measured {MEASURED_ON}, times {factor:.2g} "
+        "for this machine; a loaded machine takes longer"
+    )
+
+
+def report_plan(
+    settings: FlightFile,
+    flight: Path,
+    *,
+    inputs: list[Path],
+    out: Path,
+    logs_root: Path | None = None,
+    figures: str = "page",
+    force: bool = False,
+) -> Plan:
+    """Stages, links, poses and time of a report; reads the logs and writes nothing.
+
+    Parameters
+    ----------
+    settings : FlightFile
+        With what the command line says instead.
+    flight : Path
+    inputs : list of Path
+        Files that the flight names.
+    out : Path
+        Folder of the results.
+    logs_root : Path, optional
+    figures : str
+        As for the report.
+    force : bool
+
+    Raises
+    ------
+    UsageError, InputError
+        What the report itself would raise of its settings, logs and output.
+    """
+    from ..flight.data import gather, read_logs
+
+    OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
+    start = time.process_time()
+    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    reading = time.process_time() - start
+    factor = probe() / PROBE_S
+    cost = {name: seconds * factor for name, seconds in MEASURED.items()}
+    n_rss, n_rank = (sum(len(one.time) for one in series) for series in (data.rss, data.rank))
+    rss, rank = _tried_replays(data)
+    rt = settings.rt
+    stages = [
+        PlannedStage(name="imports", work="libraries", seconds=cost["imports"]),
+        PlannedStage(name="read", work=f"{len(inputs)} files", seconds=reading),
+    ]
+    if n_rss and settings.rss.lag in ("estimate", "apply"):
+        towers = len({series.tower for series in data.rss})
+        seconds = towers * cost["clocks, per receiver"]
+        stages.append(PlannedStage(name="clocks", work=f"{towers} receivers", seconds=seconds))
+    stages += [*rss, *rank]
+    seconds = n_rss * cost["compare, per RSS sample"] + n_rank * cost["compare, per rank sample"]
+    stages.append(PlannedStage(name="compare", work=f"{n_rss} RSS and {n_rank} rank samples", seconds=seconds))
+    if audited := rt.audit_links > 0 and settings.report.audit == "now":
+        links = min(rt.audit_links, n_rss + n_rank)
+        seconds = cost["audit"] + links * cost["audit, per link"]
+        stages.append(PlannedStage(name="audit", work=f"{links} links by the other engine", seconds=seconds))
+    if n_rss and rt.engine == "image":
+        told = [stage.seconds for stage in rss if stage.seconds is not None]
+        seconds = MEASURED["ladder, replays of the RSS"] * sum(told)
+        stages.append(PlannedStage(name="ladder", work="simpler and richer models", seconds=seconds))
+    if audited and settings.report.speed_table:
+        stages.append(PlannedStage(name="speed", work="table of speed against error", seconds=cost["speed"]))
+    drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
+    drawing = (cost["figures"] + drawn * cost["figures, per channel"]) * (3.0 if figures == "all" else 1.0)
+    seconds = cost["page"] + (drawing if drawn else 0.0)
+    stages.append(PlannedStage(name="report", work=f"page, figures of {drawn} channels", seconds=seconds))
+    return Plan(job="report", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))
+
+
+def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedStage]]:
+    """A stage per replayed RSS link and per rank series, timed on a few of their poses."""
+    from ..flight.data import rank_positions
+    from .replay import attitude_rotation
+
+    groups: dict[tuple[str, str], list[Any]] = {}
+    for series in data.rss:
+        groups.setdefault((series.tower, series.settings_key), []).append(series)
+    rss, rank, attitude = [], [], data.settings.rt.attitude
+    for (tower, _), members in groups.items():
+        assert data.track is not None
+        track = data.track.pose_at(np.concatenate([series.time for series in members]))
+        poses = Poses(track.position_m[track.valid], attitude_rotation(track, attitude)[track.valid])
+        name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
+        rss.append(_tried(data, name, members[0].link.build([tower], data.folder), poses))
+    for one in data.rank:
+        position, valid = rank_positions(one, data.track)
+        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
+        link = data.settings.link.rank.build([one.tower], data.folder)
+        rank.append(_tried(data, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
+    return rss, rank
+
+
+def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStage:
+    """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
+    from .replay import replay_poses
+
+    work, n = f"{len(poses)} poses, engine {data.settings.rt.engine}", len(poses)
+    if data.settings.rt.engine != "image" or n == 0:
+        return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
+
+    def tried(count: int) -> float:
+        few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
+        some = Poses(poses.position_m[few], np.ascontiguousarray(poses.rotation[few]))
+        return _cpu_seconds(lambda: replay_poses(data.site, data.settings.rt, link, some))
+
+    few, more = TRIED_POSES
+    if n <= more:
+        return PlannedStage(name=name, work=work, seconds=tried(n))
+    small, large = tried(few), tried(more)
+    per_pose = max(large - small, 0.2 * large) / (more - few)  # a hiccup in the small one does not make poses free
+    return PlannedStage(name=name, work=work, seconds=large + per_pose * (n - more))
+
+
+def map_plan(
+    site: str, settings: Any, *, inputs: list[Path], out: Path, flight: Path | None = None, force: bool = False
+) -> Plan:
+    """Stages, links and time of a map; a coarse grid is computed for the estimate, and nothing is written.
+
+    Parameters
+    ----------
+    site : str
+        site.yaml, or the name of a packaged site.
+    settings : MapSettings
+    inputs : list of Path
+    out : Path
+        Folder of the results.
+    flight : Path, optional
+        Whose track trains the test "along a flight".
+    force : bool
+    """
+    from ..maps.grid import Grid
+    from .coverage_map import make_maps
+
+    if flight is not None and not flight.is_file():
+        raise UsageError("there is no such file", path=flight)
+    OutputFolder(out, job="map", inputs=inputs, force=force).refuse()
+    place = load_site(site)
+    positions = len(Grid.over_area(place.area_m, settings.spacing_m))
+    heights = len(set(settings.rss_altitudes_m) | set(settings.rank_altitudes_m))
+    links = positions * heights * len(place.towers)
+    factor = probe() / PROBE_S
+    cost = {name: seconds * factor for name, seconds in MEASURED.items()}
+    stages = [PlannedStage(name="imports", work="libraries", seconds=cost["imports"])]
+    for mode in settings.foliage:
+        work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
+        seconds: float | None = None
+        if settings.engine == "image":
+            coarse = dataclasses.replace(
+                settings, foliage=(mode,), spacing_m=settings.spacing_m * max(1.0, (positions / 80) ** 0.5)
+            )
+            tried = len(Grid.over_area(place.area_m, coarse.spacing_m))
+            seconds = _cpu_seconds(lambda one=coarse: make_maps(place, one, Stages())) * positions / tried
+        stages.append(PlannedStage(name=f"maps, foliage {mode}", work=work, seconds=seconds))
+    if settings.study:
+        seconds = positions * cost["study, per position"]
+        stages.append(PlannedStage(name="study", work="correlation and interpolation", seconds=seconds))
+    layers = heights * len(place.towers) * len(settings.foliage) * (1 + len(settings.ks))
+    seconds = cost["map pages"] + positions * layers * cost["export, per layer and position"]
+    stages.append(PlannedStage(name="export, page", work=f"some {layers} layers", seconds=seconds))
+    return Plan(job="map", inputs=tuple(inputs), output=out, stages=tuple(stages), measured=_measured_text(factor))

@@ -1,0 +1,82 @@
+"""diff.html and diff.json: two reports side by side, without a script."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from ..common.jsonable import fields_of, json_safe
+from .diff_data import ReportDiff, verdict
+from .export import write_file
+from .html import environment, policy
+
+
+def diff_metrics(diff: ReportDiff) -> dict[str, Any]:
+    """Everything as plain JSON: verdict, differences, and the fields of the record."""
+    safe: dict[str, Any] = json_safe(
+        {
+            "verdict": verdict(diff),
+            "differs": bool(diff.differences),
+            "differences": diff.differences,
+            **fields_of(diff),
+        }
+    )
+    return safe
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Whisker:
+    """One row of the picture: where its dot and its interval lie, in percent of the width."""
+
+    name: str
+    at: float
+    low: float
+    high: float
+    verdict: str
+
+
+def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
+    """Differences of RMSE with their intervals, and the reach of the axis on either side of zero [dB]."""
+    rows = [(f"{one.tower} {one.channel}", one.rmse) for one in diff.levels if one.rmse.n]
+    if diff.pooled is not None and len(rows) > 1:
+        rows.append(("all links", diff.pooled))
+    sizes = [abs(x) for _, p in rows for x in (p.difference_db, *p.difference_ci95_db) if x == x]  # not NaN
+    reach = max([diff.tolerance_db, *sizes]) * 1.08
+
+    def percent(value: float) -> float:
+        return 50.0 + 50.0 * value / reach
+
+    found = []
+    for name, one in rows:
+        low, high = one.difference_ci95_db
+        known = low == low
+        at = percent(one.difference_db)
+        found.append(
+            Whisker(
+                name=name,
+                at=at,
+                low=percent(low) if known else at,
+                high=percent(high) if known else at,
+                verdict=one.verdict,
+            )
+        )
+    return found, reach
+
+
+def diff_page(diff: ReportDiff) -> str:
+    """The whole page."""
+    rows, reach = whiskers(diff)
+    text: str = (
+        environment()
+        .get_template("diff.html.jinja")
+        .render(diff=diff, verdict=verdict(diff), whiskers=rows, reach=reach, content_policy=policy())
+    )
+    return text
+
+
+def write_diff(diff: ReportDiff, folder: Path) -> list[Path]:
+    """Write ``diff.html`` and ``diff.json``; gives the files, page first."""
+    numbers = json.dumps(diff_metrics(diff), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
+    return [write_file(folder / "diff.html", diff_page(diff)), write_file(folder / "diff.json", numbers)]

@@ -1,0 +1,332 @@
+"""Mutation testing of the modules that hold the physics and the readers.
+
+Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests named
+for the module run on it in a forked child, where nothing else is changed, and end at the first failure.
+A mutant that every test passes has survived; `mutation_equivalent.txt` beside this file lists, with the reason, those
+that change nothing that can be seen. Mutants are drawn at random, with a seed, since all of them would take days.
+
+    python benchmarks/mutation.py [--each 30] [--seed 1] [--only compare/offset.py] [--account FILE] [--all]
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import contextlib
+import importlib.abc
+import importlib.machinery
+import importlib.util
+import io
+import json
+import multiprocessing
+import os
+import random
+import signal
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).parents[1]
+EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
+_PHYSICS = "tests/propagation/"
+TARGETS: dict[str, tuple[str, ...]] = {
+    "aerpaw_cmp/common/units.py": (
+        "aerpaw_cmp/common/units.py", _PHYSICS + "test_channel.py", "tests/jobs/test_noise_floor.py"
+    ),
+    "aerpaw_cmp/propagation/arrays.py": (
+        "aerpaw_cmp/propagation/arrays.py", _PHYSICS + "test_channel.py", _PHYSICS + "test_attitude_chain.py",
+        _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
+    ),
+    "aerpaw_cmp/propagation/channel.py": (
+        _PHYSICS + "test_channel.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
+        _PHYSICS + "test_compiled.py",
+    ),
+    "aerpaw_cmp/propagation/foliage.py": (
+        _PHYSICS + "test_foliage.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_hard_cases.py"
+    ),
+    "aerpaw_cmp/compare/offset.py": ("aerpaw_cmp/compare/offset.py", "tests/compare/test_offset.py"),
+    "aerpaw_cmp/compare/rank.py": ("aerpaw_cmp/compare/rank.py", "tests/compare/test_rank.py"),
+    "aerpaw_cmp/flight/clock.py": ("tests/flight/test_clock.py",),
+    "aerpaw_cmp/flight/lag.py": ("tests/flight/test_lag.py", "tests/flight/test_clock.py"),
+    "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py",),
+    "parsers/aerpaw_parsers/_lines.py": ("tests/parsers/test_law.py", "tests/parsers/test_formats.py"),
+    "parsers/aerpaw_parsers/_rows.py": (
+        "tests/parsers/test_formats.py", "tests/parsers/test_base_stations.py", "tests/parsers/test_phones.py"
+    ),
+    "parsers/aerpaw_parsers/_time.py": ("tests/parsers/test_time.py", "tests/parsers/test_formats.py"),
+    "parsers/aerpaw_parsers/vehicle_out.py": ("tests/parsers/test_formats.py", "tests/parsers/test_law.py"),
+    "parsers/aerpaw_parsers/sounder_log.py": (
+        "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py", "tests/parsers/test_law.py"
+    ),
+}  # fmt: skip
+PRELOADED = (
+    "numpy", "scipy.linalg", "scipy.signal", "scipy.spatial", "scipy.optimize", "scipy.stats", "pandas", "pytest",
+    "hypothesis", "pydantic", "yaml", "shapely", "pyproj", "h5py", "mpmath", "numba",
+)  # fmt: skip
+TIMEOUT_S = 300.0
+"""Of processor time; a mutant that loops is killed."""
+
+
+@dataclass(frozen=True, slots=True)
+class Mutant:
+    """One change: the file, its line, what stood there and what stands there now; the how-manieth node and change."""
+
+    path: str
+    line: int
+    was: str
+    now: str
+    node: int
+    change: int
+
+    @property
+    def name(self) -> str:
+        """Told apart from every other mutant of the file by its words."""
+        return f"{self.path}:{self.line}: {self.was} -> {self.now}"
+
+    @property
+    def source(self) -> str:
+        """The whole changed source."""
+        tree = ast.parse((ROOT / self.path).read_text(encoding="utf-8"))
+        target = of_code(tree)[self.node]
+        _replace(tree, target, list(changes(target))[self.change])
+        return ast.unparse(ast.fix_missing_locations(tree))
+
+
+# --- the changes ----------------------------------------------------------------------------------------------------
+
+_OPERATORS: dict[type, tuple[type, ...]] = {
+    ast.Add: (ast.Sub,), ast.Sub: (ast.Add,), ast.Mult: (ast.Div,), ast.Div: (ast.Mult,), ast.Pow: (ast.Mult,),
+    ast.FloorDiv: (ast.Mult,), ast.Mod: (ast.Mult,), ast.BitAnd: (ast.BitOr,), ast.BitOr: (ast.BitAnd,),
+    ast.MatMult: (),
+}  # fmt: skip
+_COMPARISONS: dict[type, tuple[type, ...]] = {
+    ast.Lt: (ast.LtE, ast.GtE), ast.LtE: (ast.Lt, ast.Gt), ast.Gt: (ast.GtE, ast.LtE), ast.GtE: (ast.Gt, ast.Lt),
+    ast.Eq: (ast.NotEq,), ast.NotEq: (ast.Eq,), ast.Is: (ast.IsNot,), ast.IsNot: (ast.Is,), ast.In: (ast.NotIn,),
+    ast.NotIn: (ast.In,),
+}  # fmt: skip
+
+
+def changes(node: ast.AST) -> Iterator[ast.AST]:
+    """Every node that may stand in place of this one."""
+    if isinstance(node, ast.BinOp):
+        for other in _OPERATORS.get(type(node.op), ()):
+            yield ast.BinOp(node.left, other(), node.right)
+    elif isinstance(node, ast.AugAssign):
+        for other in _OPERATORS.get(type(node.op), ()):
+            yield ast.AugAssign(node.target, other(), node.value)
+    elif isinstance(node, ast.Compare) and len(node.ops) == 1:
+        for other in _COMPARISONS.get(type(node.ops[0]), ()):
+            yield ast.Compare(node.left, [other()], node.comparators)
+    elif isinstance(node, ast.UnaryOp):
+        if isinstance(node.op, (ast.USub, ast.Not, ast.Invert)):
+            yield node.operand
+    elif isinstance(node, ast.BoolOp):
+        yield ast.BoolOp(ast.Or() if isinstance(node.op, ast.And) else ast.And(), node.values)
+    elif isinstance(node, ast.IfExp):
+        yield ast.IfExp(ast.UnaryOp(ast.Not(), node.test), node.body, node.orelse)
+    elif isinstance(node, ast.If):
+        yield ast.If(ast.UnaryOp(ast.Not(), node.test), node.body, node.orelse)
+    elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
+        yield ast.Constant(node.value + 1)
+        if node.value not in (0, -1):
+            yield ast.Constant(-node.value)
+    elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
+        yield ast.Constant(not node.value)
+    elif isinstance(node, (ast.Break, ast.Continue)):
+        yield ast.Continue() if isinstance(node, ast.Break) else ast.Break()
+
+
+def of_code(tree: ast.Module) -> list[ast.AST]:
+    """Nodes that run when a function is called, or make a constant: no annotations, messages, decorators."""
+    kept: list[ast.AST] = []
+
+    def visit(node: ast.AST) -> None:
+        for name, value in ast.iter_fields(node):
+            if name in ("annotation", "returns", "decorator_list", "type_params", "names"):
+                continue
+            for child in value if isinstance(value, list) else [value]:
+                if isinstance(child, ast.AST) and not isinstance(child, (ast.Raise, ast.JoinedStr, ast.Assert)):
+                    kept.append(child)
+                    visit(child)
+
+    visit(tree)
+    return kept
+
+
+def mutants(path: str) -> list[Mutant]:
+    """All mutants of a module."""
+    found = []
+    for position, node in enumerate(of_code(ast.parse((ROOT / path).read_text(encoding="utf-8")))):
+        for number, other in enumerate(changes(node)):
+            was, now = (_short(n) for n in (node, other))
+            if was != now:
+                found.append(Mutant(path, getattr(node, "lineno", 0), was, now, position, number))
+    return found
+
+
+def _replace(tree: ast.Module, target: ast.AST, other: ast.AST) -> None:
+    for parent in ast.walk(tree):
+        for name, value in ast.iter_fields(parent):
+            if value is target:
+                setattr(parent, name, other)
+                return
+            if isinstance(value, list) and any(item is target for item in value):
+                value[next(i for i, item in enumerate(value) if item is target)] = other
+                return
+
+
+def _short(node: ast.AST) -> str:
+    text = ast.unparse(node).splitlines()[0] if not isinstance(node, ast.If) else "if " + ast.unparse(node.test)
+    return text[:100]
+
+
+# --- one mutant -----------------------------------------------------------------------------------------------------
+
+
+class Planted(importlib.abc.MetaPathFinder, importlib.abc.Loader):
+    """Imports one module from the changed source."""
+
+    def __init__(self, name: str, path: Path, source: str) -> None:
+        self.name, self.path, self.source = name, path, source
+
+    def find_spec(self, fullname: str, path: Any = None, target: Any = None) -> Any:
+        """Of the module alone."""
+        del path, target
+        if fullname != self.name:
+            return None
+        return importlib.util.spec_from_file_location(fullname, self.path, loader=self)
+
+    def create_module(self, spec: Any) -> None:
+        """As usual."""
+
+    def exec_module(self, module: Any) -> None:
+        """The changed source in place of the file."""
+        exec(compile(self.source, str(self.path), "exec"), module.__dict__)
+
+
+def module_name(path: str) -> str:
+    """Dotted, of a path below the source roots."""
+    return path.removeprefix("parsers/").removesuffix(".py").replace("/", ".")
+
+
+def trial(path: str, source: str, tests: tuple[str, ...], pipe: Any) -> None:
+    """In a child: run the tests on the changed module, say whether one failed."""
+    import resource
+
+    resource.setrlimit(resource.RLIMIT_CPU, (int(TIMEOUT_S), int(TIMEOUT_S) + 5))
+    os.chdir(ROOT)
+    sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
+    sys.meta_path.insert(0, Planted(module_name(path), ROOT / path, source))
+    import pytest
+
+    importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
+    options = ["-q", "-x", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no"]
+    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
+        code = pytest.main([*options, *(t for t in tests if (ROOT / t).is_file())])
+    pipe.send(int(code))
+    os._exit(0)
+
+
+def outcome(path: str, source: str, tests: tuple[str, ...]) -> tuple[str, float]:
+    """``killed``, ``survived`` or ``killed by time``; and the seconds it took."""
+    begin = time.monotonic()
+    here, there = multiprocessing.get_context("fork").Pipe(duplex=False)
+    child = multiprocessing.get_context("fork").Process(target=trial, args=(path, source, tests, there))
+    child.start()
+    there.close()
+    code: int | None = None
+    if here.poll(4 * TIMEOUT_S):
+        with contextlib.suppress(EOFError):
+            code = here.recv()
+    if child.is_alive():
+        child.join(2)
+        if child.pid is not None and child.is_alive():
+            os.kill(child.pid, signal.SIGKILL)
+    child.join()
+    took = time.monotonic() - begin
+    if code is None:
+        return "killed by time or crash", took
+    return ("survived" if code == 0 else "killed"), took
+
+
+# --- all of them ----------------------------------------------------------------------------------------------------
+
+
+def equivalents() -> dict[str, str]:
+    """Mutants that change nothing that can be seen, by what they change (without the line), with the reason."""
+    out = {}
+    for row in EQUIVALENT.read_text(encoding="utf-8").splitlines() if EQUIVALENT.is_file() else ():
+        if row.strip() and not row.startswith("#"):
+            change, _, reason = row.partition(" # ")
+            out[change.strip()] = reason.strip()
+    return out
+
+
+def change_of(mutant: Mutant) -> str:
+    """The name without its line, which moves."""
+    return f"{mutant.path}: {mutant.was} -> {mutant.now}"
+
+
+def drawn(path: str, each: int, seed: int) -> list[Mutant]:
+    """Some of the mutants of a module."""
+    every = mutants(path)
+    return random.Random(f"{seed} {path}").sample(every, min(each, len(every)))
+
+
+def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, str]) -> dict[str, Any]:
+    """Try each mutant; one line of the account for each."""
+    tests = TARGETS[path]
+    clean, _ = outcome(path, (ROOT / path).read_text(encoding="utf-8"), tests)
+    if clean != "survived":
+        raise SystemExit(f"{path}: its tests fail without any change ({clean})")
+    counts = {"killed": 0, "survived": 0, "equivalent": 0}
+    survivors = []
+    for mutant in chosen:
+        result, took = outcome(path, mutant.source, tests)
+        kind = "killed" if result.startswith("killed") else "survived"
+        if kind == "survived" and change_of(mutant) in known:
+            kind = "equivalent"
+        counts[kind] += 1
+        if kind == "survived":
+            survivors.append(mutant.name)
+        row = {"mutant": mutant.name, "outcome": result, "as": kind, "seconds": round(took, 1)}
+        if account is not None:
+            with account.open("a", encoding="utf-8") as file:
+                file.write(json.dumps(row) + "\n")
+    return {"path": path, **counts, "survivors": survivors}
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--each", type=int, default=30, help="mutants per module")
+    parser.add_argument("--all", action="store_true", help="every mutant")
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--only", nargs="+", default=[], help="modules whose path ends so")
+    parser.add_argument("--account", type=Path, help="a line of JSON per mutant is added here")
+    arguments = parser.parse_args()
+    for name in PRELOADED:
+        with contextlib.suppress(ImportError):
+            importlib.import_module(name)
+    known, total = equivalents(), {"killed": 0, "survived": 0, "equivalent": 0}
+    print(f"{'module':42s} {'mutants':>8} {'killed':>7} {'equiv.':>7} {'left':>5} {'share':>6}")
+    for path in TARGETS:
+        if arguments.only and not any(path.endswith(one) for one in arguments.only):
+            continue
+        chosen = drawn(path, 10**9 if arguments.all else arguments.each, arguments.seed)
+        row = run(path, chosen, arguments.account, known)
+        total = {kind: total[kind] + row[kind] for kind in total}
+        share = row["killed"] / max(row["killed"] + row["survived"], 1)
+        counts = f"{len(chosen):8d} {row['killed']:7d} {row['equivalent']:7d} {row['survived']:5d}"
+        print(f"{path:42s} {counts} {share:6.1%}", flush=True)
+        for name in row["survivors"]:
+            print(f"    survived: {name}", flush=True)
+    share = total["killed"] / max(total["killed"] + total["survived"], 1)
+    print(f"killed {total['killed']} of {total['killed'] + total['survived']} that are not equivalent: {share:.1%}")
+
+
+if __name__ == "__main__":
+    main()

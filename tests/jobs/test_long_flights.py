@@ -1,0 +1,50 @@
+"""What a long flight is cut into for memory's sake gives the numbers of the whole."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs import replay as replay_job
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
+
+
+@pytest.fixture(scope="module")
+def one_tower() -> FlightData:
+    """Both channels of LW2, whose clock is 0.4 s late, of the sample flight."""
+    settings = load_flight(SAMPLE)
+    logs = [log for log in settings.logs if log.node in (None, "LW2")]
+    settings = settings.model_copy(update={"logs": logs})
+    return gather(settings, SAMPLE.parent, read_logs(settings, SAMPLE.parent))
+
+
+def test_a_clock_predicted_in_blocks_is_that_of_the_whole_flight(
+    one_tower: FlightData, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = replay_job.estimate_clocks(one_tower)
+    monkeypatch.setattr(replay_job, "BLOCK", 1500)
+    parts = replay_job.estimate_clocks(one_tower)
+    for a, b in zip(whole, parts, strict=True):
+        assert a is not None
+        assert b is not None
+        np.testing.assert_equal(dataclasses.asdict(b.found), dataclasses.asdict(a.found))  # to the last digit
+        assert abs(a.found.radio_minus_telemetry_s - 0.4) < 0.2
+
+
+def test_a_part_of_the_flight_turns_as_the_whole_does(one_tower: FlightData) -> None:
+    """Attitude of a few instants comes from the rows around them, and from no others."""
+    track = one_tower.track
+    assert track is not None
+    instants = np.arange(track.start_ns - 2 * 10**9, track.end_ns + 2 * 10**9, 370_000_000).astype("datetime64[ns]")
+    whole = track.pose_at(instants)
+    assert whole.valid.sum() > 100
+    for few in ([5], [40, 41], [3, 200], [0, 1, 2], list(range(100, 400, 7))):
+        part = track.pose_at(instants[few])
+        np.testing.assert_allclose(part.rotation, whole.rotation[few], atol=1e-13)
+        np.testing.assert_array_equal(part.attitude_known, whole.attitude_known[few])

@@ -1,0 +1,113 @@
+"""``--dry-run``: what would run is what runs, the time follows the work, nothing is written."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs import plan as planning
+
+SAMPLE = Path(__file__).parents[2] / "sample_logs"
+
+
+def planned(capsys: pytest.CaptureFixture[str], *line: object) -> dict[str, Any]:
+    capsys.readouterr()
+    assert main([*map(str, line), "--dry-run", "--json"]) == 0
+    return json.loads(capsys.readouterr().out)
+
+
+def short_flight(folder: Path, receivers: int) -> Path:
+    """The sample flight with the logs of some receivers, all of them without what costs time."""
+    text = (SAMPLE / "flight.yaml").read_text()
+    logs = [line for line in text.splitlines() if "path: LW" in line and int(line.split("LW")[1][0]) > receivers]
+    for line in logs:
+        text = text.replace(line + "\n", "")
+    file = folder / f"{receivers}.yaml"
+    file.write_text(text.replace("name: sample", f"name: sample{receivers}"))
+    return file
+
+
+def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    file = short_flight(tmp_path, 1)
+    there = sorted(tmp_path.rglob("*"))
+    plan = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "none")
+    assert sorted(tmp_path.rglob("*")) == there
+    work = {stage["name"]: stage["work"] for stage in plan["stages"]}
+    assert work["replay RSS LW1 USRP1"].startswith("651 poses")
+    assert work["replay rank LW1"].startswith("652 poses")
+    assert {"clocks", "compare", "ladder", "report"} <= set(work)
+    assert not {"audit", "speed"} & set(work)
+    assert plan["output"] == "reports/sample1"
+    assert plan["seconds"] == pytest.approx(sum(stage["seconds"] for stage in plan["stages"]))
+    audited = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "50", "--figures", "none")
+    assert {"audit", "speed"} <= {stage["name"] for stage in audited["stages"]}
+    assert "figures of 0 channels" in audited["stages"][-1]["work"]
+    sionna = planned(capsys, "report", file, "--logs-root", SAMPLE, "--engine", "sionna")
+    assert "replay RSS LW1 USRP1" in sionna["not_estimated"]
+    assert main(["report", str(file), "--logs-root", str(SAMPLE), "--audit", "none", "--dry-run"]) == 0
+    assert "not run" in capsys.readouterr().out
+
+
+def test_what_a_run_would_refuse_a_plan_refuses(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "notes.txt").write_text("x")
+    for line in (["report", SAMPLE / "flight.yaml", "-o", tmp_path / "mine"], ["map", "--quick", "-o", tmp_path / "mine"],
+                 ["report", tmp_path / "missing.yaml"], ["map", tmp_path / "missing.yaml"]):  # fmt: skip
+        assert main([*map(str, line), "--dry-run"]) in (2, 3), line
+        assert capsys.readouterr().out == ""
+
+
+def test_the_time_of_a_replay_follows_its_poses(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    """A clock that charges 1 ms a pose and 10 ms a call: the extrapolation is exact, whatever the machine."""
+    from aerpaw_cmp.flight.data import gather, read_logs
+
+    file = short_flight(tmp_path, 1)
+    settings = load_flight(file)
+    data = gather(settings, SAMPLE, read_logs(settings, SAMPLE, None), None)
+    calls: list[int] = []
+    monkeypatch.setattr("aerpaw_cmp.jobs.replay.replay_poses", lambda _s, _r, _l, poses: calls.append(len(poses)))
+
+    def charged(work: Any) -> float:
+        work()
+        return 0.010 + 0.001 * calls[-1]
+
+    monkeypatch.setattr(planning, "_cpu_seconds", charged)
+    rss, rank = planning._tried_replays(data)
+    assert [stage.seconds for stage in rss] == pytest.approx([0.010 + 0.651] * 2)
+    assert rank[0].seconds == pytest.approx(0.010 + 0.652)
+    assert set(calls) == set(planning.TRIED_POSES)
+
+
+def test_a_planned_map_counts_its_links(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    quick = ["map", "--quick", "--foliage", "none", "-o", tmp_path / "m"]
+    plan = planned(capsys, *quick)
+    maps, study, last = plan["stages"][1:]
+    assert maps["work"] == "2295 links: 153 positions, 3 heights, 5 towers"
+    assert study["name"] == "study"
+    assert last["seconds"] > 0 < maps["seconds"]
+    finer = planned(capsys, *quick, "--spacing", "60", "--no-study")
+    assert [stage["name"] for stage in finer["stages"]] == ["imports", "maps, foliage none", "export, page"]
+    assert finer["stages"][1]["seconds"] > 1.5 * maps["seconds"]
+    assert not (tmp_path / "m").exists()
+
+
+def test_what_was_planned_is_what_runs_and_no_line_comes_twice(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    file = short_flight(tmp_path, 1)
+    line = ["report", file, "--logs-root", SAMPLE, "--audit", "none", "--figures", "none", "-o", tmp_path / "out"]
+    plan = planned(capsys, *line)
+    assert main(list(map(str, line))) == 0
+    said = capsys.readouterr().err.splitlines()
+    assert len(said) == len(set(said)), said
+    metrics = json.loads((tmp_path / "out" / "metrics.json").read_text())
+    ran = {name.removesuffix("_s") for name, seconds in metrics["stages"].items() if seconds > 0.01}
+    assert {stage["name"].split()[0] for stage in plan["stages"]} - {"imports"} == ran

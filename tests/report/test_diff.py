@@ -1,0 +1,350 @@
+"""Two reports compared: a planted change is found, where it is and how large; equal reports give no difference."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.outputs import OutputFolder
+from aerpaw_cmp.compare.report_difference import mae_difference
+from aerpaw_cmp.compare.statistics import autocorrelation
+from aerpaw_cmp.jobs.diff_reports import run_diff
+from aerpaw_cmp.report.diff_data import verdict
+from aerpaw_cmp.report.diff_html import diff_page, whiskers
+from aerpaw_cmp.report.write import write_report
+
+LINK = ("LW1", "USRP1")
+
+
+@pytest.fixture(scope="module")
+def written(report_data, tmp_path_factory):
+    """A report as the command writes it, without figures, every eighth sample."""
+    folder = tmp_path_factory.mktemp("reports") / "first"
+    with OutputFolder(folder, job="report") as output, output.filling() as place:
+        write_report(report_data, place, drawn="none")
+        table = change_table(place, "rss", lambda whole: whole.iloc[::8])
+
+        def recount(metrics):
+            for tower, channels in metrics["rss"].items():
+                for channel, numbers in channels.items():
+                    numbers["n"] = int(table.loc[on(table, (tower, channel)), "residual_db"].notna().sum())
+
+        change_metrics(place, recount)
+    return folder
+
+
+@pytest.fixture
+def two(written, tmp_path):
+    """The report twice; the second is for tests to change."""
+    first, second = tmp_path / "first", tmp_path / "second"
+    shutil.copytree(written, first)
+    shutil.copytree(written, second)
+    return first, second
+
+
+def change_metrics(folder, change):
+    path = folder / "metrics.json"
+    content = json.loads(path.read_text(encoding="utf-8"))
+    change(content)
+    path.write_text(json.dumps(content), encoding="utf-8")
+
+
+def change_table(folder, kind, change):
+    path = folder / f"{kind}.csv"
+    table = pd.read_csv(path)
+    table = change(table)
+    table.to_csv(path, index=False, lineterminator="\n")
+    return table
+
+
+def on(table, link=LINK):
+    return (table["tower"] == link[0]) & (table["channel"] == link[1])
+
+
+def test_equal_reports_have_no_difference(two, capsys):
+    change_metrics(two[1], lambda m: m.update(generated="later", stages={"read_s": 99.0}))
+    found = run_diff(*two)
+    assert found.differences == ()
+    assert (found.settings, found.inputs, found.versions, found.numbers) == ((), (), (), ())
+    assert verdict(found).startswith("No difference: the numbers agree within 0.01 dB on 2")
+    assert {one.rmse.difference_db for one in found.levels} == {0.0}
+    assert {one.kappa.difference for one in found.ranks} == {0.0}
+    assert any(one.key == "read" and one.second == 99.0 for one in found.stages)
+    assert main(["diff", str(two[0]), str(two[1]), "--strict"]) == 0
+    assert "No difference" in capsys.readouterr().out
+
+
+def test_one_setting_is_named_by_its_key(two):
+    change_metrics(two[1], lambda m: m["settings"]["rt"].update(max_depth=1, engine=None))
+    change_metrics(two[1], lambda m: m["versions"].update(numpy="1.0"))
+    found = run_diff(*two)
+    assert [(e.key, e.first, e.second) for e in found.settings] == [("rt.max_depth", 2, 1), ("rt.engine", None, None)]
+    assert [e.key for e in found.versions] == ["numpy"]
+    assert found.differences == (), "a setting alone is no number"
+    assert "1 version" in verdict(found)
+
+
+def test_inputs_are_compared_by_content(two):
+    def change(metrics):
+        one, other = metrics["inputs"][:2]
+        one.update(sha256="f" * 64, lines=one["lines"] + 1)
+        other["path"] = "elsewhere/" + other["path"]
+        metrics["inputs"].append({**one, "path": "new.txt", "sha256": "e" * 64})
+
+    change_metrics(two[1], change)
+    found = run_diff(*two)
+    assert [(e.path, e.what) for e in found.inputs] == [(found.inputs[0].path, "changed"), ("new.txt", "added")]
+    assert found.inputs[0].second_lines == found.inputs[0].first_lines + 1
+
+
+@pytest.fixture
+def noisy(two):
+    """1 dB of white noise on the replay of one link of the second report."""
+    rng = np.random.default_rng(5)
+
+    def change(table):
+        noise = np.where(on(table), rng.normal(0, 1.0, len(table)), 0.0)
+        return table.assign(simulated_dbm=table["simulated_dbm"] + noise, residual_db=table["residual_db"] - noise)
+
+    tables = pd.read_csv(two[0] / "rss.csv"), change_table(two[1], "rss", change)
+    return two, tables
+
+
+def test_noise_on_one_link_is_found_there_and_sized(noisy):
+    two, tables = noisy
+    found = run_diff(*two)
+    by_link = {(one.tower, one.channel): one for one in found.levels}
+    hit = by_link.pop(LINK)
+    expected = [np.nanstd(table.loc[on(table), "residual_db"]) for table in tables]  # about its mean: the best offset
+    assert (hit.rmse.other_rmse_db, hit.rmse.rmse_db) == pytest.approx(expected, abs=1e-9)
+    low, high = hit.rmse.difference_ci95_db
+    truth = np.hypot(expected[0], 1.0) - expected[0]
+    assert low < truth < high
+    assert low > 0, "a decibel of noise is known to be worse"
+    assert hit.rmse.verdict == "worse"
+    apart = (tables[1]["simulated_dbm"] - tables[0]["simulated_dbm"])[on(tables[0])]
+    assert hit.simulated_rms_db == pytest.approx(np.sqrt(np.nanmean(apart**2)))
+    assert hit.simulated_max_db == pytest.approx(np.nanmax(np.abs(apart)))
+    assert hit.measured_max_db == 0.0
+    about = [table.loc[on(table), "residual_db"].dropna() for table in tables]
+    mae = [float((r - r.mean()).abs().mean()) for r in about]
+    assert (hit.mae_db.first, hit.mae_db.second, hit.mae_db.difference) == pytest.approx((*mae, mae[1] - mae[0]))
+    assert {one.rmse.difference_db for one in by_link.values()} == {0.0}
+    assert "WORSE" in verdict(found)
+    assert any("was changed after the report wrote it" in text for text in found.remarks)
+
+
+def test_the_other_way_round_has_the_other_sign(noisy):
+    (first, second), _ = noisy
+    one, two = run_diff(first, second), run_diff(second, first)
+    for there, back in zip(one.levels, two.levels, strict=True):
+        assert there.rmse.difference_db == -back.rmse.difference_db
+        assert there.mae_db.difference == pytest.approx(-back.mae_db.difference)
+    assert one.pooled.verdict == "worse"
+    assert two.pooled.verdict == "better"
+    assert "better by" in verdict(two)
+
+
+def test_the_tolerance_decides_what_counts(noisy, capsys):
+    (first, second), _ = noisy
+    assert main(["diff", str(first), str(second), "--strict"]) == 1
+    assert main(["diff", str(first), str(second), "--strict", "--tolerance", "100"]) == 0
+    assert main(["diff", str(first), str(second)]) == 0
+    assert main(["diff", str(first), str(second), "--tolerance", "-1"]) == 2
+    assert "tolerance" in capsys.readouterr().err
+
+
+def test_samples_of_one_report_alone_are_counted_and_left_out(two):
+    change_table(two[1], "rss", lambda table: table[~(on(table) & (table["time_s"] > 900))])
+    found = next(one for one in run_diff(*two).levels if (one.tower, one.channel) == LINK)
+    table = pd.read_csv(two[0] / "rss.csv")
+    gone = int((on(table) & (table["time_s"] > 900)).sum())
+    assert gone > 0
+    assert (found.samples.only_first, found.samples.only_second) == (gone, 0)
+    assert found.samples.common == found.samples.first - gone
+    assert found.rmse.difference_db == 0.0
+    assert any(f"{gone} samples only in the first" in text for text in run_diff(*two).differences)
+
+
+def test_samples_at_one_instant_pair_in_their_order(two):
+    for folder in two:
+        change_table(
+            folder, "rss", lambda t: t.assign(time_utc=t["time_utc"].where(t["time_s"] > 5, t["time_utc"].iloc[0]))
+        )
+    change_table(two[1], "rss", lambda t: t.iloc[1:])
+    found = run_diff(*two).levels[0]
+    assert found.samples.common == found.samples.first - 1
+    assert found.samples.only_second == 0
+
+
+def test_ranks_that_changed_are_counted_and_agreement_is_that_of_the_pairs(two):
+    rng = np.random.default_rng(2)
+
+    def change(table):
+        turn = (rng.random(len(table)) < 0.2) & (table["simulated_rank_k10"] > 0)
+        return table.assign(
+            simulated_rank_k10=table["simulated_rank_k10"].where(~turn, 5 - table["simulated_rank_k10"])
+        )
+
+    first = pd.read_csv(two[0] / "rank.csv")
+    second = change_table(two[1], "rank", change)
+    found = {one.k: one for one in run_diff(*two).ranks}
+    hit = found["10"]
+    assert hit.n_changed == int((first["simulated_rank_k10"] != second["simulated_rank_k10"]).sum()) > 50
+    both = first["measured_rank"].notna() & (first["simulated_rank_k10"] > 0)
+    agree = [float((t["measured_rank"] == t["simulated_rank_k10"])[both].mean()) for t in (first, second)]
+    assert (hit.agreement.first, hit.agreement.second) == pytest.approx(agree)
+    sklearn = pytest.importorskip("sklearn.metrics")
+    kappa = [
+        sklearn.cohen_kappa_score(t["measured_rank"][both].astype(int), t["simulated_rank_k10"][both].astype(int))
+        for t in (first, second)
+    ]
+    assert (hit.kappa.first, hit.kappa.second) == pytest.approx(kappa)
+    for change in (hit.agreement, hit.kappa):
+        assert change.ci95[0] <= change.difference <= change.ci95[1]
+        assert change.ci95[0] < change.ci95[1]
+    assert hit.n_reported_changed == 0
+    assert found["100"].n_changed == 0
+    assert "simulated ranks differ" in verdict(run_diff(*two))
+
+
+def test_intervals_of_the_mae_hold_the_truth_as_often_as_they_say():
+    """White noise of two sizes: the mean absolute error of a normal is sigma sqrt(2 / pi)."""
+    rng = np.random.default_rng(3)
+    truth = (2.4 - 2.0) * np.sqrt(2 / np.pi)
+    held = 0
+    for _ in range(150):
+        shared = rng.normal(0, 2.0, 500)
+        bounds = mae_difference(shared, rng.normal(0, 2.4, 500), replicates=200).ci95
+        held += bounds[0] <= truth <= bounds[1]
+    assert held >= 0.88 * 150
+    assert autocorrelation(shared).enough
+
+
+# --- what cannot be compared -----------------------------------------------------------------------------------------
+
+
+def cut_last_line(folder):
+    path = folder / "rss.csv"
+    path.write_bytes(path.read_bytes()[:-20])
+
+
+def tear_a_line(folder):
+    path = folder / "rss.csv"
+    lines = path.read_text().splitlines()
+    lines[5] = lines[5][:20]
+    path.write_text("\n".join(lines) + "\n")
+
+
+def word_for_number(folder):
+    path = folder / "rss.csv"
+    lines = path.read_text().splitlines()
+    cells = lines[3].split(",")
+    cells[8] = "loud"
+    lines[3] = ",".join(cells)
+    path.write_text("\n".join(lines) + "\n")
+
+
+def without(*keys):
+    return lambda folder: change_metrics(folder, lambda m: [m.pop(key) for key in keys])
+
+
+BAD = {
+    "a torn last line": (cut_last_line, r"rss\.csv, line \d+: the last line does not end.*torn", InputError),
+    "a torn line": (tear_a_line, r"rss\.csv, line 6: .*torn", InputError),
+    "a word": (word_for_number, r"rss\.csv, line 4: column 'measured_db': 'loud'; expected a number", InputError),
+    "an older table": (lambda f: change_table(f, "rss", lambda t: t.drop(columns="up_m")), r"no column 'up_m'.*older", InputError),
+    "an empty table": (lambda f: (f / "rank.csv").write_text(""), r"rank\.csv: is empty", InputError),
+    "binary": (lambda f: (f / "rss.csv").write_bytes(b"\xff\xfe\x00\n"), r"rss\.csv: ", InputError),
+    "no table": (lambda f: (f / "rss.csv").unlink(), r"there is no such table", InputError),
+    "an older report": (without("settings"), r"no 'settings'.*run the report again", InputError),
+    "no report": (without("rss", "rank"), r"expected metrics\.json of `aerpaw-cmp report`", InputError),
+    "a map": (lambda f: (f / "metrics.json").write_text('{"grid": {}, "rank": []}'), r"numbers of a map", InputError),
+    "a list": (lambda f: (f / "metrics.json").write_text("[]"), r"is no metrics\.json", InputError),
+    "a torn json": (lambda f: (f / "metrics.json").write_text('{"flight": '), r"is no JSON.*torn", InputError),
+    "a campaign": (lambda f: (f / "metrics.json").rename(f / "campaign.json"), r"no metrics\.json.*campaign\.json", InputError),
+    "nothing": (shutil.rmtree, r"no such file or folder", InputError),
+    "another flight": (
+        lambda f: change_metrics(f, lambda m: m.update(flight="other", inputs=[])), r"different flights: \S+ and other", UsageError
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", BAD)
+def test_what_is_no_report_is_one_message(name, two, capsys):
+    damage, said, kind = BAD[name]
+    damage(two[1])
+    with pytest.raises(kind, match=said):
+        run_diff(*two)
+    assert main(["diff", str(two[0]), str(two[1]), "--json"]) == kind.exit_code
+    shown = capsys.readouterr()
+    assert shown.out == ""
+    assert len(shown.err.splitlines()) == 1
+
+
+def test_a_renamed_flight_with_the_same_logs_is_the_same(two):
+    change_metrics(two[1], lambda m: m.update(flight="renamed"))
+    assert run_diff(*two).differences == ()
+
+
+def test_metrics_alone_give_the_reported_numbers(two):
+    change_metrics(two[1], lambda m: m["rss"]["LW1"]["USRP1"].update(rmse_db=99.0))
+    found = run_diff(two[0] / "metrics.json", two[1] / "metrics.json")
+    assert found.levels == ()
+    assert [(e.key, e.second) for e in found.numbers] == [("rss.LW1.USRP1.rmse_db", 99.0)]
+    assert found.differences
+    assert "only the reported numbers" in found.remarks[0]
+
+
+def test_links_of_one_report_alone_are_named(two):
+    change_metrics(two[1], lambda m: m["rss"].pop("LW4"))
+    found = run_diff(*two)
+    assert found.links_first_only == ("LW4 USRP1",)
+    assert "only the first report has LW4 USRP1" in found.differences
+
+
+# --- what is written -------------------------------------------------------------------------------------------------
+
+
+def test_page_and_json_are_written_as_a_set_and_replace_no_report(noisy, tmp_path, capsys):
+    (first, second), _ = noisy
+    out = tmp_path / "out"
+    assert main(["diff", str(first), str(second), "-o", str(out), "--json"]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    assert printed == json.loads((out / "diff.json").read_text(encoding="utf-8"))
+    assert printed["differs"] is True
+    assert printed["levels"][0]["rmse"]["verdict"] == "worse"
+    assert (out / "SHA256SUMS").is_file()
+    before = (first / "metrics.json").read_bytes()
+    assert main(["diff", str(first), str(second), "-o", str(first), "--force"]) == 2
+    assert (first / "metrics.json").read_bytes() == before
+
+
+def test_the_page_has_no_script_and_escapes_what_it_shows(noisy):
+    (first, second), _ = noisy
+    hostile = "<img src=x onerror=alert(1)>"
+    change_metrics(second, lambda m: m["settings"].update({hostile: hostile}))
+    change_metrics(second, lambda m: m["warnings"].append(hostile))
+    page = diff_page(run_diff(first, second))
+    assert "<script" not in page
+    assert hostile not in page
+    assert "&lt;img" in page
+    assert "script-src &#39;none&#39;" in page or "script-src 'none'" in page
+
+
+def test_the_picture_shows_every_link_at_its_number(noisy):
+    found = run_diff(*noisy[0])
+    rows, reach = whiskers(found)
+    assert [row.name for row in rows] == [*(f"{one.tower} {one.channel}" for one in found.levels), "all links"]
+    for row, one in zip(rows, found.levels, strict=False):
+        assert (row.at - 50) / 50 * reach == pytest.approx(one.rmse.difference_db)
+        assert 0 <= row.low <= row.at <= row.high <= 100
+    equal = dataclasses.replace(found, levels=(), pooled=None)
+    assert whiskers(equal)[0] == []

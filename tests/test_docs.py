@@ -1,0 +1,187 @@
+"""The documentation: every command in it is parsed by the real parser, the tutorial's are run, the pages build strictly."""
+
+from __future__ import annotations
+
+import importlib.util
+import os
+import re
+import shlex
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import pytest
+import typer
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.cli.app import app
+
+ROOT = Path(__file__).parents[1]
+PAGES = [
+    *sorted((ROOT / "docs").rglob("*.md")),
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+    *sorted((ROOT / "reports").glob("README.md")),
+    *sorted((ROOT / "reports" / "lake_wheeler").glob("*.md")),
+]
+PROGRAM: Any = typer.main.get_command(app)
+_NUMBERS = {"N", "DB", "S", "HZ", "M", "K"}
+STARTS = ("aerpaw-cmp ", "python benchmarks/", "python tools/", "pytest ", "make ")
+
+
+def commands(text: str) -> list[tuple[str, bool]]:
+    """Command lines of a page, and whether each stands in a block (True) or within a sentence (False)."""
+    text = text.replace("\\\n", " ")
+    lines = [line.strip().removeprefix("$ ") for line in text.splitlines()]
+    inside = re.findall(r"`([^`\n]+)`", re.sub(r"```.*?```", "", text, flags=re.DOTALL))
+    found = [(line, True) for line in lines if line.startswith(STARTS)]
+    return found + [(span, False) for span in inside if span.startswith(STARTS)]
+
+
+def words_of(line: str) -> list[str]:
+    """Words of a line without comment, pipe, and the brackets and dots of a synopsis; N, DB and the like are numbers."""
+    line = re.split(r"\s#|\s\||\s>|\s&", line)[0].replace("[", " ").replace("]", " ").replace("...", " ")
+    return ["1" if word in _NUMBERS else word for word in shlex.split(line)]
+
+
+def check(line: str, in_block: bool) -> None:
+    """An exception if the line could not run as it stands: unknown command, option, file, target, wrong value."""
+    program, *words = words_of(line)
+    if program == "make":
+        targets = re.findall(r"^([\w-]+):", (ROOT / "Makefile").read_text(), re.MULTILINE)
+        assert words[0] in targets, words[0]
+    elif program == "pytest":
+        assert all((ROOT / word.split("::")[0]).exists() for word in words if word.startswith("tests/")), line
+    elif program == "python":
+        code = (ROOT / words[0]).read_text()
+        assert all(f'"{word}"' in code for word in words if word.startswith("--")), line
+    elif not words[0].isupper() and words not in (["-h"], ["--help"]):
+        parse([word for word in words if word not in ("-h", "--help")], in_block)
+
+
+def parse(words: list[str], whole: bool) -> None:
+    """Let the program read a line; within a sentence it may leave out what the command needs."""
+    if words[0].startswith("-"):
+        assert words[0] in {option for one in PROGRAM.params for option in one.opts} | {
+            "--version",
+            "--debug",
+            "--help",
+        }
+        return
+    command, context = PROGRAM, PROGRAM.make_context("aerpaw-cmp", [], resilient_parsing=True)
+    while hasattr(command, "commands") and words:
+        name = words.pop(0)
+        command = command.commands[name]
+        group = hasattr(command, "commands")
+        try:
+            context = command.make_context(name, [] if group else words, parent=context, resilient_parsing=group)
+        except Exception as error:
+            if whole or type(error).__name__ != "MissingParameter":
+                raise
+
+
+LINES = {
+    f"{page.relative_to(ROOT)}: {line}": (line, block) for page in PAGES for line, block in commands(page.read_text())
+}
+
+
+def test_there_are_commands_in_the_documentation() -> None:
+    assert len(LINES) > 60
+
+
+@pytest.mark.parametrize("where", LINES)
+def test_a_command_of_the_documentation_would_run(where: str) -> None:
+    check(*LINES[where])
+
+
+@pytest.mark.parametrize(
+    "line",
+    ["aerpaw-cmp report flight.yaml --audits none", "aerpaw-cmp reprot x", "aerpaw-cmp site import -o x.yaml",
+     "aerpaw-cmp map --engine magic", "python benchmarks/ingest.py --no-such-thing", "python benchmarks/nothing.py",
+     "pytest tests/nothing.py", "make nothing"],
+)  # fmt: skip
+def test_a_wrong_command_would_be_seen(line: str) -> None:
+    with pytest.raises(Exception, match=r"(?s).*"):
+        check(line, True)
+
+
+def blocks(page: str) -> list[tuple[str, str]]:
+    return re.findall(r"^```(\w*)\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+
+
+def test_the_tutorial_shows_what_its_commands_print(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its quick commands are run here; the report is that of ``make report`` but for the audit."""
+    monkeypatch.chdir(tmp_path)
+    shown, ran = "", []
+    for kind, text in blocks((ROOT / "docs" / "tutorial.md").read_text()):
+        if kind == "sh":
+            shown = ""
+            for line in text.splitlines():
+                words = words_of(line)
+                if words[0] == "aerpaw-cmp" and words[1] not in ("report", "campaign"):
+                    capsys.readouterr()
+                    assert main(words[1:]) == 0
+                    shown += "".join(capsys.readouterr())
+                    ran.append(words[1])
+        elif shown and kind == "text":
+            squeezed = " ".join(shown.split())
+            for line in text.splitlines():
+                for part in filter(None, (part.strip() for part in line.split("..."))):
+                    assert " ".join(part.split()) in squeezed, part
+        elif kind == "yaml" and ran[-1:] == ["ingest"]:
+            draft = (tmp_path / "try_it" / "draft.yaml").read_text()
+            assert all(line in draft for line in text.splitlines() if line != "  ...")
+    assert ran[:2] == ["sample", "ingest"]
+
+
+needs_mkdocs = pytest.mark.skipif(
+    any(importlib.util.find_spec(name) is None for name in ("mkdocs", "material", "mkdocstrings_handlers")),
+    reason="mkdocs-material is not here: pip install 'aerpaw-cmp[docs]'",
+)
+
+
+@pytest.fixture(scope="module")
+def pages(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The built documentation, figures as blanks: the gallery's scripts take 10 s and run in ``make docs``."""
+    folder = tmp_path_factory.mktemp("docs")
+    environ = {**os.environ, "AERPAW_CMP_DOCS_FIGURES": "0", "NO_MKDOCS_2_WARNING": "1"}
+    done = subprocess.run(
+        [sys.executable, "-m", "mkdocs", "build", "--strict", "-q", "-d", str(folder)],
+        cwd=ROOT, env=environ, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr + done.stdout
+    return folder
+
+
+@needs_mkdocs
+def test_the_pages_build_strictly_and_ask_no_network(pages: Path) -> None:
+    loads = re.compile(
+        r'<(?:script|img|iframe|source)[^>]+src="?(https?:|//)|<link[^>]+rel="?(?:stylesheet|preconnect|icon|preload)[^>]+href="?(https?:|//)'
+    )
+    for page in pages.rglob("*.html"):
+        assert not loads.search(page.read_text()), page
+    for style in pages.rglob("*.css"):
+        assert not re.search(r"url\(\s*[\"']?(https?:|//)", style.read_text()), style
+
+
+@needs_mkdocs
+def test_the_reference_has_every_public_name_and_every_command(pages: Path) -> None:
+    import aerpaw_cmp
+    from aerpaw_cmp.common.commands import COMMANDS
+
+    python = (pages / "reference" / "python.html").read_text()
+    for name, home in aerpaw_cmp._HOME.items():
+        assert f'id="aerpaw_cmp.{home}.{name}"' in python
+    assert ":class:" not in python
+    listed = (pages / "reference" / "commands.html").read_text()
+    assert all(f"aerpaw-cmp {name}" in listed for name in COMMANDS)
+
+
+@pytest.mark.parametrize("script", sorted((ROOT / "docs" / "gallery").glob("*.py")), ids=lambda path: path.stem)
+def test_a_script_of_the_gallery_has_a_title_and_draws(script: Path) -> None:
+    code = script.read_text()
+    assert code.startswith('"""')
+    assert "figure" in code
+    compile(code, str(script), "exec")

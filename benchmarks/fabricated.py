@@ -12,6 +12,7 @@ import numpy as np
 
 from aerpaw_cmp.jobs.season import with_season
 from aerpaw_cmp.report.campaign_data import CampaignData, Failure, FlownTrack, RssRow
+from aerpaw_cmp.report.data import Baseline, ReportData, RssPanel, Track
 from aerpaw_cmp.site.siteyaml import load_site
 
 DRIFT_DB_PER_30_DAYS = 0.4
@@ -86,4 +87,38 @@ def _row(
         position_m=position if reference else np.zeros((0, 3)),
         distance_m=np.hypot(*position[:, :2].T) if reference else empty,
         start_ns=start,
+    )  # fmt: skip
+
+
+def long_flight(samples: int = 50_000, channels: int = 10) -> ReportData:
+    """A report of ten channels with so many samples together: levels of free space, noise, and nothing else."""
+    rng = np.random.default_rng(2)
+    site = load_site("lake_wheeler")
+    n = samples // channels
+    seconds = np.arange(n) * 0.1
+    time = np.datetime64("2025-03-01T14:00:00", "ns") + (seconds * 1e9).astype("timedelta64[ns]")
+    turn = seconds / 40.0
+    east, north, up = 300 * np.cos(turn), 300 * np.sin(turn), 40 + 10 * np.sin(turn / 7)
+    towers = list(site.towers.values())
+    panels = []
+    for number in range(channels):
+        tower = towers[number % len(towers)]
+        distance = np.sqrt((east - tower.east_m) ** 2 + (north - tower.north_m) ** 2 + up**2)
+        level = -30 - 20 * np.log10(distance)
+        measured = level + 10.0 + rng.normal(0, 4, n)
+        residual = measured - 10.0 - level
+        panels.append(
+            RssPanel(
+                tower=tower.name, channel=f"USRP{number // len(towers) + 1}", unit="dBm", time=time,
+                measured_db=measured, simulated_dbm=level, measured_out_of_coverage=np.zeros(n, bool),
+                simulated_out_of_coverage=np.zeros(n, bool), offset_db=-10.0,
+                rmse_db=float(np.sqrt((residual**2).mean())), correlation=0.5, n=n, n_out_of_coverage=0,
+                east_m=east, north_m=north, up_m=up, geometry={"distance_m": distance},
+                baselines=(Baseline(name="free_space", level_dbm=level - 1, offset_db=-11.0, rmse_db=4.0),),
+            )
+        )  # fmt: skip
+    track = Track(time=time, east_m=east, north_m=north, up_m=up)
+    return ReportData(
+        title="A flight that was never flown", flight="long", site=site, generated="2026-11-21T00:00:00+00:00",
+        rss=tuple(panels), track=track, synthetic=True,
     )  # fmt: skip

@@ -78,8 +78,8 @@ def serving_plate(serving: ServingComparison) -> Plate:
         section="serving",
         title="Which cell serves",
         caption=f"Counts of {count(serving.n)} samples; colour is the share of each cell that served (rows). Framed: "
-        f"the cell predicted strongest served, {100 * serving.hit_share:.0f} % of all; always naming the cell that served "
-        f"most hits {100 * serving.majority_share:.0f} %. Levels are as simulated, without offsets.",
+        f"the cell predicted strongest served, {100 * serving.hit_share:.0f} % of all; always naming the cell that "
+        f"served most hits {100 * serving.majority_share:.0f} %. Levels are as simulated, without offsets.",
         alt=f"Confusion matrix of {n_cells} serving cells against the cells predicted strongest.",
         draw=lambda: confusion(serving),
     )

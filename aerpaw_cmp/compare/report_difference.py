@@ -23,6 +23,7 @@ from .statistics import (
     bootstrap_means,
     interval,
     paired_difference,
+    paired_verdict,
 )
 
 
@@ -188,21 +189,55 @@ def mae_difference(
     return Changed(first=float(one.mean()), second=float(two.mean()), difference=estimate, ci95=bounds)
 
 
-def pooled_difference(residuals: Sequence[tuple[FloatArray, FloatArray]]) -> PairedDifference:
+def pooled_difference(
+    links: Sequence[tuple[FloatArray, FloatArray, FloatArray]], *, replicates: int = REPLICATES, seed: int = SEED
+) -> PairedDifference:
     """RMSE of the second report against the first over all links, each link about its own offset.
 
     Parameters
     ----------
-    residuals : sequence of two (n,)
-        Residuals of both reports on the common samples of each link, in time order [dB]; NaN takes no part.
+    links : sequence of three (n,)
+        Instants [s] of the common samples of a link, and the residuals of both reports there [dB]; NaN takes no part.
+    replicates, seed : int
+        Of the bootstrap.
+
+    Notes
+    -----
+    What a sample adds to the difference of the mean squares is its own difference less the mean of its link. These are
+    put in order of time over all links, so that blocks hold what the links share at an instant.
     """
-    one, two = [np.zeros(0)], [np.zeros(0)]
-    for first, second in residuals:
+    time, one, two, added = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    for instants, first, second in links:
         both = np.isfinite(first) & np.isfinite(second)
         if both.any():
-            one.append(first[both] - first[both].mean())
-            two.append(second[both] - second[both].mean())
-    return paired_difference(np.concatenate(two), np.concatenate(one), free_offset=False)
+            a, b = first[both] - first[both].mean(), second[both] - second[both].mean()
+            loss = b * b - a * a
+            time.append(instants[both])
+            one.append(a)
+            two.append(b)
+            added.append(loss - loss.mean())
+    a, b = np.concatenate(one), np.concatenate(two)
+    if not len(a):
+        return paired_difference(b, a)
+    influence = np.concatenate(added)[np.argsort(np.concatenate(time), kind="stable")]
+    known = autocorrelation(influence)
+    estimate = float(np.mean(b * b - a * a))
+    drawn = estimate + bootstrap_means(influence[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
+    low, high = interval(estimate, drawn, known)
+    rmse, other = float(np.sqrt(np.mean(b * b))), float(np.sqrt(np.mean(a * a)))
+    scale = 1.0 / (rmse + other) if rmse + other > 0 else 0.0
+    return PairedDifference(
+        n=len(a),
+        rmse_db=rmse,
+        other_rmse_db=other,
+        difference_db=rmse - other,
+        difference_ci95_db=(low * scale, high * scale),
+        standard_error_db=(high - low) / (2 * 1.959964) * scale,
+        mean_square_difference_db2=estimate,
+        mean_square_ci95_db2=(low, high),
+        n_effective=known.n_effective,
+        verdict=paired_verdict(low, high),
+    )
 
 
 def rank_difference(

@@ -572,7 +572,7 @@ def paired_difference(
         mean_square_difference_db2=estimate,
         mean_square_ci95_db2=(low, high),
         n_effective=known.n_effective,
-        verdict=_paired_verdict(low, high),
+        verdict=paired_verdict(low, high),
     )
 
 
@@ -592,7 +592,7 @@ def _no_pair() -> PairedDifference:
     )
 
 
-def _paired_verdict(low: float, high: float) -> Literal["better", "worse", "no difference shown", "none given"]:
+def paired_verdict(low: float, high: float) -> Literal["better", "worse", "no difference shown", "none given"]:
     """The word that the interval of a difference of errors allows."""
     if not (np.isfinite(low) and np.isfinite(high)):
         return "none given"

@@ -360,10 +360,23 @@ def _values(table: Any, name: str) -> FloatArray:
     return np.asarray(table[name], dtype=np.float64)
 
 
-def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[tuple[FloatArray, FloatArray]]]:
+_Residuals = tuple[FloatArray, FloatArray, FloatArray]
+"""Instants [s] of the common samples of a link, and both residuals."""
+
+
+def _instants(table: Any) -> FloatArray:
+    """Seconds after one instant for all links; without times of day, after each link's first sample."""
+    import pandas as pd
+
+    known = pd.to_datetime(table["time_utc"].replace("", None), utc=True, errors="coerce")
+    seconds = (known - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
+    return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
+
+
+def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
     found: list[LevelDifference] = []
-    residuals: list[tuple[FloatArray, FloatArray]] = []
+    residuals: list[_Residuals] = []
     if one.rss is None or two.rss is None:
         return found, residuals
     names = ("measured_db", "simulated_dbm", "residual_db")
@@ -377,7 +390,7 @@ def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], li
             first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
             offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
             scored = [int(table["residual_db"].notna().sum()) for table in tables]
-            residuals.append((first[2], second[2]))
+            residuals.append((_instants(a), first[2], second[2]))
             found.append(
                 level_difference(
                     tower, channel, overlap, first, second,

@@ -177,7 +177,7 @@ def _level_verdict(diff: ReportDiff) -> str:
     if len(scored) > 1:
         told = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
         rest = len(scored) - sum(n for _, n in told)
-        text += f" ({told[0][1]} links better, {told[1][1]} worse, {rest} undecided)"
+        text += f" (links: {told[0][1]} better, {told[1][1]} worse, {rest} undecided)"
     return text + "."
 
 

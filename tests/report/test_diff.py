@@ -13,7 +13,7 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
-from aerpaw_cmp.compare.report_difference import mae_difference
+from aerpaw_cmp.compare.report_difference import mae_difference, pooled_difference
 from aerpaw_cmp.compare.statistics import autocorrelation
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.diff_data import verdict
@@ -159,6 +159,23 @@ def test_the_tolerance_decides_what_counts(noisy, capsys):
     assert main(["diff", str(first), str(second)]) == 0
     assert main(["diff", str(first), str(second), "--tolerance", "-1"]) == 2
     assert "tolerance" in capsys.readouterr().err
+
+
+def test_links_are_pooled_by_what_each_adds_at_an_instant():
+    """Two links with a change of opposite sign: the means of links are no memory of the flight."""
+    rng = np.random.default_rng(8)
+    time, links, truth = np.arange(3000) * 0.1, [], []
+    for before, after in ((2.0, 3.0), (4.0, 3.5)):
+        links.append((time, rng.normal(0, before, 3000), rng.normal(0, after, 3000)))
+        truth.append(after**2 - before**2)
+    found = pooled_difference(links)
+    low, high = found.mean_square_ci95_db2
+    assert low < np.mean(truth) < high
+    # white noise: the variance of a mean square is 2 sigma^4 / n
+    spread = np.sqrt(sum(2 * s**4 for s in (2.0, 3.0, 4.0, 3.5)) / 3000) / 2
+    assert (high - low) / 2 == pytest.approx(1.96 * spread, rel=0.2)
+    once, twice = (np.ptp(pooled_difference(links[:1] * n).mean_square_ci95_db2) for n in (1, 2))
+    assert twice == pytest.approx(once, rel=0.2), "one link written down twice is worth no more"
 
 
 def test_samples_of_one_report_alone_are_counted_and_left_out(two):

@@ -14,16 +14,34 @@ from .shown import print_files, print_json, print_plan, say, table
 @command(
     "import",
     of=site_app,
-    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) to a site.yaml.",
+    text="Map data (GeoJSON, OSM XML, Overpass JSON, KML, KMZ) or a Mitsuba scene to a site.yaml.",
     examples=[
         "aerpaw-cmp site import farm.osm -o site.yaml",
+        "aerpaw-cmp site import munich.xml --origin 48.1372,11.5755 --tower BS=8.5,21,27 -o munich.yaml",
         "aerpaw-cmp site import fields.kml barns.geojson --base my_towers.yaml --untagged building -o site.yaml",
     ],
 )
 def site_import(
-    files: Annotated[list[Path], typer.Argument(help="Map files.")],
+    files: Annotated[list[Path], typer.Argument(help="Map files, or one Mitsuba XML.")],
     out: Annotated[Path, typer.Option("-o", "--out", help="The site.yaml to write.")],
-    base: Annotated[str, typer.Option(help="Site whose towers and settings are kept.")] = "lake_wheeler",
+    base: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Site whose towers and settings are kept. Default: lake_wheeler; none for a scene."),
+    ] = None,
+    origin: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Scene: latitude,longitude[,ground height] of its (0, 0, 0), or 'local'."),
+    ] = None,
+    tower: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="Scene: name=east,north,height [m] of an antenna; may be repeated."),
+    ] = None,
+    material: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Option(help="Scene: id=concrete for a material that says nothing about radio; may be repeated."),
+    ] = None,
+    turn: Annotated[float, typer.Option(help="Scene: degrees counter-clockwise that x lies from east.")] = 0.0,
+    merge_m: Annotated[float, typer.Option(help="Scene: corners of a face lie this near to one plane [m].")] = 1e-3,
     untagged: Annotated[
         Optional[Literal["building", "forest", "geofence"]],  # noqa: UP045
         typer.Option(help="What areas without a tag are."),
@@ -31,16 +49,50 @@ def site_import(
     force: Force = False,
     as_json: Json = False,
 ) -> None:
-    """Import footprints."""
-    from ..jobs import run
+    """Import footprints, or a scene."""
+    from ..jobs import run, site_scene
 
-    actions = run.run_site_import(files, out, base=base, untagged=untagged, force=force)
+    if len(files) == 1 and site_scene.is_scene(files[0]):
+        actions = site_scene.run_scene_import(
+            files[0],
+            out,
+            origin=origin,
+            base=base,
+            towers=tower or (),
+            materials=material or (),
+            turn_deg=turn,
+            merge_m=merge_m,
+            force=force,
+        )
+    else:
+        base = base or "lake_wheeler"
+        actions = run.run_site_import(files, out, base=base, untagged=untagged, force=force)
     if as_json:
         print_json({"file": str(out), "base": base, "actions": actions})
         return
     for line in actions:
         say(line)
     print(out)
+
+
+@command(
+    "export",
+    of=site_app,
+    text="A site as Mitsuba XML with PLY meshes, which sionna.rt.load_scene opens.",
+    examples=["aerpaw-cmp site export lake_wheeler --sionna scene", "aerpaw-cmp site export site.yaml --sionna out"],
+)
+def site_export(
+    site: Annotated[str, typer.Argument(help="site.yaml, or the name of a packaged site.")],
+    sionna: Annotated[Path, typer.Option("--sionna", help="Folder to write.")],
+    trees: Annotated[bool, typer.Option("--trees/--no-trees", help="Crowns and trunks, too.")] = True,
+    force: Force = False,
+    as_json: Json = False,
+) -> None:
+    """Write a site for Sionna."""
+    from ..jobs.site_scene import run_site_export
+
+    files = run_site_export(site, sionna, trees=trees, force=force)
+    print_files(files if as_json else files[:1], as_json)
 
 
 @command(

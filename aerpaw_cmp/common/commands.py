@@ -15,7 +15,7 @@ COMMANDS: dict[str, str] = {
     "map": "Coverage and rank maps of a site, Kriging of rank and its baselines.",
     "simulate": "Write the logs of a planned flight in the real formats, with their truth.",
     "sample": "Copy the sample flight, logs and flight.yaml, into a folder of your own.",
-    "site": "Import a site from map data (import) or look at one (show).",
+    "site": "Make a site of maps or of a Mitsuba scene (import), look at it (show), export it.",
     "bench": "Speed against error of the replay on this machine.",
     "doctor": "Is this machine ready? LLVM, Sionna RT, memory, serial ports, with remedies.",
 }

@@ -70,6 +70,8 @@ class PathCache:
         faces = scene.faces
         for polygon in faces.polygon:
             digest.update(b"-" if polygon is None else polygon.wkb)
+        if scene.surfaces is not None:
+            digest.update(scene.surfaces.corners_m.tobytes() + scene.surfaces.first.tobytes())
         columns = (faces.normal, faces.offset_m, faces.along, faces.lower, faces.upper, faces.solid)
         for column in (*columns, scene.sources_m, scene.usable, scene.excluded, targets_m):
             digest.update(str(column.shape).encode() + np.ascontiguousarray(column).tobytes())

@@ -273,12 +273,17 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
 
 
 def smaller_than_fresnel_zone(
-    faces: Faces, sources_m: FloatArray, targets_m: FloatArray, frequency_hz: float
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    frequency_hz: float,
+    area_m2: FloatArray | None = None,
 ) -> BoolArray:
     """Faces smaller than the first Fresnel zone of every link: they scatter, they are no mirrors.
 
     The zone on a face at distances d1 and d2 has the area ``pi lambda d1 d2 / (d1 + d2)`` at least; a face is
-    named only when it is smaller for the nearest source and the nearest target it can have.
+    named only when it is smaller for the nearest source and the nearest target it can have. ``area_m2`` (faces,) is
+    that of faces that do not fill their bounds; left out, it is that of their polygons.
 
     Parameters
     ----------
@@ -296,6 +301,7 @@ def smaller_than_fresnel_zone(
     for index, polygon in enumerate(faces.polygon):
         if polygon is not None:
             area[index] = polygon.area
+    area = area if area_m2 is None else area_m2
     near_source = _distance(faces, sources_m)
     near_target = _distance(faces, targets_m)
     total = near_source + near_target

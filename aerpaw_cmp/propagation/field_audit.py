@@ -383,7 +383,7 @@ def against_sionna(
     )
     theirs = own_coefficients(
         scene.faces, scene.sources_m, few, probe, turns, usable=scene.usable, excluded=scene.excluded,
-        max_depth=max_depth, samples=samples, batch=batch,
+        max_depth=max_depth, samples=samples, batch=batch, surfaces=scene.surfaces,
     )  # fmt: skip
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
@@ -391,7 +391,7 @@ def against_sionna(
     ours = replace(replay.paths.select(rows), pose=place[replay.paths.pose[rows]])
     mine, other = _matched(ours, replay.faces, theirs.paths, scene.faces)
     total = _paths_against_sionna(ours.select(mine), replay, scene, few, probe, theirs, other)
-    if complete and site.dem is None:
+    if complete and site.dem is None and site.scene is None:
         lacking = np.setdiff1d(np.arange(len(theirs.paths)), other)
         total += _lacking(site, replay, theirs.paths, scene.faces, lacking, few, expected)
     return replace(total, not_covered=covered)
@@ -458,6 +458,7 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
     theirs = own_channels(
         scene.faces, scene.sources_m, some, link,
         explicit=True, max_depth=max_depth, samples=EXPLICIT_SAMPLES, batch=EXPLICIT_POSES, usable=scene.usable,
+        surfaces=scene.surfaces,
     )  # fmt: skip
     ours = trace(site, link, some, "image", max_depth=max_depth, visibility="pairs").h  # without foliage
     size = np.abs(ours).max(axis=(2, 3))

@@ -280,7 +280,7 @@ def _grow(
                 f"the scene has more than {budget} face sequences of {now.shape[1] + 1} reflections "
                 f"({len(faces)} faces)",
                 expected="a rural scene with few faces",
-                cause="take engine 'sionna', a smaller max_depth, or leave out small faces",
+                cause="pip install 'aerpaw-cmp[fast]' searches such scenes; or a smaller max_depth",
             )
     return Sequences(np.concatenate(grown), np.concatenate(images))
 
@@ -494,8 +494,8 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
     """Paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
     plane = planes_of(faces)
     shared = np.append(np.bincount(plane)[plane] > 1, False)
-    rows = order[shared[paths.faces[order]].any(axis=1)]
     repeated = np.zeros(len(paths), dtype=np.bool_)
+    rows = order[shared[paths.faces[order]].any(axis=1)] if shared.any() else order[:0]
     if len(rows):
         same = np.append(plane, -1)[paths.faces[rows]]
         key = np.column_stack([paths.pose[rows], paths.tower[rows], same])

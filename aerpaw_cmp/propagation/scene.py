@@ -3,16 +3,23 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
+from importlib.util import find_spec
 
 import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
+from ..site.materials import material
+from ..site.meshes import building_mesh
+from ..site.mitsuba import TriangleScene
+from ..site.scenes import added
 from ..site.site import Site
 from .arrays import Link, Poses
 from .crowns import Crowns
 from .faces import inside_solids, site_faces
 from .paths import Faces, PathSet
+from .surfaces import Surfaces
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,12 +46,21 @@ class Scene:
         Faces that reflect for each tower.
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
+    extent_m : (points, 3), optional
+        Points that set the tolerance of the path search in place of the poses.
+    pairs : int
+        Element pairs of all links of the replay that this scene is a part of; 0 where it is the whole.
+    surfaces : Surfaces or None
+        Of a site with a scene of triangles: what its faces are made of. They stand in for ground planes.
     """
 
     faces: Faces
     sources_m: FloatArray
     usable: BoolArray
     excluded: BoolArray
+    surfaces: Surfaces | None = None
+    extent_m: FloatArray | None = None
+    pairs: int = 0
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
@@ -57,6 +73,12 @@ class Scene:
                 expected="one of " + ", ".join(site.towers),
                 cause="a typing error",
             )
+        surfaces = surfaces_of(site)
+        if surfaces is not None:
+            sources = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
+            excluded = inside_solids(site, poses.position_m)[None, :] | inside_solids(site, sources)[:, None]
+            usable = np.ones((len(names), len(surfaces)), dtype=np.bool_)
+            return cls(surfaces.faces, sources, usable, excluded, surfaces)
         faces = site_faces(site, names)
         towers = [site.towers[name] for name in names]
         sources = np.array([tower.position_m for tower in towers]).reshape(-1, 3)
@@ -92,3 +114,27 @@ class Scene:
         )
         more = np.zeros((len(self.usable), len(faces) - len(self.faces)), dtype=np.bool_)
         return replace(self, faces=faces, usable=np.concatenate([self.usable, more], axis=1)), paths
+
+
+def surfaces_of(site: Site) -> Surfaces | None:
+    """Faces of the site's scene of triangles and of the buildings beside it; None where it has no scene."""
+    if site.scene is None:
+        return None
+    scene = site.scene
+    for building in site.buildings:
+        scene = added(scene, *building_mesh(building), building.name, material(building.material).name)
+    return _merged(scene if site.buildings else site.scene, site.merge_m)
+
+
+@lru_cache(maxsize=2)
+def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
+    """Faces of a scene; the same scene is merged once."""
+    if find_spec("numba") is None:
+        raise UsageError(
+            "the site is a scene of triangles, and numba is not installed",
+            expected="pip install 'aerpaw-cmp[fast]'",
+            cause="its thousands of faces are searched by compiled code",
+        )
+    from .merging import merged  # compiled: loaded where there is a scene
+
+    return merged(scene, merge_m)

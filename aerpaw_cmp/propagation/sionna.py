@@ -7,8 +7,9 @@ Guards against what Sionna RT 2.2.0 does silently:
 
 - its hash table of candidates is shared by all receivers of a call and loses paths: a table of 2**24 slots and
   batches of at most 100 poses;
-- it drops paths past ``max_num_paths_per_src`` and corrupts memory when that is below the number of receivers: the
-  limit is 1e6 and a batch that comes near it is an error;
+- it drops candidates past ``max_num_paths_per_src``, of which most are no paths in the end, and corrupts memory when
+  that is below the number of receivers: its own count of candidates is read after each batch, and a batch that had
+  more than the limit, or filled too much of the table, is searched again with room for them;
 - positions given as numbers recompile kernels: they are arrays, and each batch has the same size (the last is padded);
 - a line of sight must have Friis' amplitude and no path a gain above one, or the run stops.
 """
@@ -16,6 +17,8 @@ Guards against what Sionna RT 2.2.0 does silently:
 from __future__ import annotations
 
 import gc
+import inspect
+import re
 from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -31,9 +34,25 @@ from .arrays import Array, Link, Poses
 from .faces import inside, triangles
 from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .paths import Faces, PathSet
+from .surfaces import Surfaces
 
 SPECULAR_TABLE_SLOTS = 2**24
 MAXIMUM_PATHS = 1_000_000
+"""Candidates per tower and batch that there is room for at first."""
+
+MOST_CANDIDATES = 2**25
+"""Room beyond which a batch is refused (some 100 bytes each)."""
+
+FULLEST_TABLE = 1 / 32
+"""Share of the table that candidates may fill: two hashes are asked, so about twice this share is lost."""
+
+MOST_SLOTS = 2**28
+"""Slots of the table, over all towers of a call (two tables of 4 bytes each)."""
+
+RAISE_LIMITS = True
+LAST_CANDIDATES = 0
+"""What the last batch had, for benchmarks."""
+
 LARGEST_BATCH = 100
 NO_SHAPE = 0xFFFFFFFF
 HALF_SPACE_THICKNESS_M = 10.0
@@ -102,27 +121,36 @@ class _Scene:
     """object id -> face of each triangle"""
 
 
-def _build(faces: Faces, chosen: IntArray, reach_m: float, carrier_hz: float, *, own_table: bool = False) -> _Scene:
+def _build(
+    faces: Faces,
+    chosen: IntArray,
+    reach_m: float,
+    carrier_hz: float,
+    *,
+    own_table: bool = False,
+    surfaces: Surfaces | None = None,
+) -> _Scene:
     """Scene of the faces ``chosen``: one mesh per material; ``own_table`` takes Sionna's own constants of P.2040."""
     import mitsuba as mi
     import sionna.rt as rt
 
     scene = rt.load_scene()
     scene.frequency = carrier_hz
-    vertices, triangle, owner = triangles(faces, reach_m)
+    vertices, triangle, owner = triangles(faces, reach_m) if surfaces is None else surfaces.mesh()
     objects = []
     owners = []
     for name in dict.fromkeys(faces.material[i] for i in chosen):
         members = [i for i in chosen if faces.material[i] == name]
         rows = np.flatnonzero(np.isin(owner, members))
         corners, place = np.unique(triangle[rows], return_inverse=True)
-        mesh = mi.Mesh(f"faces-{name}", vertex_count=len(corners), face_count=len(rows))
+        plain = re.sub(r"[^a-z0-9_]+", "-", name)
+        mesh = mi.Mesh(f"faces-{plain}", vertex_count=len(corners), face_count=len(rows))
         parameters = mi.traverse(mesh)
         parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices[corners], np.float32).ravel())
         parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
         parameters.update()
         objects.append(
-            rt.SceneObject(mi_mesh=mesh, name=f"faces-{name}", radio_material=_material(name, carrier_hz, own_table))
+            rt.SceneObject(mi_mesh=mesh, name=f"faces-{plain}", radio_material=_material(name, carrier_hz, own_table))
         )
         owners.append(owner[rows])
     scene.add(objects)
@@ -135,14 +163,15 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
     what = material(name)
     eta = what.relative_permittivity(carrier_hz)
     thick = HALF_SPACE_THICKNESS_M if what.thickness_m is None else what.thickness_m
+    plain = re.sub(r"[^a-z0-9_]+", "-", name)
     if own_table:
         from sionna.rt.radio_materials.itu import ITU_MATERIALS_PROPERTIES
 
-        if name in ITU_MATERIALS_PROPERTIES:
-            return rt.ITURadioMaterial(f"m-{name}", name, thickness=thick)
+        if name.partition(" with ")[0] in ITU_MATERIALS_PROPERTIES:
+            return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
-        f"m-{name}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
+        f"m-{plain}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
     )
 
 
@@ -230,10 +259,27 @@ class _Finder:
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
+        self.limit, self.slots, self.candidates = MAXIMUM_PATHS, SPECULAR_TABLE_SLOTS, None
         self.sources = sources.arguments(synthetic)
         self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
         self._replace_endpoints(len(sources.centres_m))
         self.solver = rt.PathSolver()
+        self._watch_candidates()
+
+    def _watch_candidates(self) -> None:
+        """Keep PathSolver's own count of candidates per source, which goes on counting beyond its limit."""
+        generator: Any = getattr(self.solver, "_candidate_generator", None)
+        inner = getattr(generator, "_shoot_and_bounce", None)
+        if inner is None:
+            return  # another release: then the count of valid paths is all there is
+        place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
+
+        def watched(*arguments: Any, **named: Any) -> Any:
+            given = arguments[place] if len(arguments) > place else None
+            self.candidates = named.get("paths_counter_per_source", given)
+            return inner(*arguments, **named)
+
+        generator._shoot_and_bounce = watched
 
     def _replace_endpoints(self, towers: int) -> None:
         """Give PathSolver arrays of positions: those of the devices would be literals in the kernels."""
@@ -272,7 +318,7 @@ class _Finder:
         return self.solver(
             self.built.scene,
             max_depth=max_depth,
-            max_num_paths_per_src=MAXIMUM_PATHS,
+            max_num_paths_per_src=self.limit,
             samples_per_src=samples,
             synthetic_array=self.synthetic,
             los=True,
@@ -282,15 +328,43 @@ class _Finder:
             diffraction=False,
         )
 
+    def _more_room(self) -> bool:
+        """Whether the last batch had more candidates than there was room for; then there is room for them now."""
+        from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
+
+        global LAST_CANDIDATES
+        most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
+        LAST_CANDIDATES = most
+        slots = self.slots
+        while most > FULLEST_TABLE * slots:
+            slots *= 2
+        slots = max(self.slots, min(slots, MOST_SLOTS // max(1, len(self.built.scene.transmitters))))
+        limit = self.limit
+        while most > limit:
+            limit *= 2
+        if limit > MOST_CANDIDATES:
+            raise CheckError(
+                f"a batch has {most} candidates of a path for one tower, more than PathSolver can hold",
+                expected=f"at most {MOST_CANDIDATES}",
+                cause="take fewer samples or a smaller batch, or engine 'image'",
+            )
+        if (limit, slots) == (self.limit, self.slots):
+            return False
+        self.limit, self.slots = limit, slots
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = slots
+        return True
+
     def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
         """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
+        while max_depth and RAISE_LIMITS and self._more_room():
+            paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
         valid = paths.valid.numpy()
-        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * MAXIMUM_PATHS:
+        if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * self.limit:
             raise CheckError(
-                f"a tower has nearly {MAXIMUM_PATHS} paths in one batch, beyond which Sionna drops paths",
+                f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
         return {
@@ -313,6 +387,7 @@ def find_paths(
     batch: int = 50,
     usable: BoolArray | None = None,
     excluded: BoolArray | None = None,
+    surfaces: Surfaces | None = None,
     variant: str | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
@@ -328,6 +403,8 @@ def find_paths(
         Rays per tower and batch.
     batch : int
         Poses per call, at most 100; bounds the memory.
+    surfaces : Surfaces, optional
+        What the faces are made of, where they are open surfaces.
     variant : {"cuda", "llvm"}, optional
 
     Returns
@@ -347,18 +424,22 @@ def find_paths(
         if not len(poses):
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        built = _build(faces, chosen, reach, carrier_hz)
+        built = _build(faces, chosen, reach, carrier_hz, surfaces=surfaces)
         with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch) as finder:
             for start in range(0, len(poses), batch):
                 some = poses[start : start + batch]
                 raw = finder.solve(targets_m[some], max_depth, samples)
                 _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
                 pose, tower, sequence = _sequences(raw, built.face_of, some, towers, max_depth)
-                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m))
+                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces))
                 if progress:
                     progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
         del built
-    found = merge(pieces, max_depth, faces)
+    found = merge(pieces, max_depth, faces if surfaces is None else None)
+    if surfaces is not None:
+        from .growth import without_coincident
+
+        found = without_coincident(found, surfaces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
 
 
@@ -393,6 +474,7 @@ def own_coefficients(
     max_depth: int = 2,
     samples: int = 1_000_000,
     batch: int = 50,
+    surfaces: Surfaces | None = None,
 ) -> Coefficients:
     """Sionna's complex coefficient of each path, for the audit of the field.
 
@@ -401,7 +483,7 @@ def own_coefficients(
 
     Parameters
     ----------
-    faces, sources_m, usable, excluded, max_depth, samples, batch
+    faces, sources_m, usable, excluded, max_depth, samples, batch, surfaces
         As in :func:`find_paths`.
     poses : Poses
     probe : Link
@@ -421,7 +503,7 @@ def own_coefficients(
     for sharing, chosen in _groups(faces, sources_m, usable):
         for name in dict.fromkeys(arrays[t].patterns[0].name for t in sharing):
             towers = np.array([t for t in sharing if arrays[t].patterns[0].name == name])
-            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True)
+            built = _build(faces, chosen, reach, probe.carrier_hz, own_table=True, surfaces=surfaces)
             ends = _Ends(sources_m[towers], turns[0][towers], np.zeros((1, 3)))
             patterns = (name, probe.uav_array.patterns[0].name)
             with _Finder(built, ends, np.zeros((1, 3)), batch, patterns=patterns) as finder:
@@ -497,12 +579,13 @@ def own_channels(
     samples: int = 1_000_000,
     batch: int = 50,
     usable: BoolArray | None = None,
+    surfaces: Surfaces | None = None,
 ) -> ComplexArray:
     """Channel matrices as Sionna itself gives them, for comparison only: float32 phases.
 
     Parameters
     ----------
-    faces, sources_m, max_depth, samples, batch, usable
+    faces, sources_m, max_depth, samples, batch, usable, surfaces
         As in :func:`find_paths`.
     poses : Poses
     link : Link
@@ -524,7 +607,7 @@ def own_channels(
     for towers, chosen in _groups(faces, sources_m, usable):
         mounts = np.stack([arrays[t].mount for t in towers])
         sources = _Ends(sources_m[towers], mounts, arrays[0].positions_m)
-        built = _build(faces, chosen, reach, link.carrier_hz)
+        built = _build(faces, chosen, reach, link.carrier_hz, surfaces=surfaces)
         with _Finder(built, sources, link.uav_array.positions_m, batch, synthetic=not explicit) as finder:
             for start in range(0, len(poses), batch):
                 rows = slice(start, start + batch)
@@ -599,6 +682,7 @@ def _refine(
     tower: IntArray,
     sequence: IntArray,
     tolerance_m: float,
+    surfaces: Surfaces | None = None,
 ) -> PathSet:
     """Reflection points in float64; paths whose points miss their faces are dropped."""
     rows = np.column_stack([pose, tower, sequence])
@@ -609,6 +693,15 @@ def _refine(
     good = np.linalg.norm(targets_m[pose] - sources_m[tower], axis=1) >= MINIMUM_LENGTH_M
     for number in np.unique(depth[depth > 0]):
         some = np.flatnonzero(depth == number)
+        if surfaces is not None:
+            from .growth import reflection_points
+
+            ends = (sources_m[tower[some]], targets_m[pose[some]])
+            sequence[some, :number], vertices[some, :number], fits = reflection_points(
+                surfaces, sequence[some, :number], *ends, edge_m=EDGE_TOLERANCE_M
+            )
+            good[some] &= fits
+            continue
         part = _relocate(faces, sources_m[tower[some]], targets_m[pose[some]], sequence[some, :number], tolerance_m)
         sequence[some, :number] = part
         images = images_of(faces, part, sources_m[tower[some]])

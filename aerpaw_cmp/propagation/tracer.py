@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
@@ -18,6 +19,7 @@ from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import channel_matrices, mean_pair_power, rss_dbm
+from .compiled import ENOUGH_WORK
 from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .paths import Faces, PathSet
@@ -140,6 +142,7 @@ def replay(
     visibility: Visibility = "centre",
     variant: str | None = None,
     threads: int | None = None,
+    whole: Whole | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -179,6 +182,8 @@ def replay(
         ``sionna`` only.
     threads : int, optional
         Of compiled code (default: the cores this process may use); results do not depend on it.
+    whole : Whole, optional
+        What the poses are a part of; see :func:`replay_parts`.
     progress : callable, optional
         Called with the share done.
 
@@ -202,6 +207,8 @@ def replay(
     started = time.perf_counter()
     poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
+    if whole is not None:
+        scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
@@ -219,7 +226,9 @@ def replay(
         left_out += cache.told if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
-    if crowns is not None:
+    if crowns is not None and scene.surfaces is not None:
+        left_out += ["reflections off crowns: they are not searched in a scene of triangles"]
+    elif crowns is not None:
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
@@ -237,6 +246,83 @@ def replay(
         samples_reason=choice.reason if choice else "",
     )
 
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """What a part of a replay must know of the others, so that it is the same as in one piece.
+
+    Parameters
+    ----------
+    extent_m : (points, 3)
+        Points that span all poses: they set the tolerance of the path search.
+    pairs : int
+        Element pairs of all links: they decide whether compiled code is worth loading.
+    """
+
+    extent_m: FloatArray
+    pairs: int
+
+
+POSES_PER_PART = 8192
+"""Poses replayed at once by :func:`replay_parts`: some 40 MB for five towers with 4 x 4 elements."""
+
+
+def replay_parts(
+    site: Site,
+    link: Link,
+    poses: Poses | Iterable[Poses],
+    engine: Engine = "image",
+    *,
+    extent_m: FloatArray | None = None,
+    poses_per_part: int = POSES_PER_PART,
+    **options: Any,
+) -> Iterator[Replay]:
+    """Replay a flight part by part, in the memory of one part.
+
+    Parameters
+    ----------
+    site, link, engine
+        As for :func:`replay`.
+    poses : Poses or iterable of Poses
+        Of the whole flight, or in parts that are made as they are asked for.
+    extent_m : (points, 3), optional
+        Points that span all poses; needed where ``poses`` comes in parts.
+    poses_per_part : int
+        Where it comes in one piece.
+    **options
+        Of :func:`replay`.
+
+    Yields
+    ------
+    Replay
+        Of each part; together bit by bit what :func:`replay` gives for all poses at once.
+
+    Raises
+    ------
+    UsageError
+        Parts without ``extent_m``; what :func:`replay` raises.
+    """
+    if isinstance(poses, Poses):
+        known, _ = _within_reach(site, poses)
+        good = known.position_m[np.isfinite(known.position_m).all(axis=1)]
+        extent = np.stack([good.min(axis=0), good.max(axis=0)]) if len(good) else np.zeros((0, 3))
+        whole = Whole(extent, _pairs(link, poses))
+        starts = range(0, len(poses), poses_per_part)
+        runs = (slice(start, start + poses_per_part) for start in starts)
+        parts: Iterable[Poses] = (Poses(poses.position_m[run], poses.rotation[run]) for run in runs)
+    elif extent_m is None:
+        raise UsageError("poses in parts without extent_m", expected="points that span all of them")
+    else:
+        whole, parts = Whole(np.asarray(extent_m, dtype=np.float64), ENOUGH_WORK), poses
+    for part in parts:
+        yield replay(site, link, part, engine, whole=whole, **options)
+
+
+MANY_FACES = 400
+"""Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
+
+MOST_NAMED = 50
+"""Small faces that are named one by one; more are counted."""
 
 PAIRS_DIFFER = 1e-9
 """Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
@@ -276,7 +362,7 @@ def _by_pairs(
         one = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
         paths, _ = _above_terrain(site, several, spots, _search(several, one, spots, settings, None))
         found = several
-        if crowns is not None:
+        if crowns is not None and several.surfaces is None:
             found, bounces = several.with_bounces(site, spots, crowns, settings.max_depth)
             paths = image.merge([paths, bounces], settings.max_depth, None)
         loss_db = None if loss is None else loss(paths, found.sources_m, spots.position_m)
@@ -360,8 +446,11 @@ def _buried_towers(site: Site, link: Link) -> list[str]:
 def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
     """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
     good = np.isfinite(poses.position_m).all(axis=1)
-    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz)
+    area = None if scene.surfaces is None else scene.surfaces.area_m2
+    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz, area)
     left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
+    if len(left_out) > MOST_NAMED:
+        left_out = [f"{len(left_out)} faces smaller than the first Fresnel zone, such as {left_out[0].split(':')[0]}"]
     return replace(scene, usable=scene.usable & ~small), left_out
 
 
@@ -398,7 +487,8 @@ def _search_relevant(
         usable=scene.usable,
         excluded=scene.excluded,
         select=chooser,
-        work=_pairs(link, poses),
+        extent_m=scene.extent_m,
+        work=scene.pairs or _pairs(link, poses),
         threads=settings.threads,
         progress=progress,
     )
@@ -440,6 +530,30 @@ def _search(
     progress: Callable[[float], None] | None,
 ) -> PathSet:
     """Paths by the engine that the settings name."""
+    if settings.engine == "image" and scene.surfaces is not None:
+        from .growth import grow_paths  # compiled: loaded where there is a scene
+
+        return grow_paths(
+            scene.surfaces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )[0]
+    if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
+        from .prisms import find_paths  # compiled: loaded where there are many faces
+
+        return find_paths(
+            scene.faces,
+            scene.sources_m,
+            poses.position_m,
+            max_depth=settings.max_depth,
+            usable=scene.usable,
+            excluded=scene.excluded,
+            progress=progress,
+        )[0]
     if settings.engine == "image":
         return image.find_paths(
             scene.faces,
@@ -448,7 +562,8 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
-            work=_pairs(link, poses),
+            extent_m=scene.extent_m,
+            work=scene.pairs or _pairs(link, poses),
             threads=settings.threads,
             progress=progress,
         )
@@ -464,6 +579,7 @@ def _search(
         batch=settings.batch,
         usable=scene.usable,
         excluded=scene.excluded,
+        surfaces=scene.surfaces,
         variant=settings.variant,
         progress=progress,
     )
@@ -515,16 +631,19 @@ def _evaluate(
 ) -> Replay:
     """Fields of the paths; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads)
+    work = scene.pairs or None
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
     above_floor = np.isfinite(level_dbm)
+    h = fields.h
+    h[~above_floor] = 0.0
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=np.where(above_floor[:, :, None, None], fields.h, 0.0),
+        h=h,
         has_path=has_path & above_floor,
         paths=paths,
         faces=scene.faces,

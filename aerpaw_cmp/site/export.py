@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from xml.sax.saxutils import quoteattr
 
@@ -10,6 +12,7 @@ import numpy as np
 
 from ..common.outputs import told
 from .materials import (
+    CONSTANT,
     CROWN,
     CROWN_ATTENUATION_DB_PER_M,
     CROWN_PERMITTIVITY,
@@ -46,23 +49,48 @@ def export_scene(
         The files written, the XML file first.
     """
     folder = Path(folder)
-    meshes = site_meshes(site, trees=trees)
+    parts = _parts(site, trees)
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
-    lines += [_bsdf(name, gamma_db_per_m) for name in meshes]
+    lines += [_bsdf(name, gamma_db_per_m) for name in dict.fromkeys(name for _, name, _ in parts)]
     written = [folder / "scene.xml"]
     with told(folder):
         folder.mkdir(exist_ok=True)
         (folder / "meshes").mkdir(exist_ok=True)
-        for name, mesh in meshes.items():
-            written.append(folder / "meshes" / f"{name}.ply")
+        for title, name, mesh in parts:
+            written.append(folder / "meshes" / f"{title}.ply")
             write_ply(mesh, written[-1])
             lines.append(
-                f'<shape type="ply" id={quoteattr("mesh-all_" + name)}>'
-                f'<string name="filename" value="meshes/{name}.ply"/>'
+                f'<shape type="ply" id={quoteattr("mesh-" + title)}>'
+                f'<string name="filename" value="meshes/{title}.ply"/>'
                 f'<boolean name="face_normals" value="true"/><ref id={quoteattr(_bsdf_id(name))} name="bsdf"/></shape>'
             )
         written[0].write_text("\n".join([*lines, "</scene>", ""]), encoding="utf-8")
     return written
+
+
+def _parts(site: Site, trees: bool) -> list[tuple[str, str, Mesh]]:
+    """File name, material and mesh of each shape."""
+    meshes = dict(site_meshes(site, trees=trees))
+    if site.scene is None:
+        return [(f"all_{_plain(name)}", name, mesh) for name, mesh in meshes.items()]
+    scene, parts = site.scene, []
+    for number, (label, name) in enumerate(zip(scene.shapes, scene.materials, strict=True)):
+        triangles = scene.triangles[scene.shape == number]
+        used, place = np.unique(triangles, return_inverse=True)
+        mesh = Mesh(scene.vertices_m[used], place.reshape(-1, 3), np.zeros(len(triangles), dtype=np.int64), (label,))
+        parts.append((f"{number}_{_plain(label.removeprefix('mesh-'))[:60]}", name, mesh))
+    # the scene has its own ground
+    ground = material(site.ground_material).name
+    beside = {name: mesh for name, mesh in meshes.items() if name != ground or set(mesh.labels) != {"ground"}}
+    if ground in beside:
+        mesh = beside[ground]
+        beside[ground] = replace(mesh, triangles=mesh.triangles[mesh.owner != mesh.labels.index("ground")])
+    return parts + [(f"all_{_plain(name)}", name, mesh) for name, mesh in beside.items()]
+
+
+def _plain(name: str) -> str:
+    """A name as a file name and an identifier."""
+    return re.sub(r"[^A-Za-z0-9_-]+", "-", name)
 
 
 def _comment(site: Site) -> str:
@@ -74,7 +102,10 @@ def _comment(site: Site) -> str:
 
 
 def _bsdf_id(name: str) -> str:
-    return f"mat-{name}" if name == CROWN else f"mat-itu_{name}"
+    if name == "vacuum":
+        return "absorber"
+    # Sionna takes an id that begins with mat-itu_ for a material of P.2040
+    return f"mat-{_plain(name)}" if name == CROWN or name.startswith(CONSTANT) else f"mat-itu_{_plain(name)}"
 
 
 def _bsdf(name: str, gamma_db_per_m: float) -> str:
@@ -82,14 +113,25 @@ def _bsdf(name: str, gamma_db_per_m: float) -> str:
         sigma = lossy_conductivity_s_per_m(CROWN_PERMITTIVITY, gamma_db_per_m)
         values = {"relative_permittivity": CROWN_PERMITTIVITY, "conductivity": sigma, "thickness": 2.5}
         return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
-    thickness = material(name).thickness_m
-    inner = f'<string name="type" value="{name}"/>'
+    what = material(name)
+    thickness = what.thickness_m
+    if name.startswith(CONSTANT):
+        eta = what.relative_permittivity(1e9)
+        values = {
+            "relative_permittivity": eta.real,
+            "conductivity": what.conductivity_s_per_m(1e9),
+            "thickness": HALF_SPACE_THICKNESS_M if thickness is None else thickness,
+        }
+        return f'<bsdf type="radio-material" id="{_bsdf_id(name)}">' + _floats(values) + "</bsdf>"
+    if name == "vacuum":
+        return f'<bsdf type="absorber-radio-material" id="{_bsdf_id(name)}"/>'
+    inner = f'<string name="type" value="{name.partition(" with ")[0]}"/>'
     inner += _floats({"thickness": HALF_SPACE_THICKNESS_M if thickness is None else thickness})
     return f'<bsdf type="itu-radio-material" id="{_bsdf_id(name)}">{inner}</bsdf>'
 
 
 def _floats(values: Mapping[str, float]) -> str:
-    return "".join(f'<float name="{name}" value="{value:.6g}"/>' for name, value in values.items())
+    return "".join(f'<float name="{name}" value="{value:.9g}"/>' for name, value in values.items())
 
 
 def write_ply(mesh: Mesh, path: Path) -> None:

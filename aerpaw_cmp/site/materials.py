@@ -174,12 +174,14 @@ def face_material(name: str) -> Material:
 
 
 def material(name: str) -> Material:
-    """A material of ITU-R P.2040 by name.
+    """A material of ITU-R P.2040 by name, or one that its name describes.
 
     Parameters
     ----------
     name : str
-        Such as ``"concrete"``, ``"itu_concrete"`` or ``"itu-concrete"``.
+        Such as ``"concrete"``, ``"itu_concrete"`` or ``"itu-concrete"``; with a thickness of its own [m]
+        ``"concrete with thickness=0.1"``; one of constant permittivity and conductivity [S/m]
+        ``"constant with permittivity=3.5 conductivity=0.02 thickness=0.1"``.
 
     Returns
     -------
@@ -196,7 +198,14 @@ def material(name: str) -> Material:
     (5.24-0.636...j)
     >>> material("medium_dry_ground").thickness_m is None
     True
+    >>> material("concrete with thickness=0.1").thickness_m
+    0.1
+    >>> material("constant with permittivity=3.5 conductivity=0").relative_permittivity(28e9)
+    (3.5-0j)
     """
+    plain, _, said = name.partition(" with ")
+    if said:
+        return _stated(plain, said, name)
     key = name.strip().lower().replace("-", "_").replace(" ", "_").removeprefix("itu_")
     if key not in _TABLE:
         near = difflib.get_close_matches(key, _TABLE, n=1, cutoff=0.4)
@@ -206,3 +215,34 @@ def material(name: str) -> Material:
             cause=f"did you mean '{near[0]}'?" if near else None,
         )
     return Material(key, _TABLE[key], _THICKNESS_M[key])
+
+
+def _stated(plain: str, said: str, name: str) -> Material:
+    """A material whose name says its numbers."""
+    known = {"thickness"} if plain != CONSTANT else {"thickness", "permittivity", "conductivity"}
+    try:
+        values = {key: float(value) for key, value in (word.split("=") for word in said.split())}
+    except ValueError:
+        values = {"?": math.nan}
+    good = set(values) <= known and all(math.isfinite(value) and value >= 0.0 for value in values.values())
+    if not good or (plain == CONSTANT and not values.get("permittivity", 0.0) >= 1.0):
+        raise UsageError(
+            f"unknown material '{name}'",
+            expected="'concrete with thickness=0.1' or 'constant with permittivity=3.5 conductivity=0.02'",
+        )
+    thickness = values.get("thickness")
+    if plain != CONSTANT:
+        one = material(plain)
+        return Material(f"{one.name} with thickness={thickness:.9g}", one.bands, thickness or 1e-9)
+    band = (0.0, math.inf, values["permittivity"], 0.0, values.get("conductivity", 0.0), 0.0)
+    return Material(stated_name(band[2], band[4], thickness), (band,), None if thickness is None else thickness or 1e-9)
+
+
+CONSTANT = "constant"
+"""Begins the name of a material that is not of ITU-R P.2040; its numbers follow."""
+
+
+def stated_name(permittivity: float, conductivity_s_per_m: float, thickness_m: float | None) -> str:
+    """Name of a material of constant permittivity and conductivity."""
+    end = "" if thickness_m is None else f" thickness={thickness_m:.9g}"
+    return f"{CONSTANT} with permittivity={permittivity:.9g} conductivity={conductivity_s_per_m:.9g}{end}"

@@ -16,6 +16,7 @@ from ..common.geodesy import SiteFrame
 from ..common.units import FloatArray
 from .dem import Dem
 from .heights import VerticalDatum
+from .mitsuba import TriangleScene
 
 
 @dataclass(frozen=True, slots=True)
@@ -141,6 +142,10 @@ class Site:
         What up = 0 is in other height references, and how high the take-off point lies.
     dem : Dem or None
         Ground heights; blocks lines of sight.
+    scene : TriangleScene or None
+        Open surfaces in the site frame, which stand in for the ground plane. Buildings stand beside them.
+    merge_m : float
+        How far from one plane the corners of a face of the scene may lie [m].
     """
 
     name: str
@@ -156,3 +161,5 @@ class Site:
     notes: tuple[str, ...] = ()
     datum: VerticalDatum = field(default_factory=VerticalDatum)
     dem: Dem | None = None
+    scene: TriangleScene | None = None
+    merge_m: float = 1e-3

@@ -25,6 +25,8 @@ from ..common.yamlfile import LineOf, Location, StrictModel, load_yaml_and_lines
 from .dem import Dem, read_dem
 from .heights import Height, HeightReference, VerticalDatum
 from .materials import material
+from .mitsuba import TriangleScene
+from .scenes import placed_scene
 from .site import Building, Forest, Geofence, Site, Tower, Trees
 from .trees import Distribution, TreeSizes, join_trees, place_trees, trees_at, wanted_trees
 
@@ -267,6 +269,18 @@ class DemModel(SiteBase):
     reference: Literal[HeightReference.ORTHOMETRIC, HeightReference.ELLIPSOIDAL] = HeightReference.ORTHOMETRIC
 
 
+class SceneModel(SiteBase):
+    """A scene of triangles; a relative path starts at the folder of site.yaml."""
+
+    path: str
+    sha256: str | None = None
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    turn_deg: float = 0.0
+    materials: dict[str, MaterialName] = Field(default_factory=dict)
+    merge_m: Annotated[float, Field(gt=0, le=0.1)] = 1e-3
+    ground_plane: bool = False
+
+
 class SiteModel(SiteBase):
     """The whole of site.yaml."""
 
@@ -276,6 +290,7 @@ class SiteModel(SiteBase):
     coordinates: str | None = None
     tower_ground: Ground | None = None
     dem: DemModel | None = None
+    scene: SceneModel | None = None
     ground_material: MaterialName = "medium_dry_ground"
     area_m: tuple[float, float, float, float] | None = None
     buildings: list[BuildingModel] = Field(default_factory=list)
@@ -373,6 +388,9 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         dem = _dem(model, frame, folder or Path())
     datum = VerticalDatum(_origin_ground(model, dem), model.origin.takeoff_ground_m)
     notes = list(model.notes)
+    with _at("scene"):
+        scene, scene_notes = _scene(model, folder or Path())
+        notes += scene_notes
     towers = {}
     for name, tower in model.towers.items():
         with _at("towers", name):
@@ -402,7 +420,27 @@ def build_site(model: SiteModel, folder: Path | None = None) -> Site:
         notes=tuple(notes),
         datum=datum,
         dem=dem,
+        scene=scene,
+        merge_m=1e-3 if model.scene is None else model.scene.merge_m,
     )
+
+
+def _scene(model: SiteModel, folder: Path) -> tuple[TriangleScene | None, list[str]]:
+    """The scene of triangles, where the site has one, and what was repaired in it."""
+    if model.scene is None:
+        return None, []
+    if model.dem is not None:
+        raise UsageError("a scene and an elevation model", expected="one of them", cause="the scene has its own ground")
+    what = model.scene
+    scene = placed_scene(
+        folder / what.path,
+        materials=what.materials,
+        sha256=what.sha256,
+        offset_m=what.offset_m,
+        turn_deg=what.turn_deg,
+        ground_plane=model.ground_material if what.ground_plane else None,
+    )
+    return scene, list(scene.notes)
 
 
 def extent_m(model: SiteModel, frame: SiteFrame) -> Area:

@@ -226,6 +226,17 @@ def check_gpx(folder, frames, data):
     assert "above the ground" in book.tracks[0].description
 
 
+def valid_kml(folder, text):
+    """Against the schema of the OGC."""
+    from fastkml import validator
+
+    (folder / "doc.kml").write_text(text, encoding="utf-8")
+    try:
+        return bool(validator.validate(file_to_validate=folder / "doc.kml"))
+    except AssertionError:
+        return False
+
+
 def check_kmz(folder, frames, data):
     fastkml = pytest.importorskip("fastkml")
     with zipfile.ZipFile(folder / "samples.kmz") as archive:
@@ -233,6 +244,8 @@ def check_kmz(folder, frames, data):
         text = archive.read("doc.kml").decode()
         legends = [name for name in archive.namelist() if name.startswith("legends/")]
     book = fastkml.KML.from_string(text.split("?>\n", 1)[1])
+    assert valid_kml(folder, text)
+    assert not valid_kml(folder, text.replace("<TimeSpan>", "<TimeSpam>").replace("</TimeSpan>", "</TimeSpam>"))
     document = book.features[0]
     folders = {f.name: f for f in document.features if isinstance(f, fastkml.Folder)}
     towers = folders.pop("Towers")

@@ -11,7 +11,7 @@ from pyproj import Geod
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.site.heights import Height, HeightReference, VerticalDatum
-from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SiteModel, build_site, load_site
+from aerpaw_cmp.site.siteyaml import MAST_CLEARANCE_M, SceneModel, SiteModel, build_site, load_site
 
 MINIMAL = """\
 name: test
@@ -215,7 +215,10 @@ def test_the_documented_site_is_valid() -> None:
     text = (Path(__file__).parents[2] / "docs" / "site.md").read_text(encoding="utf-8")
     model = parse_yaml(text.split("```yaml\n")[1].split("```")[0], SiteModel)
     assert model.dem is not None
-    assert set(type(model).model_fields) == model.model_fields_set  # the page shows every key
+    # the page shows every key; a scene is no companion of an elevation model and has a block of its own
+    assert set(type(model).model_fields) == model.model_fields_set | {"scene"}
+    scene = parse_yaml(text.split("```yaml\nscene:\n")[1].split("```")[0].replace("\n  ", "\n").strip(), SceneModel)
+    assert set(SceneModel.model_fields) == scene.model_fields_set
     site = build_site(model)
     assert site.towers["LW2"].position_m[2] == pytest.approx(10.0)
     assert len(site.trees) > 10

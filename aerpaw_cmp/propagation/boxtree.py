@@ -1,0 +1,162 @@
+"""A tree of boxes over triangles, faces or points, compiled; and what a search asks of it.
+
+Nodes are columns: bounds, the first of two children (or -1), and for leaves the items they hold. Every answer of the
+tree is conservative; what decides is computed on the items themselves, in float64.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ..common.units import FloatArray
+from .surfaces import BoxTree
+
+DEEPEST = 64
+"""Nodes that wait while a tree is walked: twice its depth for 4e9 items."""
+
+
+def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
+    """Tree over boxes (n, 3), halved at the median of their middles along the longest side.
+
+    Parameters
+    ----------
+    lower, upper : (n, 3)
+    leaf : int
+        Most items of a leaf.
+    """
+    lower, upper = np.ascontiguousarray(lower, np.float64), np.ascontiguousarray(upper, np.float64)
+    return BoxTree(*_build(lower, upper, leaf))
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
+    n = len(lower)
+    most = max(1, 2 * n)
+    low, high = np.empty((most, 3)), np.empty((most, 3))
+    child = np.full(most, -1, np.int64)
+    start, count = np.zeros(most, np.int64), np.zeros(most, np.int64)
+    items = np.arange(n)
+    middle = 0.5 * (lower + upper)
+    nodes = 1
+    start[0], count[0] = 0, n
+    todo = np.empty(DEEPEST, np.int64)
+    todo[0] = 0
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        first, many = start[node], count[node]
+        for axis in range(3):
+            low[node, axis], high[node, axis] = np.inf, -np.inf
+            for k in range(first, first + many):
+                low[node, axis] = min(low[node, axis], lower[items[k], axis])
+                high[node, axis] = max(high[node, axis], upper[items[k], axis])
+        if many <= leaf:
+            continue
+        longest, widest = 0, -1.0
+        for axis in range(3):
+            least, most_ = np.inf, -np.inf
+            for k in range(first, first + many):
+                value = middle[items[k], axis]
+                least, most_ = min(least, value), max(most_, value)
+            if most_ - least > widest:
+                longest, widest = axis, most_ - least
+        mine = items[first : first + many].copy()
+        order = np.argsort(middle[mine, longest])
+        items[first : first + many] = mine[order]
+        half = many // 2
+        child[node] = nodes
+        start[nodes], count[nodes] = first, half
+        start[nodes + 1], count[nodes + 1] = first + half, many - half
+        todo[waiting], todo[waiting + 1] = nodes, nodes + 1
+        waiting += 2
+        nodes += 2
+    return (
+        low[:nodes].copy(),
+        high[:nodes].copy(),
+        child[:nodes].copy(),
+        start[:nodes].copy(),
+        count[:nodes].copy(),
+        items,
+    )
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
+    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many."""
+    lower, upper, child, start, count, items = tree
+    todo = np.empty(DEEPEST, np.int64)
+    todo[0] = 0
+    waiting, total = 1, 0
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        out = False
+        for axis in range(3):
+            if lower[node, axis] > high[axis] or upper[node, axis] < low[axis]:
+                out = True
+        if out:
+            continue
+        if child[node] >= 0:
+            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+            waiting += 2
+        else:
+            for k in range(start[node], start[node] + count[node]):
+                found[total] = items[k]
+                total += 1
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
+    """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
+
+    A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
+    """
+    lower, upper, child, start, count, items = tree
+    todo = np.empty(DEEPEST, np.int64)
+    todo[0] = 0
+    waiting, total = 1, 0
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        if box_outside(lower, upper, node, planes, many):
+            continue
+        if child[node] >= 0:
+            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+            waiting += 2
+        else:
+            for k in range(start[node], start[node] + count[node]):
+                found[total] = items[k]
+                total += 1
+    return total
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
+    """Whether a box lies wholly outside one of the planes."""
+    for p in range(many):
+        a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
+        best = planes[p, 3]
+        best += a * (upper[node, 0] if a > 0.0 else lower[node, 0])
+        best += b * (upper[node, 1] if b > 0.0 else lower[node, 1])
+        best += c * (upper[node, 2] if c > 0.0 else lower[node, 2])
+        if best < 0.0:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
+    """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box."""
+    enter, leave = 0.0, 1.0
+    for axis in range(3):
+        one = (lower[node, axis] - a[axis]) * inverse[axis]
+        two = (upper[node, axis] - a[axis]) * inverse[axis]
+        if one > two:
+            one, two = two, one
+        # rounding must not lose a box that is only just met
+        enter = max(enter, one - 1e-12 * abs(one))
+        leave = min(leave, two + 1e-12 * abs(two))
+    return enter > leave

@@ -1,0 +1,830 @@
+"""Every specular path among thousands of faces: sequences grown face by face along beams, compiled.
+
+The source is mirrored at a first face. The beam from that image through the face's outline meets the tree of faces;
+those that it meets are second faces, and so on. At each step the receivers, in a tree of their own, are cut by all
+side planes of the beam: those of the last face and those of the faces before it, mirrored. What is left is computed:
+reflection points, whether each lies in its face, whether a triangle cuts a segment. First faces that lie wholly in the
+shadow of one convex face are left out. All cuts are conservative, so the paths are the same with each of them off.
+
+Pairs are streamed: memory does not grow with their number.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray, IntArray
+from .boxtree import box_missed, box_outside, box_tree, within_planes
+from .compiled import in_threads, thread_count
+from .image import MINIMUM_LENGTH_M, merge
+from .merging import WINDOW
+from .paths import PathSet
+from .surfaces import Surfaces
+
+SIDE_M = 1e-6
+"""Closer to a plane than this [m] is on it."""
+
+END_M = 1e-3
+"""A surface closer to an antenna than this [m] does not hide it: it is mounted there."""
+
+SLACK_M = 1e-5
+"""Outlines are this much larger in the cuts than they are [m], so that no cut loses a path to rounding."""
+
+EDGE_M = 1e-6
+"""How far outside its triangles a reflection point may lie [m]: the seams inside a face."""
+
+GRAZING = 0.05
+"""Cosine below which a convex face is not asked whether it hides another one wholly."""
+
+SOLID_MARGIN = 1e-6
+"""Share of a triangle's height by which a segment must meet it to cut it beyond doubt."""
+
+FIRST_CHUNK = 64
+"""First faces whose search gives the estimate for the others."""
+
+Progress = Callable[[float], None]
+
+
+class _Mirrors(NamedTuple):
+    """Faces as the compiled code takes them."""
+
+    normal: FloatArray
+    offset: FloatArray
+    along: FloatArray
+    across: FloatArray
+    window: FloatArray
+    convex: BoolArray
+    plane: IntArray
+    front_only: BoolArray
+    usable: BoolArray
+    first: IntArray
+    flat: FloatArray
+
+
+class _Rules(NamedTuple):
+    """Tolerances and switches of a search."""
+
+    depth: int
+    clearance: float
+    end: float
+    margin: float
+    side: float
+    beams: bool
+    longest: float
+    shadows: bool
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Effort:
+    """What a search took.
+
+    Parameters
+    ----------
+    sequences : int
+        Sequences of at least one face that were followed.
+    candidates : int
+        Paths before anything was asked to hide them.
+    hidden : int
+        First faces in the shadow of one convex face, over all sources.
+    seconds : float
+        Wall clock.
+    estimate_s : float
+        What was expected after the first faces.
+    """
+
+    sequences: int = 0
+    candidates: int = 0
+    hidden: int = 0
+    seconds: float = 0.0
+    estimate_s: float = 0.0
+
+
+def grow_paths(
+    surfaces: Surfaces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    max_depth: int = 2,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    beams: bool = True,
+    shadows: bool = True,
+    longest_m: float = np.inf,
+    threads: int | None = None,
+    progress: Progress | None = None,
+    told: Callable[[str], None] | None = None,
+    solids: bool = False,
+) -> tuple[PathSet, Effort]:
+    """All paths with at most ``max_depth`` reflections.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+        NaN positions have no path.
+    max_depth : int
+        0 to 3.
+    usable : (towers, faces) bool, optional
+        Faces that may reflect for each tower. All faces hide.
+    excluded : (towers, poses) bool, optional
+        Links without any path.
+    beams : bool
+        False follows every sequence of faces: the same paths, for tests.
+    shadows : bool
+        False follows first faces that one convex face hides wholly, too.
+    longest_m : float
+        Leave out paths longer than this [m]: the power cut.
+    threads : int, optional
+        Default: the cores that this process may use.
+    progress : callable, optional
+        Called with the share done.
+    told : callable, optional
+        Called with the estimate of time and memory, after the first faces.
+    solids : bool
+        The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
+        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.prisms`, coincident ones among them.
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces; of coincident paths one.
+    Effort
+    """
+    if not 0 <= max_depth <= 3:
+        raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
+    started = time.perf_counter()
+    found: list[PathSet] = []
+    effort = Effort()
+    margin = SOLID_MARGIN if solids else 0.0
+    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, margin, SIDE_M, beams, float(longest_m), shadows)
+    for tower, source in enumerate(sources_m):
+        gap = np.linalg.norm(targets_m - source, axis=1)
+        alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
+        if excluded is not None:
+            alive &= ~excluded[tower]
+        poses = np.flatnonzero(alive)
+        if not len(poses):
+            continue
+        front_only = np.full(len(surfaces), solids)
+        mirrors = _mirrors(surfaces, None if usable is None else usable[tower], front_only)
+        one = _Search(mirrors, surfaces, np.ascontiguousarray(source), targets_m[poses], rules)
+        found.append(_pad(one.direct(), poses, tower, max_depth))
+        if max_depth:
+            first, hidden = one.first_faces()
+
+            def share(done: float, tower: int = tower) -> None:
+                if progress:
+                    progress((tower + done) / len(sources_m))
+
+            parts, spent = one.run(first, thread_count(threads), share, told if tower == 0 else None)
+            found += [_pad(part, poses, tower, max_depth) for part in parts]
+            effort = Effort(
+                sequences=effort.sequences + spent.sequences,
+                candidates=effort.candidates + spent.candidates,
+                hidden=effort.hidden + hidden,
+                estimate_s=effort.estimate_s + spent.estimate_s,
+            )
+        if progress:
+            progress((tower + 1) / len(sources_m))
+    paths = merge(found, max_depth, None)
+    paths = paths if solids else without_coincident(paths, surfaces)
+    return paths, Effort(
+        sequences=effort.sequences,
+        candidates=effort.candidates,
+        hidden=effort.hidden,
+        seconds=time.perf_counter() - started,
+        estimate_s=effort.estimate_s,
+    )
+
+
+def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray | None = None) -> _Mirrors:
+    faces = surfaces.faces
+    count = len(faces)
+    return _Mirrors(
+        normal=np.ascontiguousarray(faces.normal),
+        offset=np.ascontiguousarray(faces.offset_m),
+        along=np.ascontiguousarray(faces.along),
+        across=np.ascontiguousarray(faces.across),
+        window=surfaces.window_m,
+        convex=surfaces.convex,
+        plane=surfaces.plane,
+        front_only=np.zeros(count, np.bool_) if front_only is None else front_only,
+        usable=np.ones(count, np.bool_) if usable is None else np.ascontiguousarray(usable),
+        first=surfaces.first,
+        flat=surfaces.flat_m,
+    )
+
+
+_Found = tuple[IntArray, IntArray, FloatArray]
+"""Receivers (n,), faces (n, depth), reflection points (n, depth, 3)."""
+
+
+class _Search:
+    """The search of one source."""
+
+    def __init__(
+        self, mirrors: _Mirrors, surfaces: Surfaces, source: FloatArray, targets: FloatArray, rules: _Rules
+    ) -> None:
+        self.mirrors, self.source, self.rules = tuple(mirrors), source, tuple(rules)
+        self.targets = np.ascontiguousarray(targets)
+        self.corners, self.tree = surfaces.corners_m, tuple(surfaces.tree)
+        self.face_tree = tuple(surfaces.face_tree)
+        self.target_tree = tuple(box_tree(self.targets, self.targets))
+
+    def direct(self) -> _Found:
+        """Lines of sight."""
+        free = _direct(self.corners, self.tree, self.source, self.targets, self.rules)
+        pose = np.flatnonzero(free)
+        return pose, np.zeros((len(pose), 0), np.int64), np.zeros((len(pose), 0, 3))
+
+    def first_faces(self) -> tuple[IntArray, int]:
+        """First faces worth following, in an order whose beginning is a fair sample; how many hide from the source."""
+        good, hidden = _first_faces(self.mirrors, self.face_tree, self.source, self.rules)
+        return np.random.default_rng(0).permutation(np.flatnonzero(good)), int(hidden)
+
+    def run(
+        self, first: IntArray, threads: int, share: Progress, told: Callable[[str], None] | None
+    ) -> tuple[list[_Found], Effort]:
+        """Follow all sequences that begin with the faces ``first``."""
+        found: list[_Found] = []
+        totals = np.zeros(2, np.int64)
+        estimate = 0.0
+        begun = time.perf_counter()
+
+        def chunk(some: IntArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+            return _follow(  # type: ignore[no-any-return]
+                self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree,
+                self.source, some, self.rules,
+            )  # fmt: skip
+
+        def take(result: tuple[IntArray, IntArray, FloatArray, IntArray]) -> None:
+            pose, faces, points, counts = result
+            depth = (faces >= 0).sum(axis=1)
+            for d in np.unique(depth):
+                rows = depth == d
+                found.append((pose[rows], faces[rows, :d], points[rows, :d]))
+            totals[:] += counts
+
+        done = 0
+        for part, size in _chunks(first, threads):
+            for result in in_threads(chunk, part, threads):
+                take(result)
+            done += size
+            if done <= FIRST_CHUNK < len(first):
+                _follow_again = time.perf_counter()  # the first call compiles, or loads what was compiled
+                for some in part:
+                    chunk(some)
+                estimate = (time.perf_counter() - _follow_again) * len(first) / size / max(1, threads)
+                if told:
+                    told(
+                        f"about {estimate:.0f} s for each source: {len(first)} first faces, some "
+                        f"{int(totals[0] * len(first) / size)} sequences, streamed in {memory_mib(self):.0f} MiB"
+                    )
+            share(done / len(first))
+        spent = time.perf_counter() - begun
+        return found, Effort(
+            sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate or spent, seconds=spent
+        )
+
+
+def memory_mib(search: _Search) -> float:
+    """Memory that a search holds [MiB]: geometry and trees; sequences are streamed."""
+    held = [search.corners, search.targets, *search.tree, *search.face_tree, *search.target_tree, *search.mirrors]
+    return float(sum(a.nbytes for a in held if isinstance(a, np.ndarray)) / 2**20)
+
+
+def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int]]:
+    """A first sample alone, then rounds of chunks for all threads."""
+    if len(first):
+        yield [first[:FIRST_CHUNK]], len(first[:FIRST_CHUNK])
+    at = FIRST_CHUNK
+    each = max(16, min(1024, (len(first) - at) // (8 * threads) + 1))
+    while at < len(first):
+        parts = [first[k : k + each] for k in range(at, min(at + each * 4 * threads, len(first)), each)]
+        yield parts, sum(len(p) for p in parts)
+        at += each * 4 * threads
+
+
+def _pad(found: _Found, poses: IntArray, tower: int, max_depth: int) -> PathSet:
+    pose, sequence, points = found
+    count, depth = sequence.shape
+    faces = np.full((count, max_depth), -1, dtype=np.int64)
+    vertices = np.full((count, max_depth, 3), np.nan)
+    faces[:, :depth], vertices[:, :depth] = sequence, points
+    return PathSet(poses[pose], np.full(count, tower), np.full(count, depth), faces, vertices)
+
+
+COINCIDENT_M = 5e-3
+"""Paths over parallel planes whose reflection points are all closer than this [m] are one path."""
+
+
+def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
+    """Of paths over the same planes, or over planes within a few merge tolerances of each other, one each."""
+    if not len(paths):
+        return paths
+    plane = np.append(surfaces.plane, -1)[paths.faces]
+    key = np.column_stack([paths.pose, paths.tower, paths.depth, plane])
+    _, kept = np.unique(key, axis=0, return_index=True)
+    paths = paths.select(np.sort(kept))
+    # near coincidence: neighbours in a grid of twice the tolerance, asked pairwise within a link
+    order = np.lexsort((paths.depth, paths.tower, paths.pose))
+    link = np.column_stack([paths.pose, paths.tower, paths.depth])[order]
+    starts = np.flatnonzero(np.append(True, (link[1:] != link[:-1]).any(axis=1)))
+    gone = np.zeros(len(paths), dtype=np.bool_)
+    for rows in np.split(order, starts[1:]):
+        depth = int(paths.depth[rows[0]])
+        if len(rows) < 2 or not depth:
+            continue
+        points = paths.vertices_m[rows, :depth]
+        apart = np.abs(points[:, None] - points[None]).max(axis=(2, 3))
+        normal = surfaces.faces.normal[paths.faces[rows, :depth]]
+        alike = (np.abs(np.einsum("akc,bkc->abk", normal, normal)) > 0.999).all(axis=2)
+        one, two = np.nonzero(np.triu((apart < COINCIDENT_M) & alike, 1))
+        for i, j in zip(one, two, strict=True):
+            if not gone[rows[i]]:
+                gone[rows[j]] = True
+    return paths.select(~gone)
+
+
+def reflection_points(
+    surfaces: Surfaces, sequence: IntArray, sources_m: FloatArray, targets_m: FloatArray, *, edge_m: float
+) -> tuple[IntArray, FloatArray, BoolArray]:
+    """Where paths over stated faces reflect, in float64.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    sequence : (paths, depth) int
+        Faces; one of the same plane takes the place of a face that the reflection point misses.
+    sources_m, targets_m : (paths, 3)
+    edge_m : float
+        How far outside its face a point may lie.
+
+    Returns
+    -------
+    sequence : (paths, depth) int
+    vertices_m : (paths, depth, 3)
+    good : (paths,) bool
+        Every point in a face, and the ends of each reflection on one side.
+    """
+    order = np.argsort(surfaces.plane, kind="stable")
+    start = np.searchsorted(surfaces.plane[order], np.arange(len(surfaces) + 1))
+    sequence = np.ascontiguousarray(sequence).copy()
+    vertices, good = _points_of(
+        tuple(_mirrors(surfaces, None)), order, start, sequence,
+        np.ascontiguousarray(sources_m), np.ascontiguousarray(targets_m), edge_m,
+    )  # fmt: skip
+    return sequence, vertices, good
+
+
+# ---------------------------------------------------------------- compiled
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
+    normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
+    count, depth = sequence.shape
+    vertices = np.zeros((count, depth, 3))
+    good = np.ones(count, np.bool_)
+    images = np.zeros((depth + 1, 3))
+    for row in range(count):
+        images[0] = sources[row]
+        for step in range(depth):
+            f = sequence[row, step]
+            images[step + 1] = images[step] - 2.0 * _height(normal, offset, f, images[step]) * normal[f]
+        point = targets[row]
+        for step in range(depth - 1, -1, -1):
+            f = sequence[row, step]
+            low, top = _height(normal, offset, f, images[step]), _height(normal, offset, f, point)
+            if low * top < 0.0 or abs(low) + abs(top) <= SIDE_M:
+                good[row] = False
+                break
+            share = abs(low) / (abs(low) + abs(top))
+            vertices[row, step] = images[step + 1] + share * (point - images[step + 1])
+            point = vertices[row, step]
+            if _in_face(first, flat, along, across, f, point, edge):
+                continue
+            moved = False
+            for k in range(start[plane[f]], start[plane[f] + 1]):
+                if _in_face(first, flat, along, across, order[k], point, edge):
+                    sequence[row, step] = order[k]
+                    moved = True
+                    break
+            if not moved:
+                good[row] = False
+                break
+    return vertices, good
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
+    """Whether a triangle cuts the segment ``a`` - ``b``.
+
+    ``before`` and ``after`` are unit normals of mirrors at the ends, zero for an antenna: there a surface within the
+    clearance of the mirror's plane, or of the antenna, cuts nothing. Moeller and Trumbore (1997), edges included.
+    """
+    lower, upper, child, start, count, items = tree
+    clearance, end, margin = rules[1], rules[2], rules[3]
+    edge = margin if margin > 0.0 else -1e-9
+    d0, d1, d2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+    length = np.sqrt(d0 * d0 + d1 * d1 + d2 * d2)
+    inverse = np.empty(3)
+    inverse[0] = 1.0 / d0 if d0 != 0.0 else 1e300
+    inverse[1] = 1.0 / d1 if d1 != 0.0 else 1e300
+    inverse[2] = 1.0 / d2 if d2 != 0.0 else 1e300
+    mirror_a = before[0] != 0.0 or before[1] != 0.0 or before[2] != 0.0
+    mirror_b = after[0] != 0.0 or after[1] != 0.0 or after[2] != 0.0
+    todo = np.empty(64, np.int64)
+    todo[0] = 0
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        node = todo[waiting]
+        if box_missed(lower, upper, node, a, inverse):
+            continue
+        if child[node] >= 0:
+            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+            waiting += 2
+            continue
+        for k in range(start[node], start[node] + count[node]):
+            c = corners[items[k]]
+            e0, e1, e2 = c[1, 0] - c[0, 0], c[1, 1] - c[0, 1], c[1, 2] - c[0, 2]
+            g0, g1, g2 = c[2, 0] - c[0, 0], c[2, 1] - c[0, 1], c[2, 2] - c[0, 2]
+            p0, p1, p2 = d1 * g2 - d2 * g1, d2 * g0 - d0 * g2, d0 * g1 - d1 * g0
+            det = e0 * p0 + e1 * p1 + e2 * p2
+            if abs(det) <= 1e-14 * length:
+                continue
+            if margin > 0.0:  # so near to grazing that a tolerance might decide
+                m0, m1, m2 = e1 * g2 - e2 * g1, e2 * g0 - e0 * g2, e0 * g1 - e1 * g0
+                if abs(det) < 1e-5 * length * np.sqrt(m0 * m0 + m1 * m1 + m2 * m2):
+                    continue
+            s0, s1, s2 = a[0] - c[0, 0], a[1] - c[0, 1], a[2] - c[0, 2]
+            u = (s0 * p0 + s1 * p1 + s2 * p2) / det
+            if u < edge or u > 1.0 - edge:
+                continue
+            q0, q1, q2 = s1 * e2 - s2 * e1, s2 * e0 - s0 * e2, s0 * e1 - s1 * e0
+            v = (d0 * q0 + d1 * q1 + d2 * q2) / det
+            if v < edge or u + v > 1.0 - edge:
+                continue
+            t = (g0 * q0 + g1 * q1 + g2 * q2) / det
+            if t <= 0.0 or t >= 1.0:
+                continue
+            h0, h1, h2 = a[0] + t * d0, a[1] + t * d1, a[2] + t * d2
+            if mirror_a:
+                if abs(before[0] * h0 + before[1] * h1 + before[2] * h2 - before_offset) <= clearance:
+                    continue
+            elif t * length <= end:
+                continue
+            if mirror_b:
+                if abs(after[0] * h0 + after[1] * h1 + after[2] * h2 - after_offset) <= clearance:
+                    continue
+            elif (1.0 - t) * length <= end:
+                continue
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-def]
+    free = np.zeros(len(targets), np.bool_)
+    none = np.zeros(3)
+    for r in range(len(targets)):
+        free[r] = not segment_cut(corners, tree, source, targets[r], none, 0.0, none, 0.0, rules)
+    return free
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
+    return normal[f, 0] * p[0] + normal[f, 1] * p[1] + normal[f, 2] * p[2] - offset[f]
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
+    """Which faces may come first (faces,), and how many of the others are hidden by one convex face."""
+    normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
+    good = np.zeros(len(normal), np.bool_)
+    hidden = 0
+    stack = np.empty(64, np.int64)
+    for f in range(len(normal)):
+        if not usable[f]:
+            continue
+        height = _height(normal, offset, f, source)
+        if (abs(height) <= rules[4] and rules[3] == 0.0) or (front_only[f] and height < -rules[4]):
+            continue
+        if rules[7] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack):
+            hidden += 1
+            continue
+        good[f] = True
+    return good, hidden
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
+    """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
+    _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
+    lower, upper, child, start, count, items = face_tree
+    aim = np.zeros(3)
+    for k in range(WINDOW):
+        if not np.isfinite(window[f, k, 0]):
+            return False
+        aim += window[f, k] / WINDOW
+    inverse = np.empty(3)
+    for axis in range(3):
+        d = aim[axis] - source[axis]
+        inverse[axis] = 1.0 / d if d != 0.0 else 1e300
+    stack[0] = 0
+    waiting = 1
+    while waiting > 0:
+        waiting -= 1
+        node = stack[waiting]
+        if box_missed(lower, upper, node, source, inverse):
+            continue
+        if child[node] >= 0:
+            stack[waiting], stack[waiting + 1] = child[node], child[node] + 1
+            waiting += 2
+            continue
+        for k in range(start[node], start[node] + count[node]):
+            g = items[k]
+            if convex[g] and plane[g] != plane[f] and _hides(mirrors, source, f, g, rules):
+                return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
+    """Whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
+
+    It must do so well inside its outline: its triangles may lie a merge tolerance off its plane.
+    """
+    normal, offset, _, _, window, _, _, _, _, _, _ = mirrors
+    clearance = rules[1]
+    from_source = _height(normal, offset, g, source)
+    if abs(from_source) <= 10.0 * clearance:
+        return False
+    for k in range(WINDOW):
+        corner = window[f, k]
+        height = _height(normal, offset, g, corner)
+        if height * from_source >= 0.0 or abs(height) <= clearance:
+            return False
+        share = from_source / (from_source - height)
+        point = source + share * (corner - source)
+        run = corner - source
+        length = np.sqrt(run[0] ** 2 + run[1] ** 2 + run[2] ** 2)
+        cosine = abs(from_source - height) / length
+        if cosine < 0.05 or abs(_height(normal, offset, f, point)) <= 2.0 * clearance:
+            return False
+        if not _well_inside(window[g], normal[g], point, clearance / cosine + 1e-3):
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
+    """Whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
+    for k in range(WINDOW):
+        a, b = outline[k], outline[(k + 1) % WINDOW]
+        e0, e1, e2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        size = np.sqrt(e0 * e0 + e1 * e1 + e2 * e2)
+        if size == 0.0:
+            continue
+        # normal x edge points inwards
+        i0, i1, i2 = normal[1] * e2 - normal[2] * e1, normal[2] * e0 - normal[0] * e2, normal[0] * e1 - normal[1] * e0
+        if (i0 * (point[0] - a[0]) + i1 * (point[1] - a[1]) + i2 * (point[2] - a[2])) / size < margin:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
+    """Side planes of the beam from ``apex`` through an outline, added behind the first ``count``; how many then."""
+    m0 = m1 = m2 = 0.0
+    for k in range(WINDOW):
+        m0 += outline[k, 0] / WINDOW
+        m1 += outline[k, 1] / WINDOW
+        m2 += outline[k, 2] / WINDOW
+    for k in range(WINDOW):
+        a, b = outline[k], outline[(k + 1) % WINDOW]
+        x0, x1, x2 = a[0] - apex[0], a[1] - apex[1], a[2] - apex[2]
+        y0, y1, y2 = b[0] - a[0], b[1] - a[1], b[2] - a[2]
+        n0, n1, n2 = x1 * y2 - x2 * y1, x2 * y0 - x0 * y2, x0 * y1 - x1 * y0
+        size = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        if size < 1e-9:
+            continue
+        n0, n1, n2 = n0 / size, n1 / size, n2 / size
+        middle = n0 * (m0 - a[0]) + n1 * (m1 - a[1]) + n2 * (m2 - a[2])
+        if middle < 0.0:
+            n0, n1, n2 = -n0, -n1, -n2
+        # the plane goes through the apex and, a little outside, along the side of the outline
+        offset = n0 * apex[0] + n1 * apex[1] + n2 * apex[2]
+        reach = np.sqrt(x0 * x0 + x1 * x1 + x2 * x2)
+        planes[count, 0], planes[count, 1], planes[count, 2] = n0, n1, n2
+        planes[count, 3] = -offset + SLACK_M * max(1.0, 1e3 / max(reach, 1e-3))
+        count += 1
+    return count
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
+    """Whether one plane has the whole outline outside."""
+    for p in range(many):
+        a, b, c, d = planes[p, 0], planes[p, 1], planes[p, 2], planes[p, 3]
+        out = True
+        for k in range(WINDOW):
+            if a * outline[k, 0] + b * outline[k, 1] + c * outline[k, 2] + d >= 0.0:
+                out = False
+                break
+        if out:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
+    """Whether a point of the plane of face ``f`` lies in one of its triangles."""
+    a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
+    b = across[f, 0] * p[0] + across[f, 1] * p[1] + across[f, 2] * p[2]
+    for t in range(first[f], first[f + 1]):
+        c = flat[t]
+        area = (c[1, 0] - c[0, 0]) * (c[2, 1] - c[0, 1]) - (c[1, 1] - c[0, 1]) * (c[2, 0] - c[0, 0])
+        sign = 1.0 if area > 0.0 else -1.0
+        good = True
+        for k in range(3):
+            e0, e1 = c[(k + 1) % 3, 0] - c[k, 0], c[(k + 1) % 3, 1] - c[k, 1]
+            side = sign * (e0 * (b - c[k, 1]) - e1 * (a - c[k, 0]))
+            if side < -edge * np.sqrt(e0 * e0 + e1 * e1):
+                good = False
+                break
+        if good:
+            return True
+    return False
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
+    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
+    normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
+    t_lower, t_upper, t_child, t_start, t_count, t_items = target_tree
+    max_depth, side, beams, longest = rules[0], rules[4], rules[5], rules[6]
+    faces_n = len(normal)
+    space = 256
+    out_pose = np.empty(space, np.int64)
+    out_faces = np.full((space, max_depth), -1, np.int64)
+    out_points = np.zeros((space, max_depth, 3))
+    total = 0
+    counts = np.zeros(2, np.int64)
+    next_faces = np.empty((max_depth + 1, max(faces_n, len(firsts))), np.int64)
+    waiting = np.zeros(max_depth + 2, np.int64)
+    turn = np.zeros(max_depth + 2, np.int64)
+    chain = np.full(max_depth, -1, np.int64)
+    images = np.zeros((max_depth + 1, 3))
+    images[0] = source
+    signs = np.zeros(max_depth + 1)
+    planes = np.zeros((max_depth + 1, (WINDOW + 1) * (max_depth + 1), 4))
+    many = np.zeros(max_depth + 1, np.int64)
+    points = np.zeros((max_depth, 3))
+    stack = np.empty(64, np.int64)
+    none = np.zeros(3)
+    next_faces[0, : len(firsts)] = firsts
+    waiting[0] = len(firsts)
+    level = 0
+    while level >= 0:
+        if turn[level] >= waiting[level]:
+            level -= 1
+            continue
+        f = next_faces[level, turn[level]]
+        turn[level] += 1
+        here = images[level]
+        height = _height(normal, offset, f, here)
+        flatwise = abs(height) <= side
+        before = chain[level - 1]
+        if level > 0:
+            if plane[f] == plane[before] or not usable[f] or (front_only[f] and height < -side):
+                continue
+            if flatwise and rules[3] == 0.0:
+                continue
+            if beams and _none_within(window[f], planes[level - 1], many[level - 1]):
+                continue
+        sign = 1.0 if (height > 0.0 or front_only[f]) else -1.0
+        if level > 0 and beams:
+            ahead = False
+            for k in range(WINDOW):
+                if sign * _height(normal, offset, f, window[before, k]) > -side:
+                    ahead = True
+                    break
+            if not ahead:
+                continue
+        counts[0] += 1
+        chain[level] = f
+        signs[level] = sign
+        n0, n1, n2 = normal[f, 0], normal[f, 1], normal[f, 2]
+        image = images[level + 1]
+        image[0] = here[0] - 2.0 * height * n0
+        image[1] = here[1] - 2.0 * height * n1
+        image[2] = here[2] - 2.0 * height * n2
+        # planes of the beam: before this face, what earlier faces leave of it, mirrored; and its own sides
+        mine = planes[level]
+        mine[0, 0], mine[0, 1], mine[0, 2] = sign * n0, sign * n1, sign * n2
+        mine[0, 3] = -sign * offset[f] + side
+        number = 1
+        if beams and level > 0:
+            # plane 0 of the level before is the face itself: behind it nothing is lost, and it is no side of the beam
+            for p in range(1, many[level - 1]):
+                b0, b1, b2, b3 = (
+                    planes[level - 1, p, 0],
+                    planes[level - 1, p, 1],
+                    planes[level - 1, p, 2],
+                    planes[level - 1, p, 3],
+                )
+                dot = b0 * n0 + b1 * n1 + b2 * n2
+                mine[number, 0], mine[number, 1], mine[number, 2] = (
+                    b0 - 2.0 * dot * n0,
+                    b1 - 2.0 * dot * n1,
+                    b2 - 2.0 * dot * n2,
+                )
+                mine[number, 3] = b3 + 2.0 * dot * offset[f]
+                number += 1
+        if beams and not flatwise and (level + 1 < max_depth or not box_outside(t_lower, t_upper, 0, mine, number)):
+            number = _side_planes(mine, number, image, window[f])
+        many[level] = number if beams else 0
+        # receivers
+        stack[0] = 0
+        pending = 1
+        while pending > 0:
+            pending -= 1
+            node = stack[pending]
+            if beams and box_outside(t_lower, t_upper, node, mine, number):
+                continue
+            if t_child[node] >= 0:
+                stack[pending], stack[pending + 1] = t_child[node], t_child[node] + 1
+                pending += 2
+                continue
+            for k in range(t_start[node], t_start[node] + t_count[node]):
+                r = t_items[k]
+                point = targets[r]
+                good = True
+                x0, x1, x2 = point[0] - image[0], point[1] - image[1], point[2] - image[2]
+                if x0 * x0 + x1 * x1 + x2 * x2 > longest * longest:
+                    continue
+                for step in range(level, -1, -1):
+                    g = chain[step]
+                    top = signs[step] * _height(normal, offset, g, point)
+                    low = signs[step] * _height(normal, offset, g, images[step])
+                    if (
+                        top < -side
+                        or low < -side
+                        or top + low <= (side if rules[3] == 0.0 else 1e-12)
+                        or (step < level and top <= (side if rules[3] == 0.0 else -side))
+                    ):
+                        good = False
+                        break
+                    share = low / (low + top)
+                    behind = images[step + 1]
+                    for axis in range(3):
+                        points[step, axis] = behind[axis] + share * (point[axis] - behind[axis])
+                    point = points[step]
+                    if not _in_face(first, flat, along, across, g, point, EDGE_M):
+                        good = False
+                        break
+                if not good:
+                    continue
+                counts[1] += 1
+                start, start_normal, start_offset = source, none, 0.0
+                cut = False
+                for step in range(level + 1):
+                    g = chain[step]
+                    if segment_cut(
+                        corners, tree, start, points[step], start_normal, start_offset, normal[g], offset[g], rules
+                    ):
+                        cut = True
+                        break
+                    start, start_normal, start_offset = points[step], normal[g], offset[g]
+                if cut or segment_cut(corners, tree, start, targets[r], start_normal, start_offset, none, 0.0, rules):
+                    continue
+                if total == space:
+                    space *= 2
+                    pose2 = np.empty(space, np.int64)
+                    faces2 = np.full((space, max_depth), -1, np.int64)
+                    points2 = np.zeros((space, max_depth, 3))
+                    pose2[:total], faces2[:total], points2[:total] = out_pose, out_faces, out_points
+                    out_pose, out_faces, out_points = pose2, faces2, points2
+                out_pose[total] = r
+                for step in range(level + 1):
+                    out_faces[total, step] = chain[step]
+                    out_points[total, step] = points[step]
+                total += 1
+        if level + 1 < max_depth:
+            waiting[level + 1] = within_planes(face_tree, mine, many[level], next_faces[level + 1])
+            turn[level + 1] = 0
+            level += 1
+    return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), counts
+
+
+__all__ = ["Effort", "grow_paths", "reflection_points", "segment_cut", "without_coincident"]

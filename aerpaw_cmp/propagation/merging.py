@@ -1,0 +1,291 @@
+"""Triangles to planar faces, compiled.
+
+Triangles of one shape that share an edge and lie within a stated tolerance of one plane are one face; faces that touch
+or overlap in one plane, of whatever shape, share that plane, so that a reflection there is one reflection.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+
+from ..common.errors import InputError
+from ..common.units import BoolArray, FloatArray, IntArray
+from ..site.mitsuba import TriangleScene
+from .boxtree import box_tree, overlapping
+from .paths import Faces
+from .surfaces import Surfaces
+
+MERGE_M = 1e-3
+"""Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km."""
+
+WELD_M = 1e-4
+"""Corners of one shape closer than this are one corner [m]."""
+
+WINDOW = 8
+"""Most corners of the convex outline by which a face is searched; one with more is searched by a rectangle."""
+
+SMALLEST_M2 = 1e-10
+"""Triangles of less area have no plane; they are dropped."""
+
+
+def merged(scene: TriangleScene, merge_m: float = MERGE_M) -> Surfaces:
+    """Faces of a scene.
+
+    Parameters
+    ----------
+    scene : TriangleScene
+    merge_m : float
+        How far a corner may lie from the plane of its face [m].
+
+    Raises
+    ------
+    InputError
+        If no triangle has an area.
+    """
+    corners = scene.vertices_m[scene.triangles]
+    normal, offset, area = _planes(corners)
+    good = area > SMALLEST_M2
+    notes = list(scene.notes)
+    if not good.all():
+        notes.append(f"{int((~good).sum())} triangles without an area were dropped")
+    if not good.any():
+        raise InputError("no triangle of the scene has an area", expected="surfaces in metres")
+    corners, normal, offset, area = corners[good], normal[good], offset[good], area[good]
+    shape = scene.shape[good]
+    face, leader = _grown(corners, normal, offset, area, shape, merge_m)
+    order = np.argsort(face, kind="stable")
+    face, corners, shape = face[order], corners[order], shape[order]
+    triangle_area = area[order]
+    count = int(face[-1]) + 1
+    first = np.searchsorted(face, np.arange(count + 1))
+    normal, offset = normal[leader], offset[leader]
+    face_area = np.add.reduceat(triangle_area, first[:-1])
+    low = np.minimum.reduceat(corners.min(axis=1), first[:-1], axis=0)
+    high = np.maximum.reduceat(corners.max(axis=1), first[:-1], axis=0)
+    face_tree = box_tree(low - merge_m, high + merge_m)
+    plane = _shared_planes(tuple(face_tree), corners, first, normal, offset, face_area, low, high, merge_m)
+    normal, offset = normal[plane], offset[plane]
+    along, across = _axes(normal)
+    owner_axes = np.stack([along[face], across[face]], axis=1)
+    flat = np.einsum("tki,tai->tka", corners, owner_axes)
+    base = normal * offset[:, None]
+    window, convex = _windows(flat, first, face_area, base, along, across)
+    flat_low = np.minimum.reduceat(flat.min(axis=1), first[:-1], axis=0)
+    flat_high = np.maximum.reduceat(flat.max(axis=1), first[:-1], axis=0)
+    of_face = shape[first[:-1]]
+    return Surfaces(
+        faces=Faces(
+            normal=normal,
+            offset_m=offset,
+            material=tuple(scene.materials[s] for s in of_face),
+            label=_labels(scene.shapes, of_face),
+            along=along,
+            across=across,
+            lower=flat_low,
+            upper=flat_high,
+            polygon=(None,) * count,
+            solid=np.asarray(of_face, dtype=np.int64),
+        ),
+        corners_m=np.ascontiguousarray(corners),
+        face=face,
+        first=first,
+        flat_m=np.ascontiguousarray(flat),
+        window_m=window,
+        convex=convex,
+        area_m2=face_area,
+        plane=plane,
+        tree=box_tree(corners.min(axis=1), corners.max(axis=1)),
+        face_tree=face_tree,
+        merge_m=merge_m,
+        notes=tuple(notes),
+    )
+
+
+def _labels(shapes: tuple[str, ...], of_face: IntArray) -> tuple[str, ...]:
+    """``shape face 3``: faces counted within their shape."""
+    seen: dict[int, int] = {}
+    labels = []
+    for shape in of_face.tolist():
+        seen[shape] = seen.get(shape, 0) + 1
+        labels.append(f"{shapes[shape]} face {seen[shape]}")
+    return tuple(labels)
+
+
+def _planes(corners: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+    """Unit normals, offsets and areas of triangles (n, 3, 3)."""
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(across, axis=1)
+    normal = across / np.where(size > 0.0, size, 1.0)[:, None]
+    return normal, np.einsum("ti,ti->t", normal, corners.mean(axis=1)), 0.5 * size
+
+
+def _axes(normal: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """In-plane unit axes: level and uphill where there is such a thing."""
+    along = np.stack([-normal[:, 1], normal[:, 0], np.zeros(len(normal))], axis=1)
+    size = np.linalg.norm(along, axis=1)
+    level = size < 1e-6
+    along = np.where(level[:, None], np.array([1.0, 0.0, 0.0]), along / np.where(level, 1.0, size)[:, None])
+    along -= np.einsum("fi,fi->f", along, normal)[:, None] * normal
+    along /= np.linalg.norm(along, axis=1, keepdims=True)
+    return along, np.cross(normal, along)
+
+
+def _grown(
+    corners: FloatArray, normal: FloatArray, offset: FloatArray, area: FloatArray, shape: IntArray, merge_m: float
+) -> tuple[IntArray, IntArray]:
+    """Face of each triangle, and the triangle whose plane each face has: its largest."""
+    grid = np.round(corners.reshape(-1, 3) / WELD_M).astype(np.int64)
+    key = np.column_stack([np.repeat(shape, 3), grid])
+    order = np.lexsort(key.T)
+    new = np.ones(len(order), dtype=np.int64)
+    new[1:] = (key[order[1:]] != key[order[:-1]]).any(axis=1)
+    corner = np.empty(len(order), dtype=np.int64)
+    corner[order] = np.cumsum(new) - 1
+    sides = corner.reshape(-1, 3)
+    pairs = np.sort(np.stack([sides, np.roll(sides, -1, axis=1)], axis=2), axis=2).reshape(-1, 2)
+    edge_key = pairs[:, 0] * (int(corner.max()) + 1) + pairs[:, 1]
+    _, edge = np.unique(edge_key, return_inverse=True)
+    edge = edge.reshape(-1)
+    by_edge = np.argsort(edge, kind="stable")
+    start = np.searchsorted(edge[by_edge], np.arange(int(edge.max()) + 2))
+    face, leader = _grow(
+        np.argsort(-area, kind="stable"), corners, normal, offset, edge.reshape(-1, 3), by_edge // 3, start, merge_m
+    )
+    return face, leader
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _grow(order, corners, normal, offset, edges, triangle_of, start, merge_m):  # type: ignore[no-untyped-def]
+    face = np.full(len(corners), -1, np.int64)
+    leader = np.empty(len(corners), np.int64)
+    todo = np.empty(len(corners), np.int64)
+    count = 0
+    for seed in order:
+        if face[seed] >= 0:
+            continue
+        leader[count] = seed
+        face[seed] = count
+        todo[0] = seed
+        waiting = 1
+        while waiting > 0:
+            waiting -= 1
+            here = todo[waiting]
+            for side in range(3):
+                edge = edges[here, side]
+                for k in range(start[edge], start[edge + 1]):
+                    other = triangle_of[k]
+                    if face[other] < 0 and _lies_in(corners, other, normal[seed], offset[seed], merge_m):
+                        face[other] = count
+                        todo[waiting] = other
+                        waiting += 1
+        count += 1
+    return face, leader[:count].copy()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _lies_in(corners, triangle, normal, offset, merge_m):  # type: ignore[no-untyped-def]
+    for k in range(3):
+        p = corners[triangle, k]
+        if abs(normal[0] * p[0] + normal[1] * p[1] + normal[2] * p[2] - offset) > merge_m:
+            return False
+    return True
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _shared_planes(tree, corners, first, normal, offset, area, low, high, merge_m):  # type: ignore[no-untyped-def]
+    """Face whose plane each face takes: that of a larger one that it touches and lies in, or its own."""
+    plane = np.arange(len(normal))
+    near = np.empty(len(normal), np.int64)
+    for f in np.argsort(-area):
+        many = overlapping(tree, low[f] - merge_m, high[f] + merge_m, near)
+        best = -1
+        for k in range(many):
+            other = near[k]
+            if area[other] < area[f] or (area[other] == area[f] and other >= f):
+                continue
+            lead = plane[other]
+            if abs(np.dot(normal[lead], normal[f])) < 0.7:
+                continue
+            good = True
+            for t in range(first[f], first[f + 1]):
+                if not _lies_in(corners, t, normal[lead], offset[lead], merge_m):
+                    good = False
+                    break
+            if good and (best < 0 or area[lead] > area[best]):
+                best = lead
+        if best >= 0:
+            plane[f] = best
+    return plane
+
+
+def _windows(
+    flat: FloatArray, first: IntArray, area: FloatArray, base: FloatArray, along: FloatArray, across: FloatArray
+) -> tuple[FloatArray, BoolArray]:
+    """Convex outlines (faces, 8, 3) and which faces fill theirs."""
+    outline, convex = _outlines(flat, first, area)
+    window = base[:, None] + outline[..., :1] * along[:, None] + outline[..., 1:] * across[:, None]
+    return np.ascontiguousarray(window), convex
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _outlines(flat, first, area):  # type: ignore[no-untyped-def]
+    outline = np.empty((len(first) - 1, WINDOW, 2))
+    convex = np.zeros(len(first) - 1, np.bool_)
+    for f in range(len(first) - 1):
+        points = flat[first[f] : first[f + 1]].copy().reshape(-1, 2)
+        hull = _hull(points)
+        inside = 0.0
+        for k in range(len(hull)):
+            a, b = hull[k - 1], hull[k]
+            inside += 0.5 * (a[0] * b[1] - a[1] * b[0])
+        # overlapping triangles of one face could add up to its outline by chance: only exact fits count
+        convex[f] = len(hull) <= WINDOW and len(hull) >= 3 and abs(inside - area[f]) <= 1e-6 * inside
+        if len(hull) > WINDOW or len(hull) < 3:
+            hull = _rectangle(points, hull)
+        for k in range(WINDOW):
+            outline[f, k] = hull[min(k, len(hull) - 1)]
+    return outline, convex
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _hull(points):  # type: ignore[no-untyped-def]
+    """Convex hull, counter-clockwise, without corners that turn by less than 0.1 um (Andrew, 1979)."""
+    order = np.argsort(points[:, 1])
+    order = order[np.argsort(points[order, 0], kind="mergesort")]
+    n = len(order)
+    hull = np.empty((2 * n + 1, 2))
+    k = 0
+    for turn in range(2):
+        base = k
+        for step in range(n):
+            p = points[order[step] if turn == 0 else order[n - 1 - step]]
+            while k >= base + 2:
+                ax, ay = hull[k - 1, 0] - hull[k - 2, 0], hull[k - 1, 1] - hull[k - 2, 1]
+                bx, by = p[0] - hull[k - 2, 0], p[1] - hull[k - 2, 1]
+                if ax * by - ay * bx > 1e-7 * np.sqrt(bx * bx + by * by):
+                    break
+                k -= 1
+            hull[k] = p
+            k += 1
+        k -= 1
+    return hull[:k].copy()
+
+
+@njit(cache=True, nogil=True, error_model="numpy")
+def _rectangle(points, hull):  # type: ignore[no-untyped-def]
+    """Rectangle along the longest side of the hull, round all points."""
+    best, axis = -1.0, np.array([1.0, 0.0])
+    for k in range(len(hull)):
+        side = hull[k] - hull[k - 1]
+        size = np.sqrt(side[0] ** 2 + side[1] ** 2)
+        if size > best and size > 0.0:
+            best, axis = size, side / size
+    low_a, high_a, low_b, high_b = np.inf, -np.inf, np.inf, -np.inf
+    for p in points:
+        a, b = p[0] * axis[0] + p[1] * axis[1], -p[0] * axis[1] + p[1] * axis[0]
+        low_a, high_a, low_b, high_b = min(low_a, a), max(high_a, a), min(low_b, b), max(high_b, b)
+    result = np.empty((4, 2))
+    for k, (a, b) in enumerate(((low_a, low_b), (high_a, low_b), (high_a, high_b), (low_a, high_b))):
+        result[k, 0], result[k, 1] = a * axis[0] - b * axis[1], a * axis[1] + b * axis[0]
+    return result

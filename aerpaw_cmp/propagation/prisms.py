@@ -1,0 +1,117 @@
+"""Thousands of prisms: candidates by compiled beams, decided by the exact rules of the image engine.
+
+The beams of :mod:`aerpaw_cmp.propagation.growth` are cut with tolerances a thousand times wider than those that decide,
+and a candidate is given up only where a segment runs through the middle of a wall or roof. What is left, hardly more
+than the paths, is decided as in :mod:`aerpaw_cmp.propagation.image`, so both have the same paths.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray
+from .boxtree import box_tree
+from .faces import corners, triangles
+from .growth import Effort, Progress, grow_paths
+from .image import images_of, merge, planes_of, scene_tolerance_m, trace_back
+from .merging import WINDOW
+from .paths import Faces, PathSet
+from .solids import Occlusion
+from .surfaces import Surfaces
+
+REACH = 10.0
+"""The ground is searched to this many times the largest coordinate: no reflection point lies further out."""
+
+OVERLAP_M = 1e-3
+"""Boxes of faces are this much larger [m]."""
+
+
+def find_paths(
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    max_depth: int = 2,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    threads: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[PathSet, Effort]:
+    """As :func:`aerpaw_cmp.propagation.image.find_paths`, for scenes with too many sequences for it.
+
+    Parameters
+    ----------
+    faces : Faces
+        Closed solids and ground planes.
+    sources_m : (towers, 3)
+    targets_m : (poses, 3)
+        NaN positions have no path.
+    max_depth : int
+        0 to 3.
+    usable : (towers, faces) bool, optional
+    excluded : (towers, poses) bool, optional
+    threads : int, optional
+        Default: the cores that this process may use.
+    progress : callable, optional
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces.
+    Effort
+    """
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
+    found, effort = grow_paths(
+        solid_surfaces(faces, sources_m, targets_m),
+        sources_m,
+        targets_m,
+        max_depth=max_depth,
+        usable=usable,
+        excluded=excluded,
+        threads=threads,
+        progress=progress,
+        solids=True,
+    )
+    hiding = Occlusion(faces, tolerance_m)
+    pieces = []
+    for depth in range(max_depth + 1):
+        some = found.select(found.depth == depth)
+        source, target = sources_m[some.tower], targets_m[some.pose]
+        sequence = some.faces[:, :depth]
+        vertices, good = trace_back(faces, sequence, images_of(faces, sequence, source), target, tolerance_m)
+        rows = np.flatnonzero(good)
+        rows = rows[~hiding.any_segment(source[rows], vertices[rows], target[rows])]
+        some.vertices_m[:, :depth] = vertices
+        pieces.append(some.select(rows))
+    return merge(pieces, max_depth, faces), effort
+
+
+def solid_surfaces(faces: Faces, sources_m: FloatArray, targets_m: FloatArray) -> Surfaces:
+    """Faces of solids as the compiled search takes them; the ground, which hides nothing, is no obstacle."""
+    known = targets_m[np.isfinite(targets_m).all(axis=1)]
+    finite = [np.abs(x[np.isfinite(x)]).max(initial=0.0) for x in (faces.lower, faces.upper, faces.offset_m)]
+    reach = REACH * float(max(1.0, *finite, *(np.abs(p).max(initial=0.0) for p in (known, sources_m))))
+    vertices, triangle, owner = triangles(faces, reach)
+    points = vertices[triangle]
+    outline = corners(faces, reach)
+    axes = np.stack([faces.along[owner], faces.across[owner]], axis=1)
+    flat = np.einsum("tki,tai->tka", points, axes)
+    hides = faces.solid[owner] >= 0
+    lower, upper = outline.min(axis=1) - OVERLAP_M, outline.max(axis=1) + OVERLAP_M
+    obstacles = np.ascontiguousarray(points[hides])
+    if not len(obstacles):
+        obstacles = np.full((1, 3, 3), 1e9)  # nothing hides: one needle far below everything
+    return Surfaces(
+        faces=faces,
+        corners_m=obstacles,
+        face=owner,
+        first=np.searchsorted(owner, np.arange(len(faces) + 1)),
+        flat_m=np.ascontiguousarray(flat),
+        window_m=np.ascontiguousarray(outline[:, np.minimum(np.arange(WINDOW), 3)]),
+        convex=(faces.solid >= 0) & np.array([polygon is None for polygon in faces.polygon], dtype=np.bool_),
+        area_m2=np.zeros(len(faces)),
+        plane=planes_of(faces),
+        tree=box_tree(obstacles.min(axis=1), obstacles.max(axis=1)),
+        face_tree=box_tree(lower, upper),
+        merge_m=OVERLAP_M,
+    )

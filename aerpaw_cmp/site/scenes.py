@@ -1,0 +1,124 @@
+"""A scene of triangles in the site frame, and whether it has a ground."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from ..common.errors import UsageError
+from .materials import material
+from .mitsuba import TriangleScene, read_scene
+
+PLANE_MARGIN = 10.0
+"""A ground plane that is added reaches this many times the size of the scene beyond it."""
+
+GROUND_SHARE = 0.5
+"""A scene whose level surfaces cover less of its plan than this has no ground."""
+
+LEVEL = 0.7
+"""Upward part of the normal above which a surface can be ground."""
+
+
+def placed_scene(
+    path: Path,
+    *,
+    materials: Mapping[str, str] | None = None,
+    sha256: str | None = None,
+    offset_m: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    turn_deg: float = 0.0,
+    ground_plane: str | None = None,
+) -> TriangleScene:
+    """A Mitsuba scene, turned and moved into the site frame.
+
+    Parameters
+    ----------
+    path : Path
+        The XML file.
+    materials : mapping of str to str, optional
+        As in :func:`aerpaw_cmp.site.mitsuba.read_scene`.
+    sha256 : str, optional
+        What the scene's files must have.
+    offset_m : (east, north, up)
+        Where its origin lies.
+    turn_deg : float
+        How far it is turned counter-clockwise from above, about its origin.
+    ground_plane : str, optional
+        Material of a plane that is added at its lowest point.
+
+    Raises
+    ------
+    UsageError
+        If the files are not those of ``sha256``.
+    """
+    scene = read_scene(path, materials)
+    if sha256 is not None and sha256 != scene.sha256:
+        raise UsageError(
+            f"the scene's files have SHA-256 {scene.sha256[:16]}...",
+            expected=f"{sha256[:16]}...",
+            cause="they changed since the site was made: import them again, or leave out scene.sha256",
+            path=path,
+        )
+    cosine, sine = math.cos(math.radians(turn_deg)), math.sin(math.radians(turn_deg))
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    vertices = scene.vertices_m if turn_deg == 0.0 else scene.vertices_m @ turn.T
+    scene = replace(scene, vertices_m=vertices + np.array(offset_m))
+    return scene if ground_plane is None else with_ground(scene, ground_plane)
+
+
+def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
+    """The scene on a level rectangle at its lowest point, which reaches far beyond it."""
+    low, high = bounds(scene)
+    reach = PLANE_MARGIN * float(max(*(high - low)[:2], 100.0))
+    corners = [(low[0] - reach, low[1] - reach), (high[0] + reach, low[1] - reach)]
+    corners += [(high[0] + reach, high[1] + reach), (low[0] - reach, high[1] + reach)]
+    vertices = np.array([(east, north, low[2]) for east, north in corners])
+    return added(scene, vertices, np.array([[0, 1, 2], [0, 2, 3]]), "ground plane", material(name).name)
+
+
+def added(
+    scene: TriangleScene, vertices_m: np.ndarray, triangles: np.ndarray, name: str, of_material: str
+) -> TriangleScene:
+    """The scene with one more shape."""
+    return replace(
+        scene,
+        vertices_m=np.concatenate([scene.vertices_m, vertices_m]),
+        triangles=np.concatenate([scene.triangles, triangles + len(scene.vertices_m)]),
+        shape=np.concatenate([scene.shape, np.full(len(triangles), len(scene.shapes))]),
+        shapes=(*scene.shapes, name),
+        materials=(*scene.materials, of_material),
+    )
+
+
+def bounds(scene: TriangleScene) -> tuple[np.ndarray, np.ndarray]:
+    """Lowest and highest coordinates (3,) [m] of what the triangles use."""
+    used = scene.vertices_m[np.unique(scene.triangles)]
+    return used.min(axis=0), used.max(axis=0)
+
+
+def ground_share(scene: TriangleScene) -> float:
+    """Share of a 40 x 40 grid over the plan that has a level surface somewhere above or below it."""
+    corners = scene.vertices_m[scene.triangles]
+    across = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    size = np.linalg.norm(across, axis=1)
+    level = corners[np.abs(across[:, 2]) > LEVEL * np.maximum(size, 1e-300)]
+    low, high = bounds(scene)
+    side = 40
+    at = (np.arange(side) + 0.5) / side
+    covered = np.zeros((side, side), dtype=np.bool_)
+    east, north = low[0] + at * (high[0] - low[0]), low[1] + at * (high[1] - low[1])
+    for triangle in level[:, :, :2]:
+        columns = slice(*np.searchsorted(east, [triangle[:, 0].min(), triangle[:, 0].max()]))
+        rows = slice(*np.searchsorted(north, [triangle[:, 1].min(), triangle[:, 1].max()]))
+        if columns.start == columns.stop or rows.start == rows.stop:
+            continue
+        x, y = east[columns][:, None], north[rows][None, :]
+        signs = []
+        for k in range(3):
+            (a, b), (c, d) = triangle[k], triangle[(k + 1) % 3]
+            signs.append((c - a) * (y - b) - (d - b) * (x - a))
+        covered[columns, rows] |= ((np.stack(signs) >= 0).all(axis=0)) | ((np.stack(signs) <= 0).all(axis=0))
+    return float(covered.mean())

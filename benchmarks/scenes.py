@@ -1,0 +1,398 @@
+"""Scenes x engine x depth: seconds (wall and CPU), memory, paths, missing, extra; and how the cost grows.
+
+python benchmarks/scenes.py [--scenes munich,etoile,florence] [--depths 1,2] [--receivers 200] [--check]
+    [--prisms 1000,5000] [--sionna 100000,1000000] [--limits 1000000,10000000] [--slots 24,26]
+    [--growth] [--figure docs/images/scenes_growth.svg] [--json FILE] [--markdown]
+
+Scenes are those that the installed Sionna RT ships. Each row runs in a process of its own, which gives its memory; the
+compiled code must have been compiled before (the first row says how long that took). Receivers lie within 200 m of one
+transmitter, half at street level, half 30 to 60 m up.
+
+--check     repeats a row with shadows off and says how many paths differ (and with every cut off on a crop)
+--sionna    PathSolver with so many rays on the same triangles: its paths that we lack (missing), ours that it lacks
+            (extra), each of which is asked of Sionna's own scene: a ray test of every segment, shortened by 2 cm
+--limits, --slots   its max_num_paths_per_src and its table of candidates (2 to this power): each with each
+--growth    seconds against receivers, towers, faces and depth, fitted as powers
+"""
+
+from __future__ import annotations
+
+import argparse
+import itertools
+import json
+import os
+import platform
+import resource
+import subprocess
+import sys
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from shapely.geometry import box
+
+from aerpaw_cmp.propagation.growth import grow_paths
+from aerpaw_cmp.propagation.merging import merged
+from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
+
+SOURCES = {
+    "munich": (8.5, 21.0, 27.0),
+    "etoile": (0.0, 0.0, 30.0),
+    "florence": (0.0, 0.0, 30.0),
+    "san_francisco": (0.0, 0.0, 120.0),
+    "simple_street_canyon": (-20.0, 0.0, 20.0),
+}
+RAISED_M = {"san_francisco": 60.0}  # its streets lie on hills
+CARRIER_HZ = 3.5e9
+
+
+def shipped(name: str) -> Path:
+    folder = find_spec("sionna").submodule_search_locations[0]  # type: ignore[union-attr, index]
+    return Path(folder) / "rt" / "scenes" / name / f"{name}.xml"
+
+
+def ends(name: str, receivers: int, towers: int = 1) -> tuple[np.ndarray, np.ndarray]:
+    rng = np.random.default_rng(1)
+    source = np.array(SOURCES.get(name, (0.0, 0.0, 30.0)))
+    away, angle = 200.0 * np.sqrt(rng.uniform(size=receivers)), rng.uniform(0.0, 2.0 * np.pi, receivers)
+    up = np.where(np.arange(receivers) % 2 == 0, 1.5, rng.uniform(30.0, 60.0, receivers)) + RAISED_M.get(name, 0.0)
+    if name == "simple_street_canyon":
+        away = away / 5.0
+    targets = np.column_stack([source[0] + away * np.cos(angle), source[1] + away * np.sin(angle), up])
+    return source + np.column_stack([np.arange(towers) * 7.0, np.zeros(towers), np.zeros(towers)]), targets
+
+
+def crop(scene: TriangleScene, middle: np.ndarray, triangles: int) -> TriangleScene:
+    """The triangles nearest to a point."""
+    from dataclasses import replace
+
+    corners = scene.vertices_m[scene.triangles]
+    near = np.argsort(np.linalg.norm(corners.mean(axis=1)[:, :2] - middle[:2], axis=1))[:triangles]
+    return replace(scene, triangles=scene.triangles[near], shape=scene.shape[near])
+
+
+def keys(paths: Any) -> set[tuple[int, ...]]:
+    return {
+        (p, t, *(f for f in faces if f >= 0))
+        for p, t, faces in zip(paths.pose.tolist(), paths.tower.tolist(), paths.faces.tolist(), strict=True)
+    }
+
+
+def plane_keys(paths: Any, plane: np.ndarray) -> set[tuple[int, ...]]:
+    numbers = np.append(plane, -1)
+    rows = np.column_stack([paths.pose, paths.tower, numbers[paths.faces]])
+    return {tuple(n for n in row if n >= 0) for row in rows.tolist()}
+
+
+class Clock:
+    def __init__(self) -> None:
+        self.wall, self.cpu = time.perf_counter(), time.process_time()
+
+    def since(self) -> tuple[float, float]:
+        return time.perf_counter() - self.wall, time.process_time() - self.cpu
+
+
+def warm_up() -> float:
+    """Compile, or load what was compiled."""
+    clock = Clock()
+    scene = read_scene(shipped("simple_street_canyon"))
+    grow_paths(merged(scene), *ends("simple_street_canyon", 4), max_depth=2)
+    return clock.since()[0]
+
+
+def image_row(task: dict[str, Any]) -> dict[str, Any]:
+    """One scene by the exact search."""
+    task = {"towers": 1, "triangles": None, "shadows": True, "beams": True, **task}
+    compile_s = warm_up()
+    clock = Clock()
+    scene = read_scene(shipped(task["scene"]))
+    sources, targets = ends(task["scene"], task["receivers"], task["towers"])
+    if task["triangles"]:
+        scene = crop(scene, sources[0], task["triangles"])
+    surfaces = merged(scene)
+    setup = clock.since()
+    clock = Clock()
+    paths, effort = grow_paths(
+        surfaces, sources, targets, max_depth=task["depth"], shadows=task["shadows"], beams=task["beams"]
+    )
+    search = clock.since()
+    row = {
+        **task,
+        "engine": "image",
+        "triangles": len(scene),
+        "faces": len(surfaces),
+        "compile_s": compile_s,
+        "setup_s": setup,
+        "search_s": search,
+        "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
+        "sequences": effort.sequences,
+        "candidates": effort.candidates,
+        "estimate_s": effort.estimate_s,
+        "duplicates": len(paths) - len(plane_keys(paths, surfaces.plane)),
+    }
+    if task.get("check"):
+        other, _ = grow_paths(surfaces, sources, targets, max_depth=task["depth"], shadows=False)
+        row["differ_without_shadows"] = len(keys(paths) ^ keys(other))
+        small = merged(crop(scene, sources[0], 600))
+        on, off = (grow_paths(small, sources, targets, max_depth=task["depth"], beams=b)[0] for b in (True, False))
+        row["differ_without_beams_on_600_triangles"] = len(keys(on) ^ keys(off))
+    return row
+
+
+def prism_row(task: dict[str, Any]) -> dict[str, Any]:
+    """A town of prisms through the replay's own search."""
+    from aerpaw_cmp.common.geodesy import SiteFrame
+    from aerpaw_cmp.propagation import prisms
+    from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+    from aerpaw_cmp.propagation.scene import Scene
+    from aerpaw_cmp.site.site import Building, Site, Tower
+
+    compile_s = warm_up()
+    clock = Clock()
+    rng = np.random.default_rng(2)
+    count = task["prisms"]
+    side = 35.0 * count**0.5  # as dense as a suburb, whatever its size
+    spots = rng.uniform(-side / 2, side / 2, (count, 2))
+    buildings = tuple(
+        Building(f"b{k}", box(e, n, e + rng.uniform(8, 20), n + rng.uniform(8, 20)), float(rng.uniform(5, 15)))
+        for k, (e, n) in enumerate(spots)
+        if np.hypot(e, n) > 30.0
+    )
+    site = Site("town", SiteFrame(35.7, -78.7), {"T": Tower("T", 35.7, -78.7, 0.0, 0.0, 30.0)}, buildings)
+    _, targets = ends("town", task["receivers"])
+    poses = Poses(targets, np.tile(np.eye(3), (len(targets), 1, 1)))
+    scene = Scene.of(site, Link(CARRIER_HZ, {"T": single_element()}, single_element()), poses)
+    setup = clock.since()
+    clock = Clock()
+    paths, effort = prisms.find_paths(
+        scene.faces, scene.sources_m, targets, max_depth=task["depth"], usable=scene.usable, excluded=scene.excluded
+    )
+    return {
+        **task,
+        "scene": f"{count} prisms",
+        "engine": "image",
+        "faces": len(scene.faces),
+        "compile_s": compile_s,
+        "setup_s": setup,
+        "search_s": clock.since(),
+        "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "paths": np.bincount(paths.depth, minlength=task["depth"] + 1).tolist(),
+        "sequences": effort.sequences,
+        "candidates": effort.candidates,
+        "duplicates": len(paths) - len(keys(paths)),
+    }
+
+
+def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
+    """PathSolver on the same triangles, and what each has that the other lacks."""
+    from aerpaw_cmp.propagation import sionna
+
+    if task.get("limit"):
+        sionna.MAXIMUM_PATHS = task["limit"]
+        sionna.RAISE_LIMITS = False
+    if task.get("slots"):
+        sionna.SPECULAR_TABLE_SLOTS = 2 ** task["slots"]
+    surfaces = merged(read_scene(shipped(task["scene"])))
+    sources, targets = ends(task["scene"], task["receivers"])
+    ours, _ = grow_paths(surfaces, sources, targets, max_depth=task["depth"])
+    sionna.load_variant()
+    clock = Clock()
+    theirs = sionna.find_paths(
+        surfaces.faces, sources, targets, carrier_hz=CARRIER_HZ, max_depth=task["depth"], samples=task["samples"],
+        batch=25, surfaces=surfaces,
+    )  # fmt: skip
+    spent = clock.since()
+    mine, other = plane_keys(ours, surfaces.plane), plane_keys(theirs, surfaces.plane)
+    lacking = np.array([k not in other for k in row_keys(ours, surfaces.plane)])
+    row = {
+        **task,
+        "engine": "sionna",
+        "faces": len(surfaces),
+        "search_s": spent,
+        "mib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024,
+        "paths": np.bincount(theirs.depth, minlength=task["depth"] + 1).tolist(),
+        "exact": np.bincount(ours.depth, minlength=task["depth"] + 1).tolist(),
+        "candidates": int(getattr(sionna, "LAST_CANDIDATES", 0)),
+        "missing": len(other - mine),
+        "extra": len(mine - other),
+        "duplicates": len(theirs) - len(other),
+    }
+    clear = free_in_sionna(surfaces, ours.select(lacking), sources, targets)
+    return row | {"extra_confirmed": int(clear.sum()), "extra_refuted": int((~clear).sum())}
+
+
+def row_keys(paths: Any, plane: np.ndarray) -> list[tuple[int, ...]]:
+    numbers = np.append(plane, -1)
+    rows = np.column_stack([paths.pose, paths.tower, numbers[paths.faces]])
+    return [tuple(n for n in row if n >= 0) for row in rows.tolist()]
+
+
+SHORTENED_M = 0.02
+"""Float32 at a kilometre, and the merge tolerance at grazing incidence."""
+
+
+def free_in_sionna(surfaces: Any, paths: Any, sources: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Which paths (paths,) have no segment that Sionna's own scene cuts, and reflect on its surfaces."""
+    import mitsuba as mi
+
+    from aerpaw_cmp.propagation import sionna
+
+    built = sionna._build(surfaces.faces, np.arange(len(surfaces)), 1e4, CARRIER_HZ, surfaces=surfaces)
+    scene = built.scene.mi_scene
+    clear = np.ones(len(paths), dtype=bool)
+    for row in range(len(paths)):
+        points = [sources[paths.tower[row]], *paths.vertices_m[row, : paths.depth[row]], targets[paths.pose[row]]]
+        for a, b in itertools.pairwise(points):
+            length = float(np.linalg.norm(b - a))
+            if length < 3 * SHORTENED_M:
+                continue
+            way = (b - a) / length
+            start = a + SHORTENED_M * way
+            ray = mi.Ray3f(mi.Point3f(*start.tolist()), mi.Vector3f(*way.tolist()))
+            ray.maxt = length - 2 * SHORTENED_M
+            clear[row] &= not bool(scene.ray_test(ray).numpy()[0])
+    return clear
+
+
+def run(task: dict[str, Any]) -> dict[str, Any]:
+    done = subprocess.run(
+        [sys.executable, __file__, "--one", json.dumps(task)], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        return {**task, "failed": done.stderr.strip().splitlines()[-1:]}
+    return json.loads(done.stdout.splitlines()[-1])  # type: ignore[no-any-return]
+
+
+def growth_tasks(scene: str, receivers: int) -> dict[str, list[tuple[float, dict[str, Any]]]]:
+    base = {"kind": "image", "scene": scene, "receivers": receivers, "depth": 2}
+    return {
+        "receivers": [(n, {**base, "receivers": n}) for n in (50, 200, 800, 3200)],
+        "towers": [(n, {**base, "towers": n}) for n in (1, 2, 4)],
+        "triangles": [(n, {**base, "triangles": n}) for n in (2500, 5000, 10_000, 20_000, 38_936)],
+        "depth": [(n, {**base, "triangles": 2500, "depth": n}) for n in (1, 2, 3)],
+    }
+
+
+def fitted(pairs: list[tuple[float, float]]) -> float:
+    """Exponent of a power, by least squares of logarithms."""
+    x, y = np.log(np.array(pairs)).T
+    return float(np.polyfit(x, y, 1)[0])
+
+
+def draw(found: dict[str, list[tuple[float, float]]], scene: str, path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(found), figsize=(11, 2.8), constrained_layout=True)
+    for ax, (what, pairs) in zip(axes, found.items(), strict=True):
+        x, y = np.array(pairs).T
+        ax.loglog(x, y, "o-", color="#1f5fa8")
+        label = (
+            f"power {fitted(pairs):.2f}"
+            if what != "depth"
+            else f"x {(y[-1] / y[0]) ** (1 / (x[-1] - x[0])):.1f} a reflection"
+        )
+        ax.set_title(label, fontsize=10)
+        ax.set_xlabel(what)
+        ax.set_xticks(x, [f"{v:g}" for v in x])
+        ax.minorticks_off()
+        ax.grid(alpha=0.3)
+    axes[0].set_ylabel("CPU seconds of the search")
+    figure.suptitle(f"{scene}: growth of the exact search", fontsize=11)
+    figure.savefig(path)
+
+
+def table(rows: list[dict[str, Any]]) -> None:
+    head = "scene", "engine", "depth", "set-up wall / CPU [s]", "search wall / CPU [s]", "MiB", "paths by depth"
+    print("| " + " | ".join([*head, "missing / extra (of these free in Sionna's scene) / twice"]) + " |")
+    print("| --- " * 8 + "|")
+    for row in rows:
+        if "failed" in row:
+            print(f"| {row.get('scene', row.get('prisms'))} | {row['kind']} | {row['depth']} | {row['failed']} |")
+            continue
+        engine = row["engine"]
+        if engine == "sionna":
+            engine += f", {row['samples']:g} rays, limit {row['limit']:g}, table 2^{row['slots']}"
+            engine += f", {row['candidates']} candidates"
+        setup = "{:.1f} / {:.1f}".format(*row["setup_s"]) if "setup_s" in row else ""
+        compared = f"/ / {row['duplicates']}"
+        if "missing" in row:
+            compared = f"{row['missing']} / {row['extra']} ({row['extra_confirmed']}) / {row['duplicates']}"
+        search = "{:.1f} / {:.1f}".format(*row["search_s"])
+        paths = ", ".join(map(str, row["paths"]))
+        cells = row["scene"], engine, str(row["depth"]), setup, search, f"{row['mib']:.0f}", paths, compared
+        print("| " + " | ".join(cells) + " |")
+
+
+def tasks_of(given: argparse.Namespace, names: list[str]) -> list[dict[str, Any]]:
+    common = {"receivers": given.receivers}
+    depths = given.depths
+    tasks = []
+    if not given.only_sionna:
+        tasks += [
+            {"kind": "image", "scene": n, "depth": d, "check": given.check, **common} for n in names for d in depths
+        ]
+    tasks += [{"kind": "prisms", "prisms": n, "depth": d, **common} for n in given.prisms for d in depths]
+    tasks += [
+        {"kind": "sionna", "scene": n, "depth": max(depths), "samples": s, "limit": m, "slots": t, **common}
+        for n in names
+        for s in given.sionna
+        for m in given.limits
+        for t in given.slots
+    ]
+    return tasks
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    numbers = lambda text: [int(float(n)) for n in text.split(",") if n]  # noqa: E731
+    parser.add_argument("--scenes", default="munich,etoile,florence")
+    parser.add_argument("--depths", type=numbers, default=[1, 2])
+    parser.add_argument("--receivers", type=int, default=200)
+    parser.add_argument("--check", action="store_true")
+    parser.add_argument("--prisms", type=numbers, default=[])
+    parser.add_argument("--sionna", type=numbers, default=[])
+    parser.add_argument("--limits", type=numbers, default=[0])
+    parser.add_argument("--slots", type=numbers, default=[0])
+    parser.add_argument("--only-sionna", action="store_true")
+    parser.add_argument("--growth", action="store_true")
+    parser.add_argument("--figure", type=Path)
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--one", help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.one:
+        task = json.loads(given.one)
+        print(json.dumps({"image": image_row, "prisms": prism_row, "sionna": sionna_row}[task["kind"]](task)))
+        return
+    names = [name for name in given.scenes.split(",") if name]
+    print(
+        f"{platform.machine()}, {len(os.sched_getaffinity(0))} cores, load {os.getloadavg()[0]:.1f}, Python "
+        f"{platform.python_version()}; {given.receivers} receivers, 1 transmitter"
+    )
+    rows = [run(task) for task in tasks_of(given, names)]
+    table(rows)
+    for row in rows:
+        if row.get("kind") == "image" and given.check and "failed" not in row:
+            print(
+                f"{row['scene']} depth {row['depth']}: {row['differ_without_shadows']} paths differ with shadows off, "
+                f"{row['differ_without_beams_on_600_triangles']} with every cut off on 600 triangles"
+            )
+    found: dict[str, list[tuple[float, float]]] = {}
+    if given.growth:
+        for what, tasks in growth_tasks(names[0], given.receivers).items():
+            found[what] = [(n, run(task)["search_s"][1]) for n, task in tasks]
+            power = f"power {fitted(found[what]):.2f}" if what != "depth" else ""
+            print(f"{names[0]}, {what}: " + ", ".join(f"{n:g}: {s:.2f} s" for n, s in found[what]), power)
+        if given.figure:
+            draw(found, names[0], given.figure)
+    if given.json:
+        given.json.write_text(json.dumps({"rows": rows, "growth": found}, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,103 @@
+"""A scene to a site.yaml, through replay, and back."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.jobs.site_scene import is_scene, run_scene_import, run_site_export
+from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.siteyaml import load_site
+
+ROOM = """<scene version="2.1.0">
+<bsdf type="itu-radio-material" id="stone"><string name="type" value="marble"/><float name="thickness" value="0.2"/></bsdf>
+<bsdf type="radio-material" id="mine"><float name="relative_permittivity" value="4"/><float name="conductivity" value="0.01"/></bsdf>
+<shape type="rectangle" id="floor"><transform name="to_world"><scale value="50"/></transform><ref id="stone" name="bsdf"/></shape>
+<shape type="cube" id="block"><transform name="to_world"><scale value="5"/><translate x="20" z="5"/></transform><ref id="mine" name="bsdf"/></shape>
+</scene>"""
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> Path:
+    (tmp_path / "room").mkdir()
+    (tmp_path / "room" / "room.xml").write_text(ROOM)
+    return tmp_path / "room" / "room.xml"
+
+
+def paths_of(site_file: Path):
+    site = load_site(site_file)
+    link = Link(3.4e9, dict.fromkeys(site.towers, single_element()), single_element())
+    spots = np.random.default_rng(1).uniform([-30, -30, 1], [12, 30, 20], (20, 3))
+    return replay(site, link, Poses(spots, np.tile(np.eye(3), (20, 1, 1))))
+
+
+def test_in_and_out_and_in_again(room: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    out = tmp_path / "site.yaml"
+    arguments = ["site", "import", room, "--origin", "35.7,-78.7,90", "--tower", "T=-5,3,10", "-o", out]
+    assert main([str(a) for a in arguments]) == 0
+    site = load_site(out)
+    assert site.towers["T"].position_m == pytest.approx([-5, 3, 10], abs=1e-4)
+    first = paths_of(out)
+    assert {"marble with thickness=0.2", "constant with permittivity=4 conductivity=0.01 thickness=0.1"} == set(
+        first.faces.material
+    )
+    assert main(["site", "export", str(out), "--sionna", str(tmp_path / "out")]) == 0
+    assert capsys.readouterr().out.split()[-1] == str(tmp_path / "out" / "scene.xml")
+    again = tmp_path / "again.yaml"
+    run_scene_import(tmp_path / "out" / "scene.xml", again, origin="35.7,-78.7", towers=["T=-5,3,10"])
+    second = paths_of(again)
+    assert second.faces.material == first.faces.material
+    assert np.array_equal(second.paths.faces, first.paths.faces)
+    assert np.nanmax(np.abs(second.rss_dbm - first.rss_dbm)) < 1e-6
+
+
+def test_what_a_scene_does_not_say_is_asked_for(room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site.yaml"
+    with pytest.raises(UsageError, match="does not say where on Earth it lies"):
+        run_scene_import(room, out)
+    with pytest.raises(UsageError, match=r"has no towers.*from -50 to 50 m east"):
+        run_scene_import(room, out, origin="local")
+    with pytest.raises(UsageError, match="the two are swapped"):
+        run_scene_import(room, out, origin="-118.7,35.7")
+    with pytest.raises(UsageError, match="--tower A"):
+        run_scene_import(room, out, origin="local", towers=["A=1,2"])
+    assert not out.exists()
+    told = run_scene_import(room, out, origin="local", towers=["A=1,2,3"])
+    assert any("no georeference" in line for line in told)
+
+
+def test_towers_of_a_base_site_are_kept(room: Path, tmp_path: Path) -> None:
+    run_scene_import(room, tmp_path / "s.yaml", base="lake_wheeler")
+    site, base = load_site(tmp_path / "s.yaml"), load_site("lake_wheeler")
+    assert set(site.towers) == set(base.towers)
+    assert site.scene is not None
+    assert not site.buildings
+
+
+def test_a_scene_that_changed_or_went_is_said(room: Path, tmp_path: Path) -> None:
+    out = tmp_path / "site.yaml"
+    run_scene_import(room, out, origin="local", towers=["A=1,2,3"])
+    room.write_text(ROOM.replace("marble", "brick"))
+    with pytest.raises(UsageError, match="they changed since the site was made") as told:
+        load_site(out)
+    assert told.value.exit_code == 2
+    room.unlink()
+    assert main(["site", "show", str(out), "-o", str(tmp_path / "show")]) == 3
+
+
+def test_maps_are_no_scenes(room: Path, tmp_path: Path) -> None:
+    (tmp_path / "map.xml").write_text("<osm><way/></osm>")
+    assert is_scene(room)
+    assert not is_scene(tmp_path / "map.xml")
+    assert not is_scene(tmp_path / "none.xml")
+
+
+def test_a_site_of_prisms_can_be_written(tmp_path: Path) -> None:
+    files = run_site_export("lake_wheeler", tmp_path / "out", trees=False)
+    assert files[0].name == "scene.xml"
+    assert {f.stem for f in files[1:]} >= {"all_concrete", "all_medium_dry_ground"}

@@ -1,0 +1,250 @@
+"""The search among open surfaces: against enumeration of triangles, against the prism engine, in closed form."""
+
+from dataclasses import replace
+from importlib.util import module_from_spec, spec_from_file_location
+from pathlib import Path
+
+import numpy as np
+import pytest
+from shapely.geometry import box
+
+pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
+
+from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.propagation import image, prisms
+from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
+from aerpaw_cmp.propagation.merging import merged
+from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.export import export_scene
+from aerpaw_cmp.site.mitsuba import read_scene
+from aerpaw_cmp.site.scenes import placed_scene
+from aerpaw_cmp.site.site import Building
+
+_spec = spec_from_file_location("open_surfaces", Path(__file__).with_name("open_surfaces.py"))
+enumerate_ = module_from_spec(_spec)
+_spec.loader.exec_module(enumerate_)
+
+WAYS = ({}, {"beams": False}, {"shadows": False})
+
+
+def quad(corner, one, two):
+    corner, one, two = (np.asarray(v, dtype=float) for v in (corner, one, two))
+    return [[corner, corner + one, corner + one + two], [corner, corner + one + two, corner + two]]
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_tilted_overlapping_open_quads_against_enumeration(seed):
+    rng = np.random.default_rng(seed)
+    triangles, shapes = quad((-40, -40, -8), (80, 0, 0), (0, 80, 0)), [20, 20]
+    for k in range(8):
+        corner, one = rng.uniform(-20, 20, 3), 8 * rng.normal(size=3)
+        two = np.cross(one, rng.normal(size=3))
+        two *= 8 / np.linalg.norm(two)
+        triangles += quad(corner, one, two)
+        shapes += [k, k]
+        if k % 3 == 0:  # another shape that overlaps in the same plane
+            triangles += quad(corner + 0.3 * one + 0.2 * two, one, two)
+            shapes += [8 + k, 8 + k]
+    scene = enumerate_.scene_of(triangles, shapes=shapes)
+    sources, targets = rng.uniform(-15, 15, (2, 3)), rng.uniform(-15, 15, (6, 3))
+    expected = enumerate_.paths(scene.vertices_m[scene.triangles], sources, targets, 2)
+    assert sum(len(v) for v in expected.values()) > 6
+    for way in WAYS:
+        paths, _ = grow_paths(merged(scene), sources, targets, max_depth=2, **way)
+        assert enumerate_.compare(paths, expected) == (0, 0), way
+
+
+@pytest.mark.parametrize(("name", "middle", "count"), [("munich", (8, 21), 200), ("florence", (0, 0), 200)])
+def test_cropped_scenes_against_enumeration(name, middle, count):
+    path = enumerate_.shipped(name)
+    if not path.exists():
+        pytest.skip("this Sionna RT ships no scenes")
+    scene = read_scene(path)
+    corners = scene.vertices_m[scene.triangles]
+    near = np.argsort(np.linalg.norm(corners.mean(axis=1)[:, :2] - middle, axis=1))[:count]
+    crop = replace(scene, triangles=scene.triangles[near], shape=scene.shape[near])
+    rng = np.random.default_rng(1)
+    source = np.array([[*middle, 30.0]])
+    targets = np.column_stack([rng.uniform(-40, 40, (8, 2)) + middle, rng.uniform(1.5, 40, 8)])
+    expected = enumerate_.paths(corners[near], source, targets, 2)
+    for way in WAYS:
+        paths, _ = grow_paths(merged(crop), source, targets, max_depth=2, **way)
+        assert enumerate_.compare(paths, expected) == (0, 0), way
+
+
+def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
+    path = enumerate_.shipped("etoile")
+    if not path.exists():
+        pytest.skip("this Sionna RT ships no scenes")
+    surfaces = merged(read_scene(path))
+    rng = np.random.default_rng(2)
+    targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
+    source = np.array([[0.0, 0.0, 30.0]])
+    found = [grow_paths(surfaces, source, targets, max_depth=2, shadows=on)[0] for on in (True, False)]
+    assert len(found[0]) == len(found[1]) > 50
+    for column in ("pose", "faces"):
+        assert np.array_equal(getattr(found[0], column), getattr(found[1], column))
+
+
+def test_a_mirror_works_on_both_sides_and_hides_from_both():
+    wall = enumerate_.scene_of(quad((0, -50, -50), (0, 100, 0), (0, 0, 100)))
+    for side in (1.0, -1.0):
+        source, targets = np.array([[3.0 * side, 0, 0]]), np.array([[5.0 * side, 4.0, 2.0], [-5.0 * side, 4.0, 2.0]])
+        paths, _ = grow_paths(merged(wall), source, targets, max_depth=1)
+        assert paths.pose.tolist() == [0, 0]
+        assert paths.depth.tolist() == [0, 1]
+        # the image of the source is at -3: the line to (5, 4, 2) crosses the wall at 3/8 of its way
+        assert paths.vertices_m[1, 0] == pytest.approx([0.0, 4.0 * 3 / 8, 2.0 * 3 / 8])
+
+
+def test_coincident_faces_give_one_path():
+    sheet = quad((-9, -9, 0), (18, 0, 0), (0, 18, 0))
+    again = quad((-5, -5, 0), (12, 0, 0), (0, 12, 0))  # overlaps, in the same plane, of another shape
+    close = quad((-9, -9, -0.0004), (18, 0, 0), (0, 18, 0))  # the back of a double face
+    scene = enumerate_.scene_of([*sheet, *again, *close], shapes=[0, 0, 1, 1, 2, 2])
+    paths, _ = grow_paths(merged(scene), np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]]), max_depth=2)
+    assert paths.depth.tolist() == [0, 1]
+
+
+def test_triangles_within_the_tolerance_are_one_face_and_others_are_not():
+    for bend_m, faces in ((0.0005, 1), (0.005, 2)):
+        flat = np.array([[[0, 0, 0], [9, 0, 0], [9, 9, 0]], [[0, 0, 0], [9, 9, 0], [0, 9, bend_m]]], dtype=float)
+        assert len(merged(enumerate_.scene_of(flat))) == faces
+
+
+def test_flipped_and_degenerate_triangles_change_nothing():
+    sheet = np.array(quad((-9, -9, 0), (18, 0, 0), (0, 18, 0)))
+    flipped = sheet.copy()
+    flipped[1] = flipped[1][::-1]
+    needle = np.array([[[0, 0, 1], [1, 0, 1], [2, 0, 1]]], dtype=float)
+    ends = np.array([[0, 0, 3.0]]), np.array([[2.0, 1, 4]])
+    expected, _ = grow_paths(merged(enumerate_.scene_of(sheet)), *ends, max_depth=2)
+    surfaces = merged(enumerate_.scene_of(np.concatenate([flipped, needle])))
+    assert surfaces.notes == ("1 triangles without an area were dropped",)
+    paths, _ = grow_paths(surfaces, *ends, max_depth=2)
+    assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
+
+
+def test_the_power_cut_leaves_out_long_paths_only():
+    rng = np.random.default_rng(5)
+    walls = [
+        t for _ in range(10) for t in quad(rng.uniform(-30, 30, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
+    ]
+    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(10), 2)))
+    source, targets = rng.uniform(-20, 20, (1, 3)), rng.uniform(-20, 20, (30, 3))
+    every, _ = grow_paths(surfaces, source, targets, max_depth=2)
+    some, _ = grow_paths(surfaces, source, targets, max_depth=2, longest_m=40.0)
+
+    def length(paths):
+        total, last = np.zeros(len(paths)), np.broadcast_to(source[0], (len(paths), 3))
+        for step in range(3):
+            end = targets[paths.pose] if step == 2 else paths.vertices_m[:, step]
+            end = np.where(np.isfinite(end), end, targets[paths.pose])
+            total, last = total + np.linalg.norm(end - last, axis=1), end
+        return total
+
+    kept = every.select((length(every) <= 40.0) | (every.depth == 0))
+    assert 0 < len(kept) < len(every)
+    assert np.array_equal(kept.faces, some.faces)
+    assert np.array_equal(kept.pose, some.pose)
+
+
+def test_paths_can_be_recomputed_from_their_faces():
+    scene = read_scene(enumerate_.shipped("simple_street_canyon"))
+    surfaces = merged(scene)
+    rng = np.random.default_rng(6)
+    source = np.array([[-20.0, 0.0, 20.0]])
+    targets = np.column_stack([rng.uniform(-40, 40, 30), rng.uniform(-8, 8, 30), rng.uniform(1, 30, 30)])
+    paths, effort = grow_paths(surfaces, source, targets, max_depth=2)
+    rows = np.flatnonzero(paths.depth == 2)
+    assert len(rows) > 10
+    assert effort.sequences > 100
+    ends = source[paths.tower[rows]], targets[paths.pose[rows]]
+    faces, points, good = reflection_points(surfaces, paths.faces[rows], *ends, edge_m=1e-6)
+    assert good.all()
+    assert np.array_equal(faces, paths.faces[rows])
+    assert np.abs(points - paths.vertices_m[rows]).max() < 1e-9
+
+
+def test_a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine(scenes, tmp_path):
+    """Two engines that share no code: closed prisms of site.yaml, and their triangles out and in again."""
+    rng = np.random.default_rng(8)
+    buildings = tuple(
+        Building(f"b{k}", box(e - 7, n - 5, e + 6, n + 8), float(rng.uniform(6, 20)), material="concrete")
+        for k, (e, n) in enumerate([(30, 30), (-35, 20), (20, -40), (-30, -30), (60, 0)])
+    )
+    site = scenes.site(buildings, ((0.0, 0.0, 10.0),), area_m=(-200.0, 200.0, -200.0, 200.0))
+    poses = scenes.poses(rng.uniform([-90, -90, 1], [90, 90, 40], (60, 3)))
+    prisms = replay(site, scenes.link(site), poses, max_depth=2)
+    export_scene(site, tmp_path, trees=False)
+    open_site = replace(site, buildings=(), scene=placed_scene(tmp_path / "scene.xml"))
+    surfaces = replay(open_site, scenes.link(open_site), poses, max_depth=2)
+    outside = ~Scene.of(site, scenes.link(site), poses).excluded[0]
+    counts = [np.bincount(r.paths.pose, minlength=60)[outside] for r in (prisms, surfaces)]
+    assert prisms.paths.depth.max() == 2
+    assert np.array_equal(*counts)
+    assert np.nanmax(np.abs(prisms.rss_dbm - surfaces.rss_dbm)[outside]) < 1e-3  # float32 vertices
+
+
+@pytest.mark.parametrize("aligned", [False, True])
+def test_prisms_by_beams_have_the_paths_of_the_image_engine(scenes, aligned):
+    """Random prisms with holes, and boxes on a grid whose walls touch, with ends on faces."""
+    rng = np.random.default_rng(11)
+    if aligned:
+        corners = rng.integers(-4, 4, (8, 2)) * 10
+        buildings = [
+            Building(f"b{k}", box(e, n, e + 10, n + 10), 10.0 * (1 + k % 2)) for k, (e, n) in enumerate(corners)
+        ]
+        spots = rng.integers([-9, -9, 0], [10, 10, 6], (60, 3)) * 5.0
+    else:
+        buildings = scenes.buildings(rng, 8, spread_m=90.0, holes=True)
+        spots = rng.uniform([-120, -120, 0], [120, 120, 40], (60, 3))
+    site = scenes.site(buildings, ((0.0, -20.0, 10.0), (3.0, -5.0, 25.0)))
+    scene, poses = Scene.of(site, scenes.link(site), scenes.poses(spots)), scenes.poses(spots)
+    settings = {"max_depth": 2, "usable": scene.usable, "excluded": scene.excluded}
+    expected = image.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
+    found, _ = prisms.find_paths(scene.faces, scene.sources_m, poses.position_m, **settings)
+    assert len(expected) > 100
+    assert np.array_equal(found.faces, expected.faces)
+    assert np.array_equal(found.pose, expected.pose)
+
+
+def test_a_thousand_buildings_are_searched_not_refused(scenes):
+    rng = np.random.default_rng(12)
+    spot = rng.uniform(-1500, 1500, (1000, 2))
+    buildings = [
+        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
+    ]
+    site = scenes.site(buildings, ((0.0, 0.0, 30.0),))
+    result = replay(site, scenes.link(site), scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3))))
+    assert (result.paths.depth == 2).sum() > 10
+
+
+def test_what_a_scene_cannot_do_is_said(scenes, tmp_path):
+    scene = placed_scene(enumerate_.shipped("simple_street_canyon"))
+    site = scenes.site((), ((0.0, 0.0, 20.0),), scene=scene)
+    with pytest.raises(UsageError, match="max_depth 4"):
+        grow_paths(merged(scene), np.zeros((1, 3)), np.zeros((1, 3)), max_depth=4)
+    assert replay(site, scenes.link(site), scenes.poses([[5.0, 2.0, 1.5]])).paths.depth.max() == 2
+
+
+@pytest.mark.sionna
+def test_every_path_of_pathsolver_is_found(scenes):
+    """PathSolver on the same triangles: nothing of it is missing, and nothing is found twice."""
+    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
+    from aerpaw_cmp.propagation import sionna
+
+    try:
+        sionna.load_variant()
+    except (CheckError, UsageError) as error:
+        pytest.skip(f"no device for Dr.Jit: {error}")
+    rng = np.random.default_rng(9)
+    site = scenes.site((), ((-20.0, 0.0, 20.0),), scene=placed_scene(enumerate_.shipped("simple_street_canyon")))
+    spots = np.column_stack([rng.uniform(-40, 40, 25), rng.uniform(-8, 8, 25), rng.uniform(1, 30, 25)])
+    poses, link = scenes.poses(spots), scenes.link(site)
+    ours = replay(site, link, poses).paths
+    theirs = replay(site, link, poses, "sionna", samples=100_000, batch=25, cache_dir="").paths
+    keys = [{(p, *f) for p, f in zip(x.pose.tolist(), x.faces.tolist(), strict=True)} for x in (ours, theirs)]
+    assert keys[1] <= keys[0]
+    assert len(keys[1]) >= 0.97 * len(keys[0])

@@ -1,0 +1,221 @@
+"""Mitsuba scenes: every way to write one, and one message for every way to write it wrong."""
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError, UsageError
+from aerpaw_cmp.site.materials import material
+from aerpaw_cmp.site.meshfiles import read_ply
+from aerpaw_cmp.site.mitsuba import read_scene
+from aerpaw_cmp.site.scenes import ground_share, placed_scene, with_ground
+
+ITU = '<bsdf type="itu-radio-material" id="m"><string name="type" value="concrete"/></bsdf>'
+REF = '<ref id="m" name="bsdf"/>'
+SQUARE = "v 0 0 0\nv 2 0 0\nv 2 2 0\nv 0 2 0\n"
+PLY_HEAD = "ply\nformat ascii 1.0\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\nelement face {}\nproperty list uchar int vertex_indices\nend_header\n"
+PLY_POINTS = "0 0 0\n2 0 0\n2 2 0\n0 2 0\n"
+
+
+def write(folder, body, bsdf=ITU):
+    path = folder / "scene.xml"
+    path.write_text(f'<scene version="2.1.0">{bsdf}{body}</scene>')
+    return path
+
+
+def ply(kind):
+    points = np.array([[0, 0, 0], [2, 0, 0], [2, 2, 0], [0, 2, 0]], dtype=float)
+    if kind == "ascii":
+        return (PLY_HEAD.format(2) + PLY_POINTS + "3 0 1 2\n3 0 2 3\n").encode()
+    if kind == "quad":
+        return (PLY_HEAD.format(1) + PLY_POINTS + "4 0 1 2 3\n").encode()
+    order = {"little": "<", "big": ">"}[kind.split()[0]]
+    mixed = kind.endswith("mixed")
+    head = f"ply\nformat binary_{kind.split()[0]}_endian 1.0\ncomment x\nelement vertex 4\nproperty double x\nproperty float s\nproperty double y\nproperty double z\nelement face {2 if not mixed else 3}\nproperty list uchar uint vertex_index\nproperty uchar red\nend_header\n"
+    rows = np.zeros(4, dtype=[("x", order + "f8"), ("s", order + "f4"), ("y", order + "f8"), ("z", order + "f8")])
+    for k, axis in enumerate("xyz"):
+        rows[axis] = points[:, k]
+    faces = [[0, 1, 2], [0, 2, 3], [0, 1]] if mixed else [[0, 1, 2], [0, 2, 3]]
+    body = b"".join(bytes([len(f)]) + np.array(f, order + "u4").tobytes() + b"\x07" for f in faces)
+    return head.encode() + rows.tobytes() + body
+
+
+@pytest.mark.parametrize("kind", ["ascii", "quad", "little", "big", "little mixed"])
+def test_every_ply_is_the_same_square(kind, tmp_path):
+    mesh = read_ply(ply(kind), tmp_path / "a.ply")
+    corners = mesh.vertices[mesh.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    assert area.tolist() == [2.0, 2.0]
+
+
+@pytest.mark.parametrize("kind", ["ascii", "little", "big", "little mixed"])
+def test_a_ply_cut_off_anywhere_is_one_message(kind, tmp_path):
+    data = ply(kind)
+    for length in range(len(data) - 2):
+        try:
+            mesh = read_ply(data[:length], tmp_path / "a.ply")
+        except InputError:
+            continue
+        assert len(mesh.triangles) == 2, "only a last number cut short is still a number"
+
+
+@pytest.mark.parametrize(
+    ("steps", "corner"),
+    [
+        ('<translate x="5" y="-1"/>', (7, 1, 0)),
+        ('<translate value="5, -1, 2"/>', (7, 1, 2)),
+        ('<scale value="3"/><translate z="1"/>', (6, 6, 1)),
+        ('<scale x="2" y="1" z="1"/>', (4, 2, 0)),
+        ('<rotate z="1" angle="90"/>', (-2, 2, 0)),
+        ('<translate x="1"/><rotate x="2" angle="90"/>', (3, 0, 2)),
+        ('<matrix value="1 0 0 9 0 1 0 8 0 0 1 7 0 0 0 1"/>', (11, 10, 7)),
+        ('<matrix value="0 1 0 1 0 0 0 0 1"/>', (2, 2, 0)),
+    ],
+)
+def test_to_world_applies_its_steps_in_order(steps, corner, tmp_path):
+    (tmp_path / "a.obj").write_text(SQUARE + "f 1 2 3 4\n")
+    shape = f'<shape type="obj" id="s"><string name="filename" value="a.obj"/><transform name="to_world">{steps}</transform>{REF}</shape>'
+    scene = read_scene(write(tmp_path, shape))
+    assert scene.vertices_m[2] == pytest.approx(np.array(corner), abs=1e-12)
+
+
+def test_rectangle_cube_merge_and_parameters(tmp_path):
+    body = f'<default name="half" value="4"/><shape type="merge"><shape type="rectangle">{REF}<transform name="to_world"><scale value="$half"/></transform></shape><shape type="cube">{REF}</shape></shape><shape type="sphere">{REF}</shape>'
+    scene = read_scene(write(tmp_path, body))
+    corners = scene.vertices_m[scene.triangles]
+    area = 0.5 * np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
+    assert np.bincount(scene.shape, weights=area).tolist() == [64.0, 24.0]
+    assert scene.notes == (
+        "warning: 1 shapes of type 'sphere' were left out; read are ply, obj, rectangle, cube, merge",
+    )
+    outward = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[2:]
+    assert (np.einsum("ti,ti->t", outward, corners[2:].mean(axis=1)) > 0).all()
+
+
+@pytest.mark.parametrize(
+    ("bsdf", "permittivity", "thickness"),
+    [
+        (ITU, 5.24, 0.1),
+        (ITU.replace("</bsdf>", '<float name="thickness" value="0.3"/></bsdf>'), 5.24, 0.3),
+        (
+            '<bsdf type="diffuse" id="m"/><bsdf type="diffuse" id="mat-itu_brick"/>'.replace(
+                'id="m"', 'id="mat-itu_wood"'
+            ),
+            1.99,
+            0.1,
+        ),
+        (
+            '<bsdf type="radio-material" id="m"><float name="relative_permittivity" value="3.5"/><float name="conductivity" value="0.1"/></bsdf>',
+            3.5,
+            0.1,
+        ),
+        ('<bsdf type="absorber-radio-material" id="m"/>', 1.0, None),
+    ],
+)
+def test_radio_materials(bsdf, permittivity, thickness, tmp_path):
+    name = "mat-itu_wood" if "mat-itu_wood" in bsdf else "m"
+    scene = read_scene(write(tmp_path, f'<shape type="rectangle"><ref id="{name}" name="bsdf"/></shape>', bsdf))
+    what = material(scene.materials[0])
+    assert what.relative_permittivity(3.4e9).real == pytest.approx(permittivity)
+    assert what.thickness_m == thickness
+    assert material(what.name) == what
+
+
+def test_a_material_inside_a_shape_and_one_named_by_hand(tmp_path):
+    inner = f'<shape type="rectangle">{ITU}</shape>'
+    assert read_scene(write(tmp_path, inner, "")).materials == ("concrete with thickness=0.1",)
+    path = write(tmp_path, f'<shape type="rectangle">{REF}</shape>', '<bsdf type="principled" id="m"/>')
+    with pytest.raises(UsageError, match=r"'m' is of type 'principled'.*--material 'm=concrete'"):
+        read_scene(path)
+    assert read_scene(path, {"m": "brick"}).materials == ("brick",)
+    with pytest.raises(UsageError, match="no material 'wall'; expected one of m"):
+        read_scene(path, {"wall": "brick", "m": "brick"})
+
+
+MESH = '<shape type="ply" id="s"><string name="filename" value="{}"/>' + REF + "</shape>"
+
+
+@pytest.mark.parametrize(
+    ("body", "bsdf", "message"),
+    [
+        (MESH.format("gone.ply"), ITU, "names 'gone.ply', which is not there"),
+        (MESH.format("../a.ply"), ITU, "outside the scene's folder"),
+        (MESH.format("/etc/hostname"), ITU, "outside the scene's folder"),
+        (MESH.format("C:/a.ply"), ITU, "outside the scene's folder"),
+        (MESH.format("..\\a.ply"), ITU, "outside the scene's folder"),
+        (MESH.format("link.ply"), ITU, "outside the scene's folder"),
+        (MESH.format("huge.ply"), ITU, "ends before the 4000000000 entries of 'vertex'"),
+        (MESH.format("long.ply"), ITU, "no 'end_header' in its first 65536 bytes"),
+        (MESH.format("nan.ply"), ITU, "a vertex is not a finite number"),
+        (MESH.format("index.ply"), ITU, "a face names vertex 9"),
+        (MESH.format("text.ply"), ITU, "does not begin with 'ply'"),
+        ('<shape type="obj"><string name="filename" value="bad.obj"/></shape>', ITU, "'f 1 two 3'"),
+        ('<shape type="ply" id="s">' + REF + "</shape>", ITU, "the shape 's' names no file"),
+        ('<shape type="rectangle" id="s"/>', ITU, "the shape 's' has no material"),
+        ('<shape type="rectangle"><ref id="other"/></shape>', ITU, "names the material 'other', which the scene has not"),
+        (f'<shape type="rectangle">{REF}</shape>', ITU.replace("concrete", "cheese"), "unknown material 'cheese'"),
+        (f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="0"/></transform></shape>', ITU, "singular"),
+        (f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="a"/></transform></shape>', ITU, "'a'"),
+        (f'<shape type="rectangle">{REF}<transform name="to_world"><skew/></transform></shape>', ITU, "'skew'"),
+        ('<include filename="/etc/passwd"/>', ITU, "includes another XML file"),
+        ("", ITU, "no triangle"),
+        ("<shape", ITU, "not XML"),
+    ],
+)  # fmt: skip
+def test_bad_scenes_are_one_message(body, bsdf, message, tmp_path):
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    (tmp_path / "a.ply").write_bytes(ply("ascii"))
+    (folder / "link.ply").symlink_to(tmp_path / "a.ply")
+    (folder / "huge.ply").write_text(PLY_HEAD.format(2).replace("vertex 4", "vertex 4000000000"))
+    (folder / "long.ply").write_text("ply\n" + "comment x\n" * 10_000 + "end_header\n")
+    (folder / "nan.ply").write_text(PLY_HEAD.format(2) + PLY_POINTS.replace("2 2 0", "2 nan 0") + "3 0 1 2\n3 0 2 3\n")
+    (folder / "index.ply").write_text(PLY_HEAD.format(2) + PLY_POINTS + "3 0 1 9\n3 0 2 3\n")
+    (folder / "text.ply").write_text("solid\n")
+    (folder / "bad.obj").write_text(SQUARE + "f 1 two 3\n")
+    with pytest.raises(AerpawCmpError, match=message) as told:
+        read_scene(write(folder, body, bsdf))
+    assert "\n" not in str(told.value)
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-16"])
+def test_entities_are_refused(encoding, tmp_path):
+    bomb = (
+        '<?xml version="1.0"?><!DOCTYPE s [<!ENTITY a "aaaa"><!ENTITY b "&a;&a;">]><scene version="2.1.0">&b;</scene>'
+    )
+    path = tmp_path / "scene.xml"
+    path.write_bytes(bomb.encode(encoding))
+    with pytest.raises(InputError, match="declares entities"):
+        read_scene(path)
+
+
+def test_bent_quads_are_counted(tmp_path):
+    (tmp_path / "a.obj").write_text(SQUARE.replace("2 2 0", "2 2 0.1") + "f 1 2 3 4\n")
+    body = f'<shape type="obj"><string name="filename" value="a.obj"/>{REF}</shape>'
+    assert "1 polygons are not flat" in read_scene(write(tmp_path, body)).notes[0]
+
+
+def test_ground_is_looked_for_and_added(tmp_path):
+    cube = f'<shape type="cube">{REF}</shape>'
+    wide = f'<shape type="rectangle">{REF}<transform name="to_world"><scale value="20"/></transform></shape>'
+    upright = f'<shape type="rectangle">{REF}<transform name="to_world"><rotate x="1" angle="90"/></transform></shape>'
+    assert ground_share(read_scene(write(tmp_path, cube + wide))) == 1.0
+    scene = read_scene(
+        write(
+            tmp_path, upright + cube.replace("/>", '/><transform name="to_world"><scale value="0.2"/></transform>', 1)
+        )
+    )
+    assert ground_share(scene) < 0.5
+    grounded = with_ground(scene, "wet_ground")
+    assert ground_share(grounded) == 1.0
+    assert grounded.materials[-1] == "wet_ground"
+    assert grounded.vertices_m[:, 2].min() == scene.vertices_m[:, 2].min()
+
+
+def test_a_scene_is_turned_moved_and_recognised(tmp_path):
+    path = write(tmp_path, f'<shape type="rectangle">{REF}</shape>')
+    plain = read_scene(path)
+    moved = placed_scene(path, offset_m=(10.0, 0.0, 1.0), turn_deg=90.0, sha256=plain.sha256)
+    assert moved.vertices_m[1] == pytest.approx([11.0, 1.0, 1.0])  # (1, -1, 0) turned by a quarter
+    path.write_text(path.read_text().replace("concrete", "brick"))
+    with pytest.raises(UsageError, match="they changed since the site was made"):
+        placed_scene(path, sha256=plain.sha256)

@@ -23,6 +23,7 @@ from .rss_figures import (
     seen_from_antennas,
     trajectory,
 )
+from .serving_figures import serving_plate
 from .speed_figures import pareto, rank_changes
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ def plates(data: ReportData) -> list[Plate]:
                 page=True,
             )
         )
+    if data.serving is not None and data.serving.n:
+        result.append(serving_plate(data.serving))
     for rank in data.rank:
         if len(rank.time):
             result += _rank_plates(data, rank)

@@ -276,8 +276,9 @@ def near_an_edge(faces: Faces, source_m: FloatArray, target_m: FloatArray, path:
         return True
     corners = np.concatenate([source_m[None], points, target_m[None]])
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
-    # ends moved by that much in any direction
-    wide = Occlusion(faces, tolerance)
+    # moved by that much in any direction it meets a building, other than those it reflects at
+    own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
+    wide = Occlusion(_chosen(faces, np.flatnonzero(~own)), tolerance)
     moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
     return any(wide.segments(corners[:-1] + move, corners[1:] + move).any() for move in moves)
 

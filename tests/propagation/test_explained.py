@@ -47,3 +47,9 @@ def test_a_point_near_an_edge_is_known_as_such(scenes):
         bounce = type("B", (), dict(zip(("east_m", "north_m", "up_m"), point, strict=True)))()
         path.bounces, path.planes = (bounce,), (wall,)
         assert near_an_edge(faces, source, target, path) == near
+    # a line of sight that passes half a millimetre, or five, above a roof
+    faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
+    for above, near in ((5e-4, True), (5e-3, False)):
+        ends = np.array([[0.0, 0, 15 + above], [60.0, 0, 15 + above]])
+        line = type("P", (), {"bounces": (), "planes": ()})()
+        assert near_an_edge(faces, *ends, line) == near

@@ -7,12 +7,15 @@ lines of ``sample_logs`` and of ``$AERPAW_CMP_FIELD_DATA``; mutations change byt
 package's own; at most 2 s of the processor and 300 MiB; the process lives. Input ``i`` of a target depends on the
 seed, the target and ``i`` alone, so a violation is made again with ``--reproduce TARGET I``.
 
-``--account FILE`` appends a line of JSON per block and goes on where the file ends.
+``--account FILE`` appends a line of JSON per block and goes on where the file ends: a target's inputs count as long
+as the modules that read it, with all that they import, are unchanged. ``--part 1/2`` takes every second target: one
+process per part, all with the same account. ``--summary`` prints what an account holds for this state of the sources.
 """
 
 from __future__ import annotations
 
 import argparse
+import ast
 import fnmatch
 import hashlib
 import io
@@ -32,7 +35,7 @@ import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +46,7 @@ import numpy as np  # noqa: E402
 
 from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
 from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
-from aerpaw_cmp.logs import limits  # noqa: E402
+from aerpaw_cmp.logs import blocks, limits  # noqa: E402
 from aerpaw_cmp.logs.readers import Reader, ReadOptions, catalogue, head_of  # noqa: E402
 from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 
@@ -84,6 +87,8 @@ class Target:
     name: str
     seeds: tuple[bytes, ...]
     run: Callable[[bytes, int], bool]
+    modules: tuple[str, ...] = ()
+    """Modules whose code it is about; what they import counts as theirs."""
 
 
 # --- mutations -------------------------------------------------------------------------------------------------------
@@ -266,7 +271,9 @@ def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:
         raise ViolationError(f"{name}: a rank below 1")
     if kind == "rss" and np.isinf(frame["rss_db"].to_numpy()).any():
         raise ViolationError(f"{name}: an infinite level")
-    for column in frame.columns.intersection(list(RANGES)):
+    for column in frame.columns:
+        if column not in RANGES:
+            continue
         low, high = RANGES[column]
         values = frame[column].to_numpy()
         if ((values < low) | (values > high)).any():
@@ -279,9 +286,29 @@ def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
         head = head_of(data)
         for one in catalogue():
             one.sniff(head)
-    result = limits.check(reader.read(data, OPTIONS[index % len(OPTIONS)]))
+    options = OPTIONS[index % len(OPTIONS)]
+    result = limits.check(reader.read(data, options))
     check_law(result, data, binary)
+    if index % 8 == 4 and reader.in_blocks is not None:
+        _read_in_blocks(reader, data, options, result)
     return result.accepted > 0
+
+
+def _read_in_blocks(reader: Reader, data: bytes, options: ReadOptions, whole: ReadResult) -> None:
+    """The same account where a log is cut into blocks of a few lines."""
+    assert reader.in_blocks is not None
+    usual, blocks.BLOCK_BYTES = blocks.BLOCK_BYTES, 400
+    try:
+        result = reader.in_blocks((data[i : i + 300] for i in range(0, len(data), 300)), options)
+    except blocks.Whole:
+        return
+    finally:
+        blocks.BLOCK_BYTES = usual
+    account = (result.lines, result.accepted, result.blank, len(result.rejected))
+    expected = (whole.lines, whole.accepted, whole.blank, len(whole.rejected))
+    if account != expected:
+        raise ViolationError(f"in blocks: lines, accepted, blank, rejected {account}, in one piece {expected}")
+    check_law(limits.check(result), data, False)
 
 
 # --- targets ---------------------------------------------------------------------------------------------------------
@@ -517,33 +544,54 @@ def targets() -> list[Target]:
     for name, seeds in sorted(logs.items()):
         # SigMF is accounted for by its values, as binary files are, not by the lines of its JSON
         binary = name == "sigmf" or any(b"\0" in seed[:200] for seed in seeds)
-        out.append(Target(f"reader:{name}", tuple(seeds), partial(_read_log, readers[name], binary)))
+        out.append(
+            Target(f"reader:{name}", tuple(seeds), partial(_read_log, readers[name], binary), (_module_of(name),))
+        )
     some = [seeds[0] for name, seeds in sorted(logs.items()) if name != "generic_csv"]
-    out.append(Target("ingest:gzip", tuple(gzip.compress(s, mtime=0) for s in some), _gzipped))
+    packed = tuple(gzip.compress(s, mtime=0) for s in some)
+    out.append(Target("ingest:gzip", packed, _gzipped, ("aerpaw_cmp.logs.ingest",)))
     mats = [s for seeds in logs.values() for s in seeds if s.startswith((b"MATLAB", b"\x89HDF"))]
-    out.append(Target("matfile", tuple(mats), _mat))
+    out.append(Target("matfile", tuple(mats), _mat, ("aerpaw_cmp.logs.matfile",)))
     vehicle = next(iter(logs["vehicle_out"]))
-    out.append(Target("flight_file", (_flight_bytes(vehicle),), partial(_by_path, "f.h5", _flight_file)))
-    out.append(Target("path_cache", (_cache_entry(),), _path_cache))
-    yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any]]] = [
-        ("flight.yaml", (FLIGHT, (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]), _flight),
-        ("campaign.yaml", (CAMPAIGN,), _campaign),
-        ("site.yaml", (maps.SITE,), _site),
+    file = partial(_by_path, "f.h5", _flight_file)
+    out.append(Target("flight_file", (_flight_bytes(vehicle),), file, ("aerpaw_cmp.logs.flight_file",)))
+    out.append(Target("path_cache", (_cache_entry(),), _path_cache, ("aerpaw_cmp.propagation.cache",)))
+    sample = (ROOT / "sample_logs/flight.yaml").read_bytes()[:MEDIUM_BYTES]
+    yamls: list[tuple[str, tuple[bytes, ...], Callable[[Path], Any], tuple[str, ...]]] = [
+        ("flight.yaml", (FLIGHT, sample), _flight, ("aerpaw_cmp.flight.settings", "aerpaw_cmp.flight.simulate")),
+        ("campaign.yaml", (CAMPAIGN,), _campaign, ("aerpaw_cmp.jobs.campaign",)),
+        ("site.yaml", (maps.SITE,), _site, ("aerpaw_cmp.site.siteyaml",)),
     ]
-    for name, seeds, read in yamls:
-        out.append(Target(name, seeds, partial(_by_path, name, read)))
+    for name, seeds, load, modules in yamls:
+        out.append(Target(name, seeds, partial(_by_path, name, load), modules))
     fence = [p.read_bytes() for p in _log_files() if p.name.endswith("Geofence.kml")]
     plain = {"geojson": (maps.GEOJSON,), "overpass": (maps.OVERPASS,), "osm": (maps.OSM,)}
     for name, seeds in {**plain, "kml": (maps.KML, *(f[:MEDIUM_BYTES] for f in fence))}.items():
-        out.append(Target(f"map:{name}", seeds, partial(_by_path, f"m.{name}", _map)))
+        out.append(Target(f"map:{name}", seeds, partial(_by_path, f"m.{name}", _map), MAPS))
     kinds = (zipfile.ZIP_DEFLATED, zipfile.ZIP_STORED, zipfile.ZIP_BZIP2, zipfile.ZIP_LZMA)
     kmz = tuple(_zipped("doc.kml", maps.KML, kind) for kind in kinds)
-    out.append(Target("map:kmz", kmz, partial(_by_path, "m.kmz", _map)))
-    out.append(Target("dem:asc", (maps.DEM,), partial(_by_path, "d.asc", _dem)))
+    out.append(Target("map:kmz", kmz, partial(_by_path, "m.kmz", _map), MAPS))
+    out.append(Target("dem:asc", (maps.DEM,), partial(_by_path, "d.asc", _dem), DEMS))
     if (tiff := _geotiff()) is not None:
-        out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem)))
-    out.append(Target("antenna:text", (maps.PATTERN,), partial(_by_path, "p.txt", _pattern)))
+        out.append(Target("dem:tif", (tiff,), partial(_by_path, "d.tif", _dem), DEMS))
+    pattern = partial(_by_path, "p.txt", _pattern)
+    out.append(Target("antenna:text", (maps.PATTERN,), pattern, ("aerpaw_cmp.site.antennas",)))
     return out
+
+
+MAPS = ("aerpaw_cmp.site.footprints",)
+DEMS = ("aerpaw_cmp.site.dem",)
+
+
+def _module_of(reader: str) -> str:
+    """The module of the catalogue that a reader stands in."""
+    import aerpaw_parsers
+
+    for name, module in vars(aerpaw_parsers).items():
+        found = (*getattr(module, "READERS", ()), getattr(module, "READER", None), getattr(module, "JSON_READER", None))
+        if any(one is not None and one.name == reader for one in found):
+            return f"aerpaw_parsers.{name}"
+    raise KeyError(reader)
 
 
 # --- one input -------------------------------------------------------------------------------------------------------
@@ -651,23 +699,69 @@ def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any
     }
 
 
-def done_before(account: Path | None, seed: int, commit: str) -> dict[str, int]:
-    """How many inputs of each target the account holds already, for this seed and this state of the package."""
-    done: dict[str, int] = {}
+def done_before(account: Path | None, seed: int, known: Iterable[Target]) -> dict[str, dict[str, int]]:
+    """What the account holds of each target for this seed and the present sources: inputs, read, violations."""
+    state = {target.name: sources_of(target.modules) for target in known}
+    done: dict[str, dict[str, int]] = {}
     if account is not None and account.exists():
         for line in account.read_text(encoding="utf-8").splitlines():
             entry = json.loads(line)
-            if entry["seed"] == seed and entry["commit"] == commit and entry["from"] == done.get(entry["target"], 0):
-                done[entry["target"]] = entry["to"]
+            name = entry["target"]
+            row = done.get(name, {"inputs": 0, "read": 0, "violations": 0})
+            if (entry["seed"], entry.get("sources"), entry["from"]) == (seed, state.get(name), row["inputs"]):
+                done[name] = {
+                    "inputs": entry["to"],
+                    "read": row["read"] + entry["read"],
+                    "violations": row["violations"] + entry["violation"],
+                }
     return done
 
 
-def commit_of() -> str:
-    """Hash of the package's own sources: the state that an account speaks of."""
+@cache
+def _imports(module: str) -> frozenset[str]:
+    """Modules of the package that one imports, inside functions, too."""
+    path = _path_of(module)
+    if path is None:
+        return frozenset()
+    package = module if path.name == "__init__.py" else module.rpartition(".")[0]
+    found = {package}
+    for node in ast.walk(ast.parse(path.read_bytes())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            parts = package.split(".")
+            base = ".".join(parts[: len(parts) - node.level + 1]) if node.level else ""
+            name = ".".join(part for part in (base, node.module) if part)
+            found |= {name} | {f"{name}.{alias.name}" for alias in node.names}
+    return frozenset(name for name in found if name != module and _path_of(name) is not None)
+
+
+@cache
+def _path_of(module: str) -> Path | None:
+    folder = ROOT / "parsers" if module.startswith("aerpaw_parsers") else ROOT
+    place = folder.joinpath(*module.split("."))
+    if not module.startswith(("aerpaw_cmp", "aerpaw_parsers")):
+        return None
+    return next((path for path in (place.with_suffix(".py"), place / "__init__.py") if path.is_file()), None)
+
+
+@cache
+def sources_of(modules: tuple[str, ...]) -> str:
+    """Hash of some modules and all of the package that they import: the state that an account speaks of.
+
+    The list of readers is left out: a new reader changes nothing for the others.
+    """
+    wanted, left = set(), list(modules)
+    while left:
+        module = left.pop()
+        if module not in wanted and module != "aerpaw_parsers":
+            wanted.add(module)
+            left += _imports(module)
     digest = hashlib.sha256()
-    for folder in ("aerpaw_cmp", "parsers"):
-        for path in sorted((ROOT / folder).rglob("*.py")):
-            digest.update(path.relative_to(ROOT).as_posix().encode() + b"\0" + path.read_bytes())
+    for module in sorted(wanted):
+        path = _path_of(module)
+        assert path is not None, module
+        digest.update(module.encode() + b"\0" + path.read_bytes())
     return digest.hexdigest()[:16]
 
 
@@ -675,10 +769,9 @@ def run(
     chosen: Iterable[Target], inputs: int, seed: int, account: Path | None, tell: Callable[[str], None]
 ) -> list[dict[str, Any]]:
     """Blocks of all targets in turn, so that an account that was cut short holds as much of each."""
-    commit = commit_of()
-    done = done_before(account, seed, commit)
-    rows: dict[str, dict[str, Any]] = {}
     pending = {t.name: t for t in chosen}
+    done = {name: row["inputs"] for name, row in done_before(account, seed, pending.values()).items()}
+    rows: dict[str, dict[str, Any]] = {}
     while pending:
         for name, target in list(pending.items()):
             start = done.get(name, 0)
@@ -689,7 +782,7 @@ def run(
             began = time.perf_counter()
             block = run_block(target, seed, start, stop)
             entry = {
-                "target": name, "seed": seed, "commit": commit, "from": start, "to": stop,
+                "target": name, "seed": seed, "sources": sources_of(target.modules), "from": start, "to": stop,
                 "seconds": round(time.perf_counter() - began, 2), **block,
             }  # fmt: skip
             entry["reading_s"] = round(entry["reading_s"], 2)
@@ -705,6 +798,7 @@ def run(
             row["refused"] += block["refused"]
             row["violations"] += block["violation"]
             row["slowest_ms"] = max(row["slowest_ms"], block["slowest_ms"])
+            row["reading_s"] = row.get("reading_s", 0.0) + block["reading_s"]
             for violation in block["violations"]:
                 tell(f"{name} {violation['index']}: {violation['what']}")
     return list(rows.values())
@@ -717,6 +811,8 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
     parser.add_argument("--target", default="*", help="pattern of target names, e.g. 'reader:*'")
     parser.add_argument("--seed", type=int, default=1)
     parser.add_argument("--account", type=Path, help="append a line of JSON per block here, and go on where it ends")
+    parser.add_argument("--part", default="1/1", metavar="I/N", help="every N-th target, from the I-th")
+    parser.add_argument("--summary", action="store_true", help="print what the account holds for these sources")
     parser.add_argument("--reproduce", nargs=2, metavar=("TARGET", "I"), help="run one input here, with its traceback")
     parser.add_argument("--save", type=Path, help="with --reproduce: write the input to this file")
     parser.add_argument("--json", action="store_true")
@@ -731,15 +827,27 @@ def main(argv: list[str] | None = None) -> list[dict[str, Any]]:
         print(target.run(data, index))
         return []
     chosen = [t for name, t in known.items() if fnmatch.fnmatchcase(name, arguments.target)]
+    part, parts = (int(number) for number in arguments.part.split("/"))
+    chosen = chosen[part - 1 :: parts]
+    if arguments.summary:
+        held = done_before(arguments.account, arguments.seed, chosen)
+        for target in chosen:
+            row = held.get(target.name, {"inputs": 0, "read": 0, "violations": 0})
+            print(f"{target.name:26} " + " ".join(f"{row[key]:10}" for key in row))
+        total = [sum(row[key] for row in held.values()) for key in ("inputs", "read", "violations")]
+        print(f"{'all':26} " + " ".join(f"{number:10}" for number in total))
+        return []
     start = time.perf_counter()
     rows = run(chosen, arguments.inputs, arguments.seed, arguments.account, lambda text: print(text, file=sys.stderr))
     if arguments.json:
         print(json.dumps({"rows": rows, "seconds": round(time.perf_counter() - start, 1)}))
     else:
-        print(f"{'target':26} {'inputs':>10} {'read':>10} {'refused':>10} {'violations':>10} {'slowest_ms':>10}")
+        heads = ("inputs", "read", "refused", "violations", "slowest_ms", "ms/input")
+        print(f"{'target':26} " + " ".join(f"{head:>10}" for head in heads))
         for row in rows:
             numbers = (row[key] for key in ("inputs", "read", "refused", "violations", "slowest_ms"))
-            print(f"{row['target']:26} " + " ".join(f"{number:10}" for number in numbers))
+            mean = 1e3 * row["reading_s"] / row["inputs"]
+            print(f"{row['target']:26} " + " ".join(f"{number:10}" for number in numbers) + f" {mean:10.2f}")
     if any(row["violations"] for row in rows):
         sys.exit(1)
     return rows

@@ -128,7 +128,7 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
         ) from None
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=file) from error
-    except ValueError as error:
+    except (ValueError, RecursionError) as error:
         raise InputError(
             f"is no JSON ({one_line(str(error))})", expected="metrics.json of a report", cause="a torn copy", path=file
         ) from None
@@ -142,14 +142,34 @@ def _metrics(file: Path, named: Path) -> dict[str, Any]:
             expected="metrics.json of `aerpaw-cmp report`",
             path=file,
         )
-    wrong = [k for k in ("rss", "rank") if not isinstance(content[k], dict)]
+    wrong = [] if missing else _misshapen(content)
     if missing or wrong:
-        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is no mapping"
-        made = (content.get("versions") or {}).get("aerpaw-cmp", "unknown")
+        found = f"has no {', '.join(map(repr, missing))}" if missing else f"{wrong[0]!r} is not of its kind"
+        versions = content.get("versions")
+        made = versions.get("aerpaw-cmp", "unknown") if isinstance(versions, dict) else "unknown"
         raise InputError(
-            found, expected="a report of this version", cause=f"made by version {made}: run the report again", path=file
+            found,
+            expected="a report of this version",
+            cause=f"made by version {one_line(str(made))}: run the report again",
+            path=file,
         )
     return content
+
+
+def _misshapen(content: Mapping[str, Any]) -> list[str]:
+    """Keys whose value is not of the kind that a report writes."""
+    mappings = ("versions", "settings", "rss", "rank", "stages")
+    wrong = [key for key in mappings if not isinstance(content[key], dict)]
+    inputs = content["inputs"]
+    if not isinstance(inputs, list) or not all(isinstance(i, dict) and isinstance(i.get("path"), str) for i in inputs):
+        wrong.append("inputs")
+    if wrong:
+        return wrong
+    for tower in content["rss"].values():
+        links = tower.values() if isinstance(tower, dict) else [None]
+        if not all(isinstance(n, dict) and isinstance(n.get("offset_db"), (float, int, type(None))) for n in links):
+            return ["rss"]
+    return wrong
 
 
 def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
@@ -165,7 +185,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
         if not size:
             raise InputError("is empty", expected="a header at least", cause="a torn copy", path=path)
         texts = {name: "str" for name in ("time_utc", "tower", "channel", "unit") if name in columns}
-        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], encoding="utf-8")
+        table = pd.read_csv(path, dtype=texts, keep_default_na=False, na_values=[""], low_memory=False)
     except FileNotFoundError:
         raise InputError("there is no such table", expected=f"{kind}.csv beside metrics.json", path=path) from None
     except OSError as error:

@@ -785,6 +785,7 @@ def run_campaign(
     from ..report.exports.write import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
+    from .season import find_reports, with_season
 
     stages = Stages(progress)
     campaign = load_campaign(path)
@@ -805,6 +806,7 @@ def run_campaign(
             stage=stages,
             progress=progress,
         )
+        data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place, exports=formats, progress=progress)

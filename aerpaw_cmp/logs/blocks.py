@@ -92,13 +92,19 @@ def by_lines(
     def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
         gathered = Gathered()
         top_of = None if head is None else lambda data: head(data, options)
-        for front, data in _blocks(chunks, apart, top_of, keep):
+        for front, data in _blocks(_unmarked(chunks), apart, top_of, keep):
             before = read(front, options) if front else None
             gathered.add(read(front + data, options), before)
         result = gathered.result()
         return result if settle is None else settle(result)
 
     return in_blocks
+
+
+def _unmarked(chunks: Iterator[bytes]) -> Iterator[bytes]:
+    """The chunks of a file without its byte order mark."""
+    for i, chunk in enumerate(chunks):
+        yield chunk.removeprefix(b"\xef\xbb\xbf") if i == 0 else chunk
 
 
 def first_line(data: bytes, options: ReadOptions) -> int:  # noqa: ARG001 - the contract of heads

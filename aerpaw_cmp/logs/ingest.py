@@ -32,6 +32,7 @@ FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
 
 _GZIP = b"\x1f\x8b"
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
 __all__ = ["Ingested", "IngestedFile", "Skipped", "ingest", "read_bytes", "read_file", "summary"]
@@ -165,6 +166,20 @@ def ingest(
     return Ingested(files, skipped)
 
 
+def as_utf8(data: bytes) -> bytes:
+    """Text without its byte order mark, UTF-16 (what PowerShell's ``>`` writes) as UTF-8; other content as it is.
+
+    Examples
+    --------
+    >>> as_utf8("a".encode("utf-16"))
+    b'a'
+    """
+    if data[:2] in _UTF_16:
+        text = data.decode("utf-16", errors="replace")
+        return data if "\0" in text or text.count("\ufffd") > 8 else text.encode()
+    return data.removeprefix(b"\xef\xbb\xbf")
+
+
 def _present(path: Path) -> bool:
     try:
         return path.exists()
@@ -185,10 +200,10 @@ def sniffers_of(path: Path) -> list[str]:
         return []
     part = None if _present(path) else archives.inside(path)
     if part is None:
-        data = read_bytes(path)[0]
+        data = as_utf8(read_bytes(path)[0])
     else:
         content = dict(archives.members(read_bytes(part[0])[0], part[0]))
-        data = content[part[1]]() if part[1] in content else b""
+        data = as_utf8(content[part[1]]()) if part[1] in content else b""
     return [reader.name for reader in catalogue() if reader.kinds and reader.sniff(head_of(data))]
 
 
@@ -236,7 +251,7 @@ def _member(
 ) -> IngestedFile:
     """One file of an archive."""
     digest = hashlib.sha256(raw).hexdigest()
-    data = _gunzip(raw, path) if raw.startswith(_GZIP) else raw
+    data = as_utf8(_gunzip(raw, path) if raw.startswith(_GZIP) else raw)
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
@@ -271,7 +286,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
         return _member(place, content[name](), content, name, options, reader)
-    head = _raw(place, HEAD_BYTES)
+    head = as_utf8(_raw(place, HEAD_BYTES))
     if head.startswith(_HDF5):
         raise InputError(
             "an HDF5 file, such as the flight file that 'ingest -o' writes",
@@ -280,12 +295,13 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         )
     packed = head.startswith(_GZIP)
     if packed and place.stat().st_size > blocks.FROM_BYTES // 16:
-        head, packed = _unpacked_head(head), False
+        head, packed = as_utf8(_unpacked_head(head)), False
     if reader is None and not packed and not hides_its_content(head):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     if (large := _in_blocks(place, reader, options)) is not None:
         return large
     data, digest = read_bytes(place)
+    data = as_utf8(data)
     if not data.strip() or data.startswith(b"version https://git-lfs"):
         identify(data, path=str(path))  # raises the message for an empty file or a pointer
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
@@ -304,6 +320,8 @@ def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -
 
     least = blocks.FROM_BYTES // 16 if _raw(place, 2) == _GZIP else blocks.FROM_BYTES
     if place.stat().st_size < least or reader is None or reader.in_blocks is None:
+        return None
+    if _raw(place, 2) in _UTF_16:
         return None
     given = _options(place, options, _beside(place))
     try:

@@ -227,7 +227,8 @@ def _shape(text: str) -> str:
 
 def _way_out(head: bytes) -> str:
     first = head.lstrip(b"\xef\xbb\xbf \r\n").split(b"\n", 1)[0].decode("utf-8", "replace").strip()
-    names = [name.strip().strip('"') for name in first.split(",")]
+    sign = max(",;\t|", key=first.count)
+    names = [name.strip().strip('"') for name in first.split(sign)]
     if len(names) > 1 and all(name and not name[0].isdigit() for name in names):
         example = f"--map {names[0]!r}=time --map {names[-1]!r}=rss_db"
         return f"a table of another kind: name what its columns hold, e.g. {example}"

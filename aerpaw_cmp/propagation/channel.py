@@ -363,7 +363,15 @@ def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float
 
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
-    """Mean over the last two axes of ``|h|^2``, scaled so that tiny and huge channels neither vanish nor overflow."""
-    scale = np.abs(h).max(axis=(-2, -1), keepdims=True, initial=0.0)
-    safe = np.where(scale > 0.0, scale, 1.0)
-    return np.asarray((np.abs(h / safe) ** 2).mean(axis=(-2, -1)) * scale[..., 0, 0] ** 2)
+    """Mean over the last two axes of ``|h|^2``; tiny and huge channels neither vanish nor overflow."""
+    parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], -1)
+    pairs = max(parts.shape[-1] // 2, 1)
+    with np.errstate(over="ignore", under="ignore"):
+        power = np.asarray(np.einsum("...i,...i->...", parts, parts) / pairs)
+    odd = ~((power > 1e-280) & (power < 1e280))  # squares may have lost digits: scaled by the largest entry
+    if odd.any():
+        some = h[odd]
+        scale = np.abs(some).max(axis=(-2, -1), keepdims=True, initial=0.0)
+        safe = np.where(scale > 0.0, scale, 1.0)
+        power[odd] = (np.abs(some / safe) ** 2).mean(axis=(-2, -1)) * scale[..., 0, 0] ** 2
+    return power

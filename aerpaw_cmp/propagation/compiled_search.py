@@ -92,6 +92,9 @@ def _decided(
     """The paths of a run, after polygons and seams had their say."""
     numbers, sequence, points = found
     flags = numbers[:, 3]
+    pose, tower, depth_ = (np.ascontiguousarray(numbers[:, i]) for i in range(3))
+    if not flags.any():
+        return PathSet(pose, tower, depth_, sequence, points)
     good = np.ones(len(numbers), dtype=np.bool_)
     rows, steps = np.nonzero((sequence >= 0) & (flags & kernels.POLYGON > 0)[:, None])
     if len(rows):
@@ -102,8 +105,7 @@ def _decided(
         if len(rows):
             source, target = known["sources_m"][numbers[rows, 1]], known["targets_m"][numbers[rows, 0]]
             good[rows] = ~hiding.any_segment(source, points[rows, :depth], target)
-    pose, tower, depth_ = (np.ascontiguousarray(numbers[good, i]) for i in range(3))
-    return PathSet(pose, tower, depth_, sequence[good], points[good])
+    return PathSet(pose[good], tower[good], depth_[good], sequence[good], points[good])
 
 
 def _sequences(levels: Sequence[Sequence[Level]], max_depth: int) -> dict[str, Any]:

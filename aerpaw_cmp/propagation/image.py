@@ -494,8 +494,8 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
     """Paths (paths,) over the same planes as one before them in ``order``, with the same ends."""
     plane = planes_of(faces)
     shared = np.append(np.bincount(plane)[plane] > 1, False)
-    rows = order[shared[paths.faces[order]].any(axis=1)]
     repeated = np.zeros(len(paths), dtype=np.bool_)
+    rows = order[shared[paths.faces[order]].any(axis=1)] if shared.any() else order[:0]
     if len(rows):
         same = np.append(plane, -1)[paths.faces[rows]]
         key = np.column_stack([paths.pose[rows], paths.tower[rows], same])

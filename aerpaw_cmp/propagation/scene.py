@@ -46,6 +46,10 @@ class Scene:
         Faces that reflect for each tower.
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
+    extent_m : (points, 3), optional
+        Points that set the tolerance of the path search in place of the poses.
+    pairs : int
+        Element pairs of all links of the replay that this scene is a part of; 0 where it is the whole.
     surfaces : Surfaces or None
         Of a site with a scene of triangles: what its faces are made of. They stand in for ground planes.
     """
@@ -55,6 +59,8 @@ class Scene:
     usable: BoolArray
     excluded: BoolArray
     surfaces: Surfaces | None = None
+    extent_m: FloatArray | None = None
+    pairs: int = 0
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:

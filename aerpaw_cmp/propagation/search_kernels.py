@@ -8,14 +8,12 @@ a segment along several pieces of buildings that touch (:data:`POLYGON`, :data:`
 from __future__ import annotations
 
 import inspect
-from typing import Any
 
 import numpy as np
 from numba import njit
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-
-OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "fastmath": False}
+from .kernels import OPTIONS
 
 POLYGON, SEAM = 1, 2
 """Flags of a path that is to be decided elsewhere: whether its points lie on their faces; whether a seam hides it."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -19,6 +19,7 @@ from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import channel_matrices, mean_pair_power, rss_dbm
+from .compiled import ENOUGH_WORK
 from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .paths import Faces, PathSet
@@ -141,6 +142,7 @@ def replay(
     visibility: Visibility = "centre",
     variant: str | None = None,
     threads: int | None = None,
+    whole: Whole | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -180,6 +182,8 @@ def replay(
         ``sionna`` only.
     threads : int, optional
         Of compiled code (default: the cores this process may use); results do not depend on it.
+    whole : Whole, optional
+        What the poses are a part of; see :func:`replay_parts`.
     progress : callable, optional
         Called with the share done.
 
@@ -203,6 +207,8 @@ def replay(
     started = time.perf_counter()
     poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
+    if whole is not None:
+        scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
@@ -239,6 +245,77 @@ def replay(
         samples=settings.samples if engine == "sionna" else 0,
         samples_reason=choice.reason if choice else "",
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """What a part of a replay must know of the others, so that it is the same as in one piece.
+
+    Parameters
+    ----------
+    extent_m : (points, 3)
+        Points that span all poses: they set the tolerance of the path search.
+    pairs : int
+        Element pairs of all links: they decide whether compiled code is worth loading.
+    """
+
+    extent_m: FloatArray
+    pairs: int
+
+
+POSES_PER_PART = 8192
+"""Poses replayed at once by :func:`replay_parts`: some 40 MB for five towers with 4 x 4 elements."""
+
+
+def replay_parts(
+    site: Site,
+    link: Link,
+    poses: Poses | Iterable[Poses],
+    engine: Engine = "image",
+    *,
+    extent_m: FloatArray | None = None,
+    poses_per_part: int = POSES_PER_PART,
+    **options: Any,
+) -> Iterator[Replay]:
+    """Replay a flight part by part, in the memory of one part.
+
+    Parameters
+    ----------
+    site, link, engine
+        As for :func:`replay`.
+    poses : Poses or iterable of Poses
+        Of the whole flight, or in parts that are made as they are asked for.
+    extent_m : (points, 3), optional
+        Points that span all poses; needed where ``poses`` comes in parts.
+    poses_per_part : int
+        Where it comes in one piece.
+    **options
+        Of :func:`replay`.
+
+    Yields
+    ------
+    Replay
+        Of each part; together bit by bit what :func:`replay` gives for all poses at once.
+
+    Raises
+    ------
+    UsageError
+        Parts without ``extent_m``; what :func:`replay` raises.
+    """
+    if isinstance(poses, Poses):
+        known, _ = _within_reach(site, poses)
+        good = known.position_m[np.isfinite(known.position_m).all(axis=1)]
+        extent = np.stack([good.min(axis=0), good.max(axis=0)]) if len(good) else np.zeros((0, 3))
+        whole = Whole(extent, _pairs(link, poses))
+        starts = range(0, len(poses), poses_per_part)
+        runs = (slice(start, start + poses_per_part) for start in starts)
+        parts: Iterable[Poses] = (Poses(poses.position_m[run], poses.rotation[run]) for run in runs)
+    elif extent_m is None:
+        raise UsageError("poses in parts without extent_m", expected="points that span all of them")
+    else:
+        whole, parts = Whole(np.asarray(extent_m, dtype=np.float64), ENOUGH_WORK), poses
+    for part in parts:
+        yield replay(site, link, part, engine, whole=whole, **options)
 
 
 MANY_FACES = 400
@@ -410,7 +487,8 @@ def _search_relevant(
         usable=scene.usable,
         excluded=scene.excluded,
         select=chooser,
-        work=_pairs(link, poses),
+        extent_m=scene.extent_m,
+        work=scene.pairs or _pairs(link, poses),
         threads=settings.threads,
         progress=progress,
     )
@@ -484,7 +562,8 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
-            work=_pairs(link, poses),
+            extent_m=scene.extent_m,
+            work=scene.pairs or _pairs(link, poses),
             threads=settings.threads,
             progress=progress,
         )
@@ -552,16 +631,19 @@ def _evaluate(
 ) -> Replay:
     """Fields of the paths; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads)
+    work = scene.pairs or None
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads, work=work)
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
     above_floor = np.isfinite(level_dbm)
+    h = fields.h
+    h[~above_floor] = 0.0
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=np.where(above_floor[:, :, None, None], fields.h, 0.0),
+        h=h,
         has_path=has_path & above_floor,
         paths=paths,
         faces=scene.faces,

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import re
+from bisect import bisect_right
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -16,30 +19,95 @@ SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
 """What Android and modems write for 'unavailable'."""
 
 
-def objects(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, Any]], list[RejectedLine]]:
-    """0-based lines and objects, and the lines that are no JSON object.
+WHOLE = re.compile(rb"\s*\{.*\}\s*,?\s*$")
+"""A line that is an object of its own: between two of them a large file may be cut."""
+_MOST_LINES = 5000
+_MOST_TRIES = 20
 
-    A file that is one JSON array with an object per line is read, too: brackets alone on a line and commas at the end
-    of lines count as nothing.
+
+@dataclass
+class Objects:
+    """Objects of a file.
+
+    Parameters
+    ----------
+    row : int array, shape (n,)
+        0-based line on which each begins.
+    found : list of dict, length n
+    rejected : list of RejectedLine
+        Lines that are no object.
+    more : int array
+        0-based further lines of objects that are written over several.
+    """
+
+    row: IntArray
+    found: list[dict[str, Any]]
+    rejected: list[RejectedLine]
+    more: IntArray
+
+
+def objects(lines: _lines.Lines) -> Objects:
+    """The objects of a file, one per line or each over several (as programs print them for people).
+
+    A file that is one JSON array of them is read, too: brackets alone on a line and commas at the end of lines count
+    as nothing.
     """
     rows: list[int] = []
     found: list[dict[str, Any]] = []
     rejected: list[RejectedLine] = []
+    more: list[int] = []
+    ends: dict[bytes, list[int]] | None = None
+    tries = 0
     for i in np.flatnonzero(~lines.blank).tolist():
-        text = lines.raw(i).strip().lstrip(b"\xef\xbb\xbf").rstrip(b",")
+        if more and i <= more[-1]:
+            continue
+        text = _bare(lines.raw(i))
         if text in (b"[", b"]"):
             continue
-        try:
-            one = json.loads(text)
-        except (ValueError, RecursionError):
-            rejected.append(lines.reject(i, "no JSON object (torn line?)"))
-            continue
+        one = _loaded(text)
+        if one is None and text.startswith(b"{") and tries < _MOST_TRIES:
+            ends = _ends(lines) if ends is None else ends
+            last = _end_of(lines, i, ends)
+            one = None if last < 0 else _loaded(_bare(lines.data[lines.starts[i] : lines.ends[last]]))
+            more += range(i + 1, last + 1) if isinstance(one, dict) else ()
+            tries += not isinstance(one, dict)
         if isinstance(one, dict):
             rows.append(i)
             found.append(one)
         else:
-            rejected.append(lines.reject(i, "no JSON object"))
-    return np.array(rows, dtype=np.int64), found, rejected
+            rejected.append(lines.reject(i, "no JSON object (torn line?)" if one is None else "no JSON object"))
+    return Objects(np.array(rows, dtype=np.int64), found, rejected, np.array(more, dtype=np.int64))
+
+
+def _bare(text: bytes) -> bytes:
+    return text.strip().lstrip(b"\xef\xbb\xbf").rstrip(b",")
+
+
+def _loaded(text: bytes) -> Any:
+    try:
+        return json.loads(text)
+    except (ValueError, RecursionError):
+        return None
+
+
+def _indent(line: bytes) -> bytes:
+    return line[: len(line) - len(line.lstrip(b" \t"))]
+
+
+def _ends(lines: _lines.Lines) -> dict[bytes, list[int]]:
+    """Lines that close an object and nothing else, by their indentation."""
+    found: dict[bytes, list[int]] = {}
+    for i in range(len(lines)):
+        if lines.ends[i] - lines.starts[i] < 200 and lines.raw(i).strip().rstrip(b",") == b"}":
+            found.setdefault(_indent(lines.raw(i)), []).append(i)
+    return found
+
+
+def _end_of(lines: _lines.Lines, first: int, ends: dict[bytes, list[int]]) -> int:
+    """The line that closes an object which begins on another; -1 where none does."""
+    same = ends.get(_indent(lines.raw(first).lstrip(b"\xef\xbb\xbf")), [])
+    place = bisect_right(same, first)
+    return same[place] if place < len(same) and same[place] - first <= _MOST_LINES else -1
 
 
 def first(head: bytes) -> dict[str, Any] | None:
@@ -48,10 +116,13 @@ def first(head: bytes) -> dict[str, Any] | None:
         text = line.strip().lstrip(b"\xef\xbb\xbf").lstrip(b"[").rstrip(b",")
         if not text:
             continue
-        try:
-            one = json.loads(text)
-        except (ValueError, RecursionError):
-            return None
+        one = _loaded(text)
+        if one is None:  # perhaps one over several lines
+            place = head.find(b"{")
+            try:
+                one, _ = json.JSONDecoder().raw_decode(head[max(place, 0) :].decode("utf-8", "replace"))
+            except (ValueError, RecursionError):
+                return None
         return one if isinstance(one, dict) else None
     return None
 

@@ -33,7 +33,7 @@ class Quantity:
 
 _TABLE: tuple[tuple[str, Quantity], ...] = (
     # the first that fits: 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
-    (r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri)\b", Quantity("rank", "rank", "")),
+    (r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b", Quantity("rank", "rank", "")),
     (r"\brs ?rp\b|\bss ?rsrp\b|\brsrp\b", Quantity("rss", "RSRP", "dBm")),
     (r"\brsrq\b", Quantity("kpi", "RSRQ", "dB")),
     (r"\b(rs ?)?s(i)?nr\b|\brssnr\b", Quantity("kpi", "SINR", "dB")),
@@ -55,7 +55,7 @@ def plain(name: str) -> str:
     >>> plain("RSRP (LTE detected) - 1")
     'rsrp lte detected 1'
     """
-    return re.sub(r"[^a-z0-9]+", " ", name.lower()).strip()
+    return re.sub(r"[^a-z0-9]+", " ", name.lower().replace("\u200b", "")).strip()
 
 
 def quantity(name: str) -> Quantity | None:

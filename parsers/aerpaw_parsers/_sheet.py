@@ -66,8 +66,14 @@ def header_of(lines: Sequence[bytes], is_header: IsHeader) -> tuple[int, str, li
 
 
 def starts(head: bytes, is_header: IsHeader) -> bool:
-    """Whether a file begins with such a header, title lines aside: what sniffers ask."""
-    return header_of([line.rstrip(b"\r") for line in head.split(b"\n")[:TITLES]], is_header) is not None
+    """Whether a file begins with such a header, title lines aside, and a row of its width soon follows."""
+    lines = [line.rstrip(b"\r") for line in head.split(b"\n")[: 2 * TITLES]]
+    found = header_of(lines, is_header)
+    if found is None:
+        return False
+    at, separator, names = found
+    below = [line for line in lines[at + 1 :] if line.strip()][:5]
+    return not below or any(abs(len(_split(line, separator)) - len(names)) <= 1 for line in below)
 
 
 @dataclass
@@ -163,7 +169,9 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
             rejected.append(lines.reject(i, f"{len(one)} fields where the header has {width} (torn line?)"))
     last = number[-1] if number else at
     foot = [line.number - 1 for line in rejected if line.number - 1 > last and separator not in line.text]
-    if foot and not (lines.unterminated and foot[-1] == len(lines) - 1):
+    if foot and lines.unterminated and foot[-1] == len(lines) - 1:
+        foot.pop()  # a torn row
+    if foot:
         repeats += foot  # words below the table, as Nemo writes them
         rejected = [line for line in rejected if line.number - 1 not in foot]
     comments = np.array([*range(at + 1), *repeats], dtype=np.int64)
@@ -171,13 +179,18 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
 
 
 TIME_NAMES = (
-    r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s)?",
+    r"(gps )?(time ?stamp|date ?time|time and date|date and time)( utc| gps| local| ms| s| iso| unix)?",
     r"(abs|log|pc|device|event|system|utc|gps|local|unix|epoch) ?time( stamp)?( utc| gps| local| ms| s)?",
     r"(custom )?(update ?)?time( utc| ms| s| local)?",
     r"time ?millisecond",
+    r"(rel|relative|elapsed) ?time( ms| s)?",
     r"t",
 )
 """Names of the column of times, the surest first."""
+
+
+SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
+"""Columns of srsUE's metrics file, whose time counts milliseconds."""
 
 
 def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
@@ -196,7 +209,8 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     if day is not None and day != column:
         texts = [f"{date} {time}".strip() for date, time in zip(sheet.texts(day), texts, strict=True)]
     name, unit = sheet.plain[column], sheet.unit(column)
-    count = "ms" if unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) else "s"
+    in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
+    count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
     clock, cells, warnings = _stamps.read(texts, options, unit=count)
     if clock == "wall" and utc and len(cells):

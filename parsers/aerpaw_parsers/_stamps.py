@@ -76,7 +76,10 @@ def _dated(text: str, day_first: bool) -> bytes | None:
 
 def _day_first(texts: Sequence[str]) -> bool | None:
     """Whether the day stands before the month; None where every date can be read both ways."""
-    pairs = [(int(found[1]), int(found[3])) for text in texts if (found := _YEAR_LAST.fullmatch(text))]
+    dates = [found for text in texts if (found := _YEAR_LAST.fullmatch(text))]
+    pairs = [(int(found[1]), int(found[3])) for found in dates]
+    if dates and all(found[2] == "." for found in dates):
+        return True  # 02.03.2025: where points stand, the day comes first
     if any(first > 12 for first, _ in pairs):
         return True
     if any(second > 12 for _, second in pairs) or not pairs:

@@ -17,13 +17,14 @@ def _row(data: bytes) -> re.Pattern[bytes]:
     header = _HEADER.match(data[:400])
     if header is None:
         return re.compile(rb"(?!)(?P<time>)")
-    names = header[1].upper().split(b",SNR_")[1:]
-    cells = b"".join(rb",(?P<t%d_%s>" % (i, name) + _lines.NUMBER + rb"|nan|-inf|)" for i, name in enumerate(names))
-    return re.compile(rb"^(?P<time>" + _time.TIME + _time.ZONE + rb")" + cells + rb"\r?$", re.MULTILINE | re.IGNORECASE)
+    cells = b"".join(rb",(?P<t%d>" % i + _lines.NUMBER + rb"|nan|NaN|-inf|)" for i in range(header[1].count(b",")))
+    return re.compile(rb"^(?P<time>" + _time.TIME + _time.ZONE + rb")" + cells + rb"[ \t]*\r?$", re.MULTILINE)
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
-    return (_rows.snr(rows, name.partition("_")[2], rows.number(name)) for name in rows.columns)
+    header = _HEADER.match(rows.data[:400])
+    towers = [] if header is None else header[1].decode("ascii").upper().split(",SNR_")[1:]
+    return (_rows.snr(rows, tower, rows.number(f"t{i}")) for i, tower in enumerate(towers))
 
 
 READER = _text.reader(

@@ -91,12 +91,13 @@ def sniff_json(head: bytes) -> bool:
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE, cell and answer."""
     lines = _lines.split(data)
-    row, found, rejected = _json.objects(lines)
+    answers = _json.objects(lines)
+    found = answers.found
     has_utc = bool(found) and all("utc" in one for one in found)
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
-        lines, row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
-        clock="epoch_s" if has_utc else "relative_s", extra=rejected,
+        lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
+        clock="epoch_s" if has_utc else "relative_s", extra=answers.rejected, markup=answers.more,
     )  # fmt: skip
     pairs: list[tuple[int, dict[str, Any]]] = [
         (i, {**ue, **cell})
@@ -131,5 +132,5 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=blocks.by_lines(read_json),
+    in_blocks=blocks.by_lines(read_json, apart=_json.WHOLE),
 )

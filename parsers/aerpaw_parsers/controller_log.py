@@ -16,7 +16,7 @@ from aerpaw_cmp.logs.records import Stream
 
 from . import _lines, _rows, _text, _time
 
-_STAMP = rb"^\[(?P<time>" + _time.TIME + rb")\] "
+_STAMP = rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] "
 _VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(_STAMP + rb"[^\n]{0,40}?\[Controller-->UAV\] (?P<what>SNR|Download):[ \t]*\r?$", re.MULTILINE)
 

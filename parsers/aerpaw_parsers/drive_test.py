@@ -24,7 +24,7 @@ from . import _cells, _lines, _pose, _quantities, _rows, _sheet, aadm_snr, nemo_
 _PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
 _ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
 _NEIGHBOUR = re.compile(
-    r"\b(detected|neighbou?rs?|nbr|nb|ncell|n ?\d{1,2}|nrx|nlte\w*|adjacent|top \d{1,2})\b|^n\d?(rsrp|rxrsrp)\b|^nrx"
+    r"\b(detected|neigh(bou?rs?)?|nbr|nb|ncell|n ?\d{1,2}|nrx|nlte\w*|adjacent|top \d{1,2})\b|^n\d?(rsrp|rxrsrp)\b|^nrx"
 )
 _NR = re.compile(r"\b(nr|5g|spcell|ss ?rsrp|ss ?rsrq|ss ?sinr|nr5g)\b|^ss")
 _LTE = re.compile(r"\b(lte|4g|e ?utran?)\b|^lte")
@@ -33,8 +33,31 @@ _BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss"
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
+_GNETTRACK = {
+    r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
+    r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
+}  # fmt: skip
+_SRSUE = {r"pl": "path loss"}
+_TECH = re.compile(r"(?i)4g|5g|lte|nr")
+
+
+def known(names: list[str]) -> list[str]:
+    """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
+    given = set(names)
+    if {"level", "qual"} <= given and given & {"networktech", "networkmode"}:
+        table = _GNETTRACK
+    elif given >= _sheet.SRSUE:
+        table = _SRSUE
+    else:
+        return names
+    for pattern, word in table.items():
+        names = [re.sub(f"^{pattern}$", word, name) for name in names]
+    return names
+
+
 def is_header(names: list[str]) -> bool:
     """Whether names hold a time and a level, ratio or rank."""
+    names = known(names)
     times = any(re.fullmatch(pattern, name) for pattern in (*_sheet.TIME_NAMES, "date") for name in names)
     return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
 
@@ -139,12 +162,24 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
+    _settle_names(sheet)
     cells, others, ranks = _places(sheet)
     streams: list[Stream | None] = [_pose.from_sheet(rows, sheet, name="phone", source="table of a phone")]
     streams += _cells.streams(rows, _readings(sheet, cells), source="drive test")
     streams += [_rank(rows, sheet, column) for column in ranks]
     streams += [_other(rows, sheet, column) for column in [*others, *_alone(sheet, cells)]]
     return rows.result(_distinct(streams))
+
+
+def _settle_names(sheet: _sheet.Sheet) -> None:
+    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only."""
+    words = known(sheet.plain)
+    if words != sheet.plain and "level" in sheet.plain:
+        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find("networktech", "networkmode")
+        for cells in sheet.cells:
+            if tech is not None and not _TECH.search(cells[tech]):
+                cells[places[0]] = cells[places[1]] = ""
+    sheet.plain = words
 
 
 def _alone(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:

@@ -21,6 +21,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
 from . import _frames, _lines, _time
+from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
 _BESIDE: dict[str, tuple[str, ...]] = {"rank": EXTRA, "rss": (*COLUMNS["telemetry"][:-2], "sinr_db")}
@@ -38,17 +39,23 @@ def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
     return False
 
 
-def _fields(line: bytes) -> list[str]:
+def _fields(line: bytes, separator: str) -> list[str]:
     text = line.decode("utf-8", errors="replace")
     if '"' not in text:
-        return text.split(",")
+        return text.split(separator)
     # a stray CR or NUL would end the csv module's patience with the whole line
-    return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")]), [])
+    return next(csv.reader([text.replace("\0", "\ufffd").replace("\r", " ")], delimiter=separator), [])
+
+
+def _separator(header: bytes) -> str:
+    """The sign that the header's names stand between: the most frequent one, a comma where none does."""
+    return max(SEPARATORS, key=lambda sign: header.count(sign.encode()))
 
 
 def _header(lines: _lines.Lines, first: int) -> list[str]:
+    line = lines.raw(first).removeprefix(b"\xef\xbb\xbf")
     try:
-        return [name.strip() for name in _fields(lines.raw(first).removeprefix(b"\xef\xbb\xbf"))]
+        return [name.strip() for name in _fields(line, _separator(line))]
     except csv.Error as error:
         raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
 
@@ -90,9 +97,11 @@ _NONE = (b"", b"nan", b"na", b"n/a", b"none", b"null", b"-", b"--", b"-inf", b"-
 """What stands for no value; -inf dB is no signal. Any other word, and +inf, is flagged."""
 
 
-def _numbers(cells: list[str]) -> FloatArray:
+def _numbers(cells: list[str], comma: bool = False) -> FloatArray:
     """Numbers of a column; what is none becomes NaN, and +inf where it is a word: the limits flag it."""
     stripped = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
+    if comma:  # a decimal comma, where the separator leaves room for one
+        stripped = [cell.replace(b",", b".") for cell in stripped]
     return np.array([_number(cell) for cell in stripped], dtype=np.float64)
 
 
@@ -157,13 +166,15 @@ def _settled(result: ReadResult) -> ReadResult:
 
 def _head(data: bytes, options: ReadOptions) -> int:
     """Bytes of the header and of the rows down to the first with a time: that row says which form times have."""
-    end, column = 0, -1
+    end, column, sign = 0, -1, ","
     for line in data[:1_000_000].splitlines(keepends=True):
         end += len(line)
         if not line.strip():
             continue
         try:
-            cells = _fields(line.removeprefix(b"\xef\xbb\xbf").rstrip(b"\r\n"))
+            text = line.removeprefix(b"\xef\xbb\xbf").rstrip(b"\r\n")
+            sign = _separator(text) if column < 0 else sign
+            cells = _fields(text, sign)
         except csv.Error:
             continue
         if column < 0:
@@ -189,7 +200,8 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
     rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
     flag = _lines.flags(len(rows))
     instants.flag(flag)
-    numbers = {name: _numbers(texts) for name, texts in column.items()}
+    comma = _separator(lines.raw(first)) != ","
+    numbers = {name: _numbers(texts, comma) for name, texts in column.items()}
     odd = np.any([np.isposinf(numbers[name]) for name in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")
     values, extra = _values(kind, {k: np.where(np.isposinf(v), np.nan, v) for k, v in numbers.items()}, flag, options)
@@ -216,11 +228,12 @@ def _table(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[
     numbers: list[int] = []
     cells: list[list[str]] = []
     rejected: list[RejectedLine] = []
+    separator = _separator(lines.raw(first))
     for i in np.flatnonzero(~lines.blank).tolist():
         if i == first:
             continue
         try:
-            fields = _fields(lines.raw(i))
+            fields = _fields(lines.raw(i), separator)
         except csv.Error as error:
             rejected.append(lines.reject(i, f"no CSV: {error}"))
             continue

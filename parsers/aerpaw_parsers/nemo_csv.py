@@ -17,22 +17,22 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _lines, _rows, _table
 
-_HEADER = b"index,rel_time_ms,lat,lon,alt_m,pdsch_rank,nr_rsrp_dbm,nr_sinr_db,wb_cqi"
+_NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_cqi".split()
+_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
-_ROW = re.compile(rb"^(\d{1,12})," + _N + (rb"," + _CELL) * 7 + rb"\r?$", re.MULTILINE)
+_ROW = re.compile(rb"^(\d{1,12}), ?" + _N + (rb", ?" + _CELL) * 7 + rb"[ \t]*\r?$", re.MULTILINE)
 NO_RANK = "no_rank_in_row"
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 
 
 def sniff(head: bytes) -> bool:
     """Whether the first line is the header."""
-    first = head.lstrip(b"\xef\xbb\xbf")[: len(_HEADER) + 2]
-    return first.startswith(_HEADER) and first[len(_HEADER) :].strip() == b""
+    return _HEADER.fullmatch(head[:400].split(b"\n", 1)[0]) is not None
 
 
 def _reason(line: bytes) -> str | None:
-    if line.lstrip(b"\xef\xbb\xbf").strip() == _HEADER:
+    if _HEADER.fullmatch(line):
         return None
     fields = line.count(b",") + 1
     if fields != 9:

@@ -13,12 +13,16 @@ from aerpaw_cmp.logs.matfile import MAGIC
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, flight_mat, gpx, iq_burst, nemo_kml, vehicle_log
+from . import _lines, flight_mat, gpx, iq_burst, nemo_kml, oai_log, srsenb_log, srsran_gnb, srsue_log, vehicle_log
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 _POWER_REFS = re.compile(rb"(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
+_RADIO = re.compile(
+    rb"Software Radio Systems (?:LTE|RAN)|srs(?:ran|lte)/(?:ue|enb|gnb)\.(?:conf|yml)|--== srsRAN gNB"
+    rb"|Built in Release mode using"
+)
 _PLACE = re.compile(rb"\s*-?\d{1,3}\.\d{2,12}, ?-?\d{1,3}\.\d{2,12}\s*")
 _AT = re.compile(rb"(?i)\s*(?:at[+&a-z][^\r\n]{0,200}|\+[A-Z0-9]{2,12}: ?[^\r\n]{0,300}|OK|ERROR|ATI)\s*")
 _NEMO_BINARY = re.compile(rb"(?i)nmfs|nemo file|anite")
@@ -85,6 +89,12 @@ def _uhd(head: bytes) -> bool:
     )
 
 
+def _radio_console(head: bytes) -> bool:
+    return b"\0" not in head and _RADIO.search(head) is not None and not any(
+        sniff(head) for sniff in (srsue_log.READER.sniff, srsenb_log.READER.sniff, srsran_gnb.sniff, oai_log.sniff)
+    )  # fmt: skip
+
+
 def _places(head: bytes) -> bool:
     lines = _texts(head)
     return 0 < len(lines) < 40 and sum(_PLACE.fullmatch(line) is not None for line in lines) * 2 >= len(lines)
@@ -134,6 +144,11 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     ("nemo_summary", "a Nemo summary of a session (counts and rates, no samples)", _nemo_summary),
     ("nemo_binary", "a binary Nemo measurement file (.nmfs: export it as CSV with Nemo's own tools)", _nemo_binary),
     ("uhd_console", "the console of a USRP program, without samples", _uhd),
+    (
+        "radio_console",
+        "the console of an srsRAN program without its trace (type 't' there, or log longer)",
+        _radio_console,
+    ),
     ("positions", "a list of positions without times", _places),
     ("document", "a page of text", _document),
     ("flight_script", "the console of a flight script, without positions", _flight_talk),

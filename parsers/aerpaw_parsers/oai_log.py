@@ -24,7 +24,8 @@ from . import _cells, _lines, _rows, _time
 
 _CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
 _LEVEL = re.compile(
-    rb"\bUE RNTI (?P<rnti>[0-9a-f]{4})\b[^\n]{0,120}?average RSRP (?P<rsrp>-?\d{1,3}) \((?P<meas>\d{1,9}) meas\)"
+    rb"\bUE (?:ID \d{1,4} )?RNTI (?P<rnti>[0-9a-f]{4})\b[^\n]{0,120}?"
+    rb"average RSRP (?P<rsrp>-?\d{1,3}) \((?P<meas>\d{1,9}) meas\)"
 )
 _UE = re.compile(
     rb"(?:\bRSRP = (?P<rsrp>-?\d{1,3}) dBm, )?\bRI = (?P<ri>\d{1,2}) i1 = [-\d.]{1,20}, i2 = -?\d{1,5}, "

@@ -29,7 +29,7 @@ _CONNECTED = tuple(
 
 def sniff(head: bytes) -> bool:
     """Whether the first line is an object with a phone's cells and times."""
-    first = head.split(b"\n", 1)[0]
+    first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]
     return (
         head.lstrip(b"\xef\xbb\xbf[ \r\n").startswith(b"{")
         and b'"abs_time"' in first
@@ -98,11 +98,13 @@ def _settled(result: ReadResult) -> ReadResult:
 def _read(data: bytes, options: ReadOptions) -> ReadResult:
     """What each line says, altitudes above sea level."""
     lines = _lines.split(data)
-    row, found, rejected = _json.objects(lines)
+    one = _json.objects(lines)
+    found = one.found
     time = _json.column(found, "companion_abs_time", "abs_time")
     rows = _rows.built(
-        lines, row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms", extra=rejected
-    )
+        lines, one.row, {"time": time}, options, reader="pawprints", reason=_json.bracket, clock="epoch_ms",
+        extra=one.rejected, markup=one.more,
+    )  # fmt: skip
     kept = [found[i] for i in rows.at.tolist()]
     if any("companion_abs_time" not in one for one in kept):
         rows.warnings.append("some lines lack companion_abs_time: the phone's own clock was taken there")
@@ -118,5 +120,5 @@ READER = Reader(
     sample='{"abs_time": 1740927600000, "connected_pci": 2, "cells": [{"technology": "4G_LTE", "rsrp": -6, "pci": 2}]}',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, keep=_CONNECTED, settle=_settled),
+    in_blocks=blocks.by_lines(_read, apart=_json.WHOLE, keep=_CONNECTED, settle=_settled),
 )

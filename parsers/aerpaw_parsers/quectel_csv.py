@@ -58,7 +58,7 @@ _CSI = re.compile(
     # a fifth value of newer firmware, then the four +QNWINFO columns of the first generation
     + rb"(?:,-?\d{1,7})?(?:(?:,"
     + _C
-    + rb"){4})?\r?$",
+    + rb"){4})?[ \t]*\r?$",
     re.MULTILINE,
 )
 _SERVING = _T + _token(b"QENG", b"servingcell") + rb"," + _C + rb","
@@ -73,7 +73,7 @@ _LTE = re.compile(
     + rb",".join([_V] * 3)
     + rb"(?:(?:,"
     + _C
-    + rb"){4})?)?\r?$",
+    + rb"){4})?)?[ \t]*\r?$",
     re.MULTILINE,
 )
 _SA = re.compile(
@@ -86,7 +86,7 @@ _SA = re.compile(
     + _C
     + rb","
     + _C
-    + rb"\r?$",
+    + rb"[ \t]*\r?$",
     re.MULTILINE,
 )
 _ANY = re.compile(rb"^" + _time.TIME + rb',"?\+(?:QNWCFG|QENG|QENDC)')

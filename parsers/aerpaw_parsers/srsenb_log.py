@@ -1,6 +1,7 @@
 """srsENB console (through ``ts``): the ``ri`` column of the downlink trace.
 
-``[time] lte [pci] rnti cqi ri mcs brate ok nok (%) | ...`` once a second; newer versions print the cell's ``pci``.
+``[time] lte [pci] rnti cqi ri mcs brate ok nok (%) | ...`` once a second; newer versions print the cell's ``pci``,
+srsLTE before 2020 neither ``rat`` nor bar.
 All other lines are the console's talk and count as comments.
 
 What ``ri`` is (srsRAN 4G: the MAC's metrics and ``metrics_stdout.cc``): the MAC adds one to each reported RI,
@@ -20,9 +21,10 @@ from . import _rows, _text, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + rb")\] *(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +[0-9a-fA-F]{1,5}"
+    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *"
+    rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?[0-9a-fA-F]{1,5}"
     + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
-    + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% \|[^\n]{0,160}$",
+    + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% [^\n]{0,160}$",
     re.MULTILINE,
 )  # fmt: skip
 _CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (\d{1,2}) channels in RF device", re.MULTILINE)
@@ -44,7 +46,7 @@ READER = _text.reader(
     "srsENB console: rank indicator (0 = no report)",
     kinds=("rank",),
     sample="[2025-01-01 12:00:07.000000] lte   46   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k",
-    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *rat +(?:pci +)?rnti +cqi +ri +mcs", re.MULTILINE),
+    mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE),
     row=_ROW,
     torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "),
     keep=(_CHANNELS,),

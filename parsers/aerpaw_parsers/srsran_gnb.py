@@ -26,7 +26,7 @@ _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
 _ROW = re.compile(
     _STAMP
-    + rb" *(?P<pci>\d{1,4}) +(?P<rnti>[0-9a-fA-F]{4})(?: +\|)?"
+    + rb" *(?P<pci>\d{1,4}) +(?P<rnti>(?:0x)?[0-9a-fA-F]{1,6})(?: +\|)?"
     + _N % b"cqi"
     + _N % b"ri"
     + _N % b"mcs"
@@ -35,13 +35,14 @@ _ROW = re.compile(
 )
 _LOG = re.compile(
     _STAMP + rb" +\[METRICS *\][^\n]{0,200}?\bpci=(?P<pci>\d{1,4})[^\n]{0,80}?\brnti=(?:0x)?(?P<rnti>[0-9a-fA-F]{1,6})"
-    rb"[^\n]{0,200}?\bcqi=(?P<cqi>[0-9.]{1,8}|n/a) dl_ri=(?P<ri>[0-9.]{1,8}|n/a) dl_mcs=(?P<mcs>[0-9.]{1,8}|n/a)"
+    rb"[^\n]{0,200}?\bcqi=(?P<cqi>[0-9.]{1,8}|n/a)[^\n]{0,80}? (?:dl_)?ri=(?P<ri>[0-9.]{1,8}|n/a)"
+    rb"[^\n]{0,80}? dl_mcs=(?P<mcs>[0-9.]{1,8}|n/a)"
     rb"[^\n]{0,4000}$",
     re.MULTILINE,
 )
 _TITLE = re.compile(_STAMP + rb" *\|? *pci +rnti +(?:\| +)?cqi +ri +mcs", re.MULTILINE)
 _SCHEDULER = re.compile(_STAMP + rb" +\[METRICS *\][^\n]{0,300}\bdl_ri=", re.MULTILINE)
-_TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +[0-9a-fA-F]{4} ")
+_TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a-fA-F]{1,6} ")
 
 
 def sniff(head: bytes) -> bool:
@@ -80,7 +81,8 @@ def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
     lines = _lines.split(data)
-    row, found, rejected = _json.objects(lines)
+    reports = _json.objects(lines)
+    row, found = reports.row, reports.found
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
     clock, time, warnings = _stamps.read(texts, options)
@@ -93,8 +95,8 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
         reader="srsran_json",
         reason=_json.bracket,
         clock=clock,
-        extra=rejected,
-        markup=mute,
+        extra=reports.rejected,
+        markup=np.concatenate((mute, reports.more)),
     )
     rows.warnings += warnings
     pairs = [(i, ue) for i, at in enumerate(rows.at.tolist()) for ue in _ues(found[with_ue[at]])]
@@ -122,5 +124,5 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=blocks.by_lines(read_json),
+    in_blocks=blocks.by_lines(read_json, apart=_json.WHOLE),
 )

@@ -18,7 +18,7 @@ from . import _cells, _rows, _text, _time
 
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
+    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
     + _N % b"pci" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
     + rb" \|" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}\|[^\n]{0,80}$",
     re.MULTILINE,

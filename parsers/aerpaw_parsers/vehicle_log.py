@@ -19,7 +19,7 @@ _N = _lines.NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)
 _MEANS = rb"Pwr: ?(?P<power>%s), ?P_Var: ?%s, ?Qual: ?(?P<quality>%s), ?Q_Var: ?%s, ?" % (_N, _N, _N, _N)
 _ROW = re.compile(
-    rb"^\[(?P<time>" + _time.TIME + rb")\] (?:Filtered data \(avg\): " + _MEANS
+    rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] (?:Filtered data \(avg\): " + _MEANS
     + rb"|(?i:(?:current|vehicle|drone|uav) (?:location|position)(?: is)?:? ?))"
     + _PLACE + rb"(?:, ?heading: ?(?P<heading>%s))?[ \t]*\r?$" % _N,
     re.MULTILINE,

@@ -27,7 +27,7 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _frames, _lines, _table, _time
 
-_N = rb"(" + _lines.NUMBER + rb"|nan|NaN|None)"
+_N = rb'"?(' + _lines.NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + _N + rb", ?" + _N + rb", ?" + _N + rb'[)\]]"?'
 _SEP = rb", ?"
 _BODY = (
@@ -38,14 +38,14 @@ _BODY = (
 _ROW = re.compile(
     _SEP.join(
         (
-            rb"^ ?(\d{1,12})",
+            rb'^ ?"?(\d{1,12})"?',
             _N,
             _N,
             _N,
             rb"(?:" + rb"|".join(_BODY) + rb")",
-            rb"(" + _time.TIME + _time.ZONE + rb")",
-            rb"(-?\d{1,3})",
-            rb"(-?\d{1,3})\r?$",
+            rb'"?(' + _time.TIME + _time.ZONE + rb')"?',
+            rb'"?(-?\d{1,3})"?',
+            rb'"?(-?\d{1,3})"?[ ,\t]{0,8}\r?$',
         )
     ),
     re.MULTILINE,

@@ -136,6 +136,16 @@ SRSENB = (
     b"[2025-03-02 10:00:02.000003] lte   46  n/a n/a    0      0    0    0   0% |   n/a   12.5   40   15    38k   12    0   0%    0.0\n"
     b"[2025-03-02 10:00:03.000003] lte   46   11   1  \n"
 )
+SRSENB_OLD = (
+    b"[2025-03-02 10:00:00.000001] rnti cqi  ri mcs brate   ok  nok  (%)  pusch pucch phr mcs brate   ok  nok  (%)   bsr\n"
+    b"[2025-03-02 10:00:00.000003]   46  11   2   2  3.7k   14    0   0%   31.5  12.5  40  15   38k   12    0   0%  0.0\n"
+    b"[2025-03-02 10:00:01.000003]   46  11   0   2  3.7k   14    0   0%    n/a  12.5  40  15   38k   12    0   0%  0.0\n"
+)
+SRSENB_NR = (
+    b"[2025-03-02 10:00:00.000002] rat  pci rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch  pucch  phr  mcs  brate\n"
+    b"[2025-03-02 10:00:00.000003] lte    1   46   15   1    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k\n"
+    b"[2025-03-02 10:00:00.000003]  nr  500 4601  n/a   0   27   6.9M  124    0   0% |   n/a    n/a    0    0   6.1M\n"
+)
 SRSUE = (
     b"[2025-03-02 10:00:00.000001] Attaching UE...\n"
     b"[2025-03-02 10:00:00.000002]  cc  pci  rsrp   pl   cfo | mcs  snr  iter  brate  bler  ta_us | mcs   buff  brate  bler\n"
@@ -190,6 +200,18 @@ GNETTRACK = (
     b"Timestamp\tLongitude\tLatitude\tSpeed\tCellID\tLTEPCI\tRSRP\tRSRQ\tSNR\tCQI\tNRxRSRP\n"
     b"2025.03.02_10.00.00\t-78.70\t35.73\t0\t11\t42\t-95\t-13\t5\t9\t-101\n"
     b"2025.03.02_10.00.01\t-78.70\t35.73\t0\t11\t42\t-96\t-13\t5\t9\t-\n"
+)
+GNETTRACK_PRO = (
+    b"Timestamp|Longitude|Latitude|Speed|Operator|CGI|Node|CellID|NetworkTech|NetworkMode|Level|Qual|SNR|CQI|LTERSSI|"
+    b"ARFCN|PSC|Altitude|NCell1|NARFCN1|NRxLev1|NQual1\n"
+    b"2025.03.02_10.00.00|-78.70|35.73|0|00101|1|2|11|4G|LTE|-95|-13|5|9|-70|1300|42|120|43|1300|-101|-15\n"
+    b"2025.03.02_10.00.01|-78.70|35.73|0|00101|1|2|11|3G|HSPA+|-75|-7|||||142|120||||\n"
+)
+SRSUE_METRICS = (
+    b"time;cc;earfcn;pci;rsrp;pl;cfo;pci_neigh;rsrp_neigh;cfo_neigh;dl_mcs;dl_snr;dl_turbo;dl_brate;dl_bler\n"
+    b"1000;0;3400;1;-61.5;71.2;-350.2;n/a;n/a;n/a;13.2;33.1;0.5;1e6;0\n"
+    b"2000;0;3400;1;-62.5;71.2;-350.2;2;-90;0;13.2;33.1;0.5;1e6;0\n"
+    b"#eof\n"
 )
 AIRDATA = (
     b"time(millisecond),datetime(utc),latitude,longitude,height_above_takeoff(feet),xSpeed(mph),ySpeed(mph),zSpeed(mph),"
@@ -332,6 +354,21 @@ SRSRAN_JSON = (
     b'{"timestamp": 1740927602.25, "app_resource_usage": {"cpu": 12}}\n'
     b'{"timestamp": 17409\n'
 ).replace(b'"2025-03-02T15:00:01.250Z"', b"1740927601.25")
+SRSRAN_PRETTY = (
+    b'{\n  "timestamp": 1740927600.25,\n  "ue_list": [\n    {\n      "ue_container": {\n        "pci": 1,\n'
+    b'        "rnti": 17921,\n        "cqi": 15,\n        "ri": 2,\n        "dl_mcs": 27\n      }\n    }\n  ]\n}\n'
+    b'{\n  "timestamp": 1740927601.25,\n  "ue_list": []\n}\n'
+    b'{\n  "timestamp": 1740\n'
+)
+SRSRAN_HEX = (
+    b"[2025-03-02 10:00:00.000002]  pci rnti | cqi  ri  mcs  brate   ok  nok  (%)  dl_bs | pusch  rsrp  mcs  brate\n"
+    b"[2025-03-02 10:00:00.000003]    1 0x44 |  15 2.0   28   1.0G 1539    0   0%    10M |  99.9   ovl   28    75M\n"
+)
+OAI_GNB_OLD = (
+    b"[2025-03-02 10:00:00.000001] [NR_MAC]   Frame.Slot 128.0\n"
+    b"[2025-03-02 10:00:00.000002] UE ID 0 RNTI 1f4d (1/1) PH 51 dB PCMAX 21 dBm, average RSRP -78 (16 meas)\n"
+    b"[2025-03-02 10:00:00.000003] UE 0: dlsch_rounds 5/0/0/0, dlsch_errors 0\n"
+)
 OAI_GNB = (
     b"[2025-03-02 10:00:00.000001] [NR_MAC]   Frame.Slot 128.0\n"
     b"[2025-03-02 10:00:00.000002] UE RNTI 1f4d CU-UE-ID 1 in-sync PH 51 dB PCMAX 21 dBm, average RSRP -78 (16 meas)\n"
@@ -445,7 +482,7 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "nemo_kml": {"placemarks": (NEMO_KML, 2, 1)},
     "aadm_snr": {"table": (SNR_CSV, 2, 1)},
     "controller_log": {"console": (CONTROLLER, 3, 1)},
-    "srsenb_log": {"console": (SRSENB, 3, 1)},
+    "srsenb_log": {"console": (SRSENB, 3, 1), "before_2020": (SRSENB_OLD, 2, 0), "nr": (SRSENB_NR, 2, 0)},
     "tap_jsonl": {"session": (TAP, 3, 1)},
     "srsue_log": {"console": (SRSUE, 3, 1)},
     "vehicle_log": {"console": (VEHICLE_LOG, 2, 1)},
@@ -455,12 +492,24 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
         "nemo": (NEMO_WIDE, 3, 1),
         "xcal": (XCAL, 2, 0),
         "g_nettrack": (GNETTRACK, 2, 0),
+        "g_nettrack_pro": (GNETTRACK_PRO, 2, 0),
+        "srsue_metrics": (SRSUE_METRICS, 2, 0),
     },
     "pose_csv": {"airdata": (AIRDATA, 2, 0), "dji": (DJI, 2, 0), "converted": (CONVERTED, 2, 1)},
     "quectel_console": {"tables": (QUECTEL_CONSOLE, 4, 1)},
-    "srsran_gnb": {"console": (SRSRAN_GNB, 3, 1), "old_console": (SRSRAN_GNB_OLD, 1, 0), "log": (SRSRAN_LOG, 1, 0)},
-    "srsran_json": {"metrics": (SRSRAN_JSON, 2, 1)},
-    "oai_log": {"gnb": (OAI_GNB, 3, 0), "frames": (OAI_GNB_FRAMES, 2, 0), "ue": (OAI_UE, 2, 0)},
+    "srsran_gnb": {
+        "console": (SRSRAN_GNB, 3, 1),
+        "old_console": (SRSRAN_GNB_OLD, 1, 0),
+        "log": (SRSRAN_LOG, 1, 0),
+        "hex": (SRSRAN_HEX, 1, 0),
+    },
+    "srsran_json": {"metrics": (SRSRAN_JSON, 2, 1), "pretty": (SRSRAN_PRETTY, 1, 2)},
+    "oai_log": {
+        "gnb_2021": (OAI_GNB_OLD, 1, 0),
+        "gnb": (OAI_GNB, 3, 0),
+        "frames": (OAI_GNB_FRAMES, 2, 0),
+        "ue": (OAI_UE, 2, 0),
+    },
     "amarisoft": {"monitor": (AMARISOFT, 2, 1)},
     "amarisoft_json": {"answers": (AMARISOFT_JSON, 2, 0)},
     "sigmf": {"dataset12": (SIGMF, 2, 1)},
@@ -484,6 +533,7 @@ WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
     ("flight_mat", "lte"),
     ("flight_mat", "processed"),
     ("gpx", "track"),
+    ("drive_test", "srsue_metrics"),
     ("pose_csv", "airdata"),
     "srsran_json",
     ("oai_log", "frames"),
@@ -507,6 +557,7 @@ NO_LOGS: dict[str, bytes] = {
     "uhd_console": (
         b"[2025-03-02 10:00:00.000001] [INFO] [UHD] linux; GNU C++\n[2025-03-02 10:00:01.000001] [INFO] [B200] Detected\n"
     ),
+    "radio_console": b"[2025-03-02 10:00:00.000001] ---  Software Radio Systems LTE eNodeB  ---\n[2025-03-02 10:00:01] Reading\n",
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",
     "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",

@@ -180,7 +180,7 @@ def test_a_last_record_without_line_end_is_flagged(reader: str, sample: str) -> 
     last = max(int(stream.frame["line"].max()) for stream in result.streams)
     cut = check_law(reader, b"\n".join(lines[:last]).rstrip(b"\r"))
     if cut is None or cut.accepted != result.accepted:
-        assert reader == "sounder_log"  # there the layout tells a cut line
+        assert reader == "sounder_log" or sample == "pretty"  # the layout tells a cut line, or an object ends below
         return
     flagged = [flag for stream in cut.streams for flag in stream.frame.loc[stream.frame["line"] == last, "flag"]]
     assert flagged

@@ -21,7 +21,7 @@ from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, 
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.tracer import replay, replay_parts
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.site import Building
@@ -262,6 +262,25 @@ def test_nothing_to_search(monkeypatch, scenes):
     assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
 
 
+@pytest.mark.parametrize("mode", ["never", pytest.param("always", marks=needs_numba)])
+def test_parts_are_the_whole_bit_by_bit(monkeypatch, case, mode):
+    monkeypatch.setenv(compiled.SWITCH, mode)
+    site, link, poses, _ = case
+    position = poses.position_m.copy()
+    position[3], position[30] = np.nan, 1e9  # unknown, and no pose of the site
+    poses = Poses(position, poses.rotation)
+    whole = replay(site, link, poses)
+    parts = list(replay_parts(site, link, poses, poses_per_part=17))
+    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
+        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
+    assert sum(len(part.paths) for part in parts) == len(whole.paths)
+    made = (Poses(poses.position_m[i : i + 20], poses.rotation[i : i + 20]) for i in range(0, len(poses), 20))
+    streamed = list(replay_parts(site, link, made, extent_m=np.array([[-300.0, -300, 0], [300, 300, 60]])))
+    np.testing.assert_allclose(np.concatenate([p.h for p in streamed]), whole.h, rtol=0, atol=1e-14)
+    with pytest.raises(UsageError, match="without extent_m"):
+        next(replay_parts(site, link, iter([poses])))
+
+
 # ---------------------------------------------------------------- choosing and doing without
 
 
@@ -307,6 +326,19 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         replay(site, link, poses)
+
+
+@needs_numba
+def test_without_a_folder_to_write_nothing_is_kept(monkeypatch):
+    from aerpaw_cmp.propagation import kernels
+
+    def read_only(*args, **kwargs):
+        raise OSError(30, "Read-only file system")
+
+    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
+    assert not kernels._can_keep()
+    monkeypatch.undo()
+    assert kernels._can_keep()
 
 
 def test_only_large_work_is_compiled(monkeypatch):

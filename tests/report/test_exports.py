@@ -226,6 +226,17 @@ def check_gpx(folder, frames, data):
     assert "above the ground" in book.tracks[0].description
 
 
+def valid_kml(folder, text):
+    """Against the schema of the OGC."""
+    from fastkml import validator
+
+    (folder / "doc.kml").write_text(text, encoding="utf-8")
+    try:
+        return bool(validator.validate(file_to_validate=folder / "doc.kml"))
+    except AssertionError:
+        return False
+
+
 def check_kmz(folder, frames, data):
     fastkml = pytest.importorskip("fastkml")
     with zipfile.ZipFile(folder / "samples.kmz") as archive:
@@ -233,6 +244,8 @@ def check_kmz(folder, frames, data):
         text = archive.read("doc.kml").decode()
         legends = [name for name in archive.namelist() if name.startswith("legends/")]
     book = fastkml.KML.from_string(text.split("?>\n", 1)[1])
+    assert valid_kml(folder, text)
+    assert not valid_kml(folder, text.replace("<TimeSpan>", "<TimeSpam>").replace("</TimeSpan>", "</TimeSpam>"))
     document = book.features[0]
     folders = {f.name: f for f in document.features if isinstance(f, fastkml.Folder)}
     towers = folders.pop("Towers")
@@ -374,7 +387,7 @@ def test_the_checker_of_the_conventions_sees_a_unit_that_is_none(data, tmp_path,
 # --- what else may happen --------------------------------------------------------------------------------------------
 
 
-def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch, cf_faults):
+def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatch):
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     epoch = np.datetime64(0, "ns")
 
@@ -386,14 +399,13 @@ def test_logs_without_a_time_of_day_are_named_as_such(data, tmp_path, monkeypatc
     )
     export = samples.of_report(relative)
     assert not export.clock
-    write.write_exports(export, tmp_path, ["gpx", "kmz", "netcdf"])
+    write.write_exports(export, tmp_path, ["gpx", "kmz"])
     place = tmp_path / "exports"
     assert "<time>" not in (place / "track.gpx").read_text()
     with zipfile.ZipFile(place / "samples.kmz") as archive:
         text = archive.read("doc.kml").decode()
     assert "TimeSpan" not in text
     assert "no origin" in text
-    assert cf_faults(place / "rss.nc") == []
 
 
 def test_a_flight_with_rank_alone_and_one_with_nothing(data, tmp_path, monkeypatch):
@@ -468,6 +480,22 @@ def test_a_missing_library_is_named_with_its_extra(name, module, data, tmp_path,
     )
     assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
     assert not list((tmp_path / "exports").glob("*.nc" if name == "netcdf" else "*.parquet"))
+
+
+@pytest.mark.parametrize("name", write.FORMATS)
+def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path, monkeypatch):
+    """A library that writes by itself must not end the process or keep silent."""
+    resource = pytest.importorskip("resource")
+    monkeypatch.setattr(kmz, "_legend", lambda _: b"")
+    export = samples.of_report(data)
+    write.write_exports(export, tmp_path, [name])  # what it loads is loaded now
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    try:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))
+        with pytest.raises(OSError, match=r"(?i)large|disk"):
+            write.write_exports(export, tmp_path, [name])
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
 
 
 def test_a_full_disk_is_an_oserror_for_sqlite_too(data, tmp_path, monkeypatch):

@@ -53,6 +53,7 @@ _SCHEMA = "http://www.geopackage.org/spec121/#extension_schema"
 def write_geopackage(export: Export, folder: Path) -> list[Path]:
     """``samples.gpkg``; an OSError where the disk does not take it."""
     path = folder / "samples.gpkg"
+    path.unlink(missing_ok=True)  # SQLite would add to it
     try:
         with closing(sqlite3.connect(path, isolation_level=None)) as book:
             # the folder becomes whole or does not appear: no journal is needed

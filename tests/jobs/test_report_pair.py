@@ -1,0 +1,104 @@
+"""Two runs of ``report`` on one small flight, end to end: their exports, and what ``diff`` says of them."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.report.exports.write import FORMATS
+
+SETTINGS: dict[str, Any] = {
+    "flight": {
+        "name": "small",
+        "synthetic": True,
+        "plan": {
+            "start": "2025-06-01T10:00:00",
+            "seed": 4,
+            "speed_mps": 10.0,
+            "rss_interval_s": 0.5,
+            "rank_k": 10,
+            "rank_interval_s": 1.0,
+            "fading_db": 1.0,
+            "fading_correlation_s": 0.5,
+            "waypoints": [
+                {"east_m": e, "north_m": n, "height_m": h} for e, n, h in ((-40, 10, 30), (-250, 60, 30), (-100, 260, 40))
+            ],
+            "offsets_db": {"LW1": {"USRP1": 12.3}},
+        },
+    },
+    "site": {"file": "lake_wheeler", "without_buildings": True},
+    "timezone": "America/New_York",
+    "logs": [
+        {"path": "small/vehicle.txt", "reader": "vehicle_out"},
+        {"path": "small/USRP1.txt", "reader": "sounder_log", "node": "LW1", "channel": "USRP1"},
+        {"path": "small/ri.csv", "reader": "quectel_ri", "node": "LW1"},
+    ],
+    "rt": {"max_depth": 1, "audit_links": 0},
+    "rss": {"bootstrap": 50, "lag": "off"},
+    "rank": {"k": [10, 100], "bootstrap": 20},
+    "report": {"speed_table": False, "export": ["gpx"]},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Path]:
+    """Reports with one reflection and with none; the first also exports everything."""
+    folder = tmp_path_factory.mktemp("pair")
+    path = folder / "flight.yaml"
+    path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
+    assert main(["simulate", str(path), "--quiet"]) == 0
+    out = folder / "with", folder / "without"
+    words = ["--figures", "none", "--quiet"]
+    assert main(["report", str(path), "-o", str(out[0]), "--export", "all", *words]) == 0
+    path.write_text(yaml.safe_dump({**SETTINGS, "rt": {"max_depth": 0, "audit_links": 0}}), encoding="utf-8")
+    assert main(["report", str(path), "-o", str(out[1]), *words]) == 0
+    return out
+
+
+def test_every_export_is_part_of_the_report(pair: tuple[Path, Path]) -> None:
+    names = {path.name for path in (pair[0] / "exports").iterdir()}
+    assert names >= {"rss.geojson", "rank.geojson", "towers.geojson", "samples.gpkg", "samples.kmz", "samples.mat"}
+    assert len(FORMATS) == 7
+    sums = (pair[0] / "SHA256SUMS").read_text(encoding="utf-8")
+    page = (pair[0] / "report.html").read_text(encoding="utf-8")
+    for name in names:
+        assert f"exports/{name}" in sums
+        assert f"exports/{name}" in page
+    assert [path.name for path in (pair[1] / "exports").iterdir()] == ["track.gpx"], "what flight.yaml asks for"
+    assert json.loads((pair[0] / "metrics.json").read_text(encoding="utf-8"))["stages"]["exports_s"] > 0
+
+
+def test_an_export_holds_the_samples_of_the_report(pair: tuple[Path, Path]) -> None:
+    table = pd.read_csv(pair[0] / "rss.csv")
+    points = json.loads((pair[0] / "exports" / "rss.geojson").read_text(encoding="utf-8"))["features"]
+    residual = np.array([p["properties"]["residual_db"] for p in points], dtype=float)  # None is NaN
+    np.testing.assert_allclose(residual, table["residual_db"])
+    assert [p["properties"]["time"] for p in points] == table["time_utc"].tolist()
+
+
+def test_diff_of_two_runs_names_the_setting_and_the_levels(pair: tuple[Path, Path]) -> None:
+    from aerpaw_cmp.jobs.diff_reports import run_diff
+
+    found = run_diff(*pair)
+    assert [(e.key, e.first, e.second) for e in found.settings] == [("rt.max_depth", 1, 0)]
+    assert [(e.role, e.what) for e in found.inputs] == [("flight file", "changed")]
+    assert found.versions == ()
+    (level,) = found.levels
+    tables = [pd.read_csv(folder / "rss.csv") for folder in pair]
+    moved = tables[1]["simulated_dbm"] - tables[0]["simulated_dbm"]
+    assert level.simulated_max_db == pytest.approx(moved.abs().max())
+    assert level.simulated_max_db > 1, "the ground ray is gone"
+    assert level.samples.common == len(tables[0])
+    # simulated with the ground ray: without it the replay is worse
+    assert level.rmse.difference_db > 0
+    assert level.rmse.other_rmse_db == pytest.approx(1.0, abs=0.3), "the fading of the plan"
+    assert found.pooled is not None
+    assert found.pooled.difference_db == pytest.approx(level.rmse.difference_db)
+    assert run_diff(pair[0], pair[0]).differences == ()

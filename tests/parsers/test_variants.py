@@ -1,0 +1,82 @@
+"""What editors, spreadsheets and shells make of a log on its way: the same records."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from aerpaw_cmp.logs import blocks
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import by_name, identify
+from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, SAMPLES
+
+TEXTS = [
+    (reader, name, data, accepted)
+    for reader, found in SAMPLES.items()
+    for name, (data, accepted, _) in found.items()
+    if reader not in BINARY
+]
+VARIANTS = {
+    "unix lines": lambda data: data.replace(b"\r\n", b"\n"),
+    "windows lines": lambda data: data.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"),
+    "byte order mark": lambda data: b"\xef\xbb\xbf" + data,
+    "utf-16": lambda data: data.decode().encode("utf-16"),
+    "blank lines at the end": lambda data: data + b"\n\n" if data.endswith(b"\n") else data,
+}
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_line_ends_and_marks_change_nothing(variant: str, tmp_path: Path) -> None:
+    for reader, name, data, accepted in TEXTS:
+        place = tmp_path / OPTIONS.file_name
+        place.write_bytes(VARIANTS[variant](data))
+        options = replace(OPTIONS, columns=OPTIONS.columns if reader == "generic_csv" else {})
+        (file,) = ingest(place, options=options, reader="generic_csv" if reader == "generic_csv" else None)
+        assert (file.result.reader, file.result.accepted) == (reader, accepted), (reader, name)
+
+
+def test_a_mark_in_front_of_a_large_log_is_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocks, "FROM_BYTES", 100)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 100)
+    data = SAMPLES["vehicle_out"]["ten_fields"][0]
+    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf" + data)
+    (tmp_path / "b.txt").write_bytes(data.decode().encode("utf-16"))
+    for file in ingest(tmp_path, options=OPTIONS):
+        assert (file.result.accepted, file.result.rejected) == (3, ())
+
+
+def _cells(data: bytes) -> list[list[bytes]]:
+    return [line.split(b",") for line in data.split(b"\r\n")[:-1]]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda rows: b"\n".join(b",".join(row[::-1]) for row in rows) + b"\n",
+        lambda rows: b"\n".join(b";".join(row).replace(b".", b",") for row in rows) + b"\n",
+        lambda rows: b"\n".join(b"\t".join(row) for row in rows) + b"\n",
+        lambda rows: b"Flight 3\n" + b"\n".join(b",".join([*row, b"x"]) for row in rows) + b"\n",
+        lambda rows: b"\n".join(b",".join(b'"' + cell + b'"' for cell in row) for row in rows) + b"\n",
+        lambda rows: b",".join(rows[0]).upper() + b"\n" + b"\n".join(b",".join(row) for row in rows[1:]) + b"\n",
+    ],
+    ids=["order", "decimal comma", "tabs", "title and more columns", "quoted", "capitals"],
+)
+def test_a_rank_table_in_another_dress_gives_the_same_ranks(change) -> None:  # type: ignore[no-untyped-def]
+    whole = by_name("nemo_csv").read(NEMO_CSV, OPTIONS).streams[0].frame
+    data = change(_cells(NEMO_CSV))
+    result = identify(data).read(data, OPTIONS)
+    (rank,) = (stream.frame for stream in result.streams if stream.kind == "rank")
+    shown = whole[whole["rank"].notna()]
+    assert rank["rank"].tolist() == shown["rank"].tolist()
+    assert rank["time"].tolist() == shown["time"].tolist()
+
+
+def test_a_mapped_table_has_any_separator() -> None:
+    options = replace(OPTIONS, kind="rss", columns={"time": "Time", "rss_db": "Level"})
+    whole = by_name("generic_csv").read(b"Time,Level\n2025-03-02T10:00:00.5,-81.5\n", options).streams[0].frame
+    for data in (b"Time;Level\n2025-03-02T10:00:00.5;-81,5\n", b"Time\tLevel\n2025-03-02T10:00:00.5\t-81.5\n"):
+        frame = by_name("generic_csv").read(data, options).streams[0].frame
+        assert frame["rss_db"].tolist() == whole["rss_db"].tolist()
+        assert frame["time"].tolist() == whole["time"].tolist()

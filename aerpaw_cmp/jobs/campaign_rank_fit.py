@@ -205,8 +205,8 @@ def search(benches: Sequence[RankBench], grids: Mapping[str, Sequence[Any]], cri
         return known[name][1]
 
     if np.prod([len(values) for values in grids.values()], dtype=np.float64) <= LARGEST_PRODUCT:
-        for values in product(*grids.values()):
-            tried(dict(zip(grids, values, strict=True)))
+        for combination in product(*grids.values()):
+            tried(dict(zip(grids, combination, strict=True)))
         method = "every combination"
     else:
         for share in (0.25, 0.5, 0.75):

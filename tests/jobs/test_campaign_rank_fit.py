@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.campaign import load_campaign
 from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, search, shares_by_rank
 
 PLANTED = {"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0}
@@ -105,3 +108,43 @@ def test_refusals(flights: dict[str, FlightData]) -> None:
     none = {"one": dataclasses.replace(flights["one"], rank=(silent,)), "two": flights["two"]}
     with pytest.raises(InputError, match="nothing can be fitted on one"):
         fit_rank_all(none, GRIDS, ["one"], criterion="kappa")
+
+
+def campaign_file(folder: Path, held_out: str) -> Path:
+    path = folder / "campaign.yaml"
+    path.write_text(f"campaign: c\nflights: [one.yaml, two.yaml]\nheld_out: {held_out}\n", encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("held_out", "says"),
+    [
+        ("{fit: {rank.k: [10, 20]}}", "criterion: kappa"),
+        ("{fit: {rss.lag: [1, 2]}, criterion: kappa}", "rank.k"),
+        ("{fit: {link.rank.uav.slant_deg: [[0, 0, 0, 0], [45, -45, 45, -45]]}}", "rank alone"),
+        ("{fit: {rank.k: [20, 10]}, criterion: kappa}", "increasing"),
+    ],
+)
+def test_what_a_campaign_cannot_fit_is_refused_by_name(tmp_path: Path, held_out: str, says: str) -> None:
+    with pytest.raises(UsageError) as caught:
+        load_campaign(campaign_file(tmp_path, held_out))
+    assert says in str(caught.value)
+
+
+def test_a_campaign_writes_its_rank_fit(tmp_path: Path) -> None:
+    for name, north in (("one", 8e-4), ("two", -6e-4)):
+        said = RankBench(flight(tmp_path, name, north)).pairs(PLANTED)[1]
+        rows = (tmp_path / f"{name}.csv").read_text(encoding="utf-8").splitlines()
+        rows[1:] = [
+            ",".join([t, str(r), *rest])
+            for (t, _, *rest), r in zip((x.split(",") for x in rows[1:]), said, strict=True)
+        ]
+        (tmp_path / f"{name}.csv").write_text("\n".join(rows) + "\n", encoding="utf-8")
+    fit = "{fit: {link.rank.uav.yaw_deg: [0, 45, 90, 135], rank.k: [5, 10, 20, 40]}, criterion: kappa}"
+    out = tmp_path / "out"
+    assert main(["campaign", str(campaign_file(tmp_path, fit)), "-o", str(out), "--quiet"]) == 0
+    folds = json.loads((out / "campaign.json").read_text(encoding="utf-8"))["held_out"]["rank"]
+    assert [fold["parameters"] for fold in folds] == [PLANTED, PLANTED]
+    assert all(row["fit_kappa"] == 1.0 for fold in folds for row in fold["scores"])
+    page = (out / "campaign.html").read_text(encoding="utf-8")
+    assert "Rank fitted on two: on one kappa goes from" in page

@@ -142,11 +142,12 @@ class RankPairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A flight (and setting) that gave no numbers, and why."""
+    """A flight (and setting) that gave no numbers, and why; ``traceback`` for whoever mends it, never on the page."""
 
     flight: str
     setting: str
     message: str
+    traceback: str = field(repr=False, default="")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

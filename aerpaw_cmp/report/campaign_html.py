@@ -85,7 +85,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         ],
         "settings": data.settings,
         "reference": data.reference,
-        "failures": _entries(data.failures),
+        "failures": _entries(data.failures, ("traceback",)),
         "mean_rmse_db": mean_rmse(data),
         "rss": _entries(data.rss, ARRAYS),
         "rank": _entries(data.rank),

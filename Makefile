@@ -14,7 +14,7 @@ REPORT := reports/sample
 unexport PYTHONPATH PYTHONHOME PIP_USER
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup report test bench docs clean
+.PHONY: help setup report test bench bench-all docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -23,6 +23,7 @@ help:
 	@echo "make setup    only the environment, developers' tools included: .venv and an LLVM for Dr.Jit"
 	@echo "make docs     the documentation as pages, build/site/index.html"
 	@echo "make bench    speed against error on this machine"
+	@echo "make bench-all  every benchmark with its peers in one run; makes docs/performance.md"
 	@echo "make clean    remove .venv, caches and $(REPORT)/"
 
 setup: $(READY_DEV) $(LLVM)
@@ -55,13 +56,18 @@ $(READY_DOCS): $(READY)
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs
 	@touch $@
 
-# strict: a dead link or anchor, or a script of the gallery that fails, ends it
+# strict: a dead link or anchor, a page without a place in the menu, a failing script of the gallery end it; with --quiet
+# warnings would be hidden from --strict, too
 docs: $(READY_DOCS)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "The documentation: $(CURDIR)/build/site/index.html"
 
 bench: $(READY_DEV) $(LLVM)
 	$(BIN)/aerpaw-cmp bench
+
+bench-all: $(READY_DEV) $(LLVM)
+	-$(BIN)/python benchmarks/all.py
+	$(BIN)/python benchmarks/performance.py
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist $(REPORT)

@@ -92,6 +92,7 @@ class Meter:
             row["cpu_s"] += cpu - self._cpu
             row["peak_mib"] = max(row["peak_mib"], peak_mib())
             self._wall, self._cpu = wall, cpu
+        print(f"{self._name}: {row['cpu_s']:.1f} s, {row['peak_mib']:.0f} MiB", file=sys.stderr, flush=True)
 
 
 def peak_mib() -> float:

@@ -2,7 +2,9 @@
 
 1. A two-channel flight of 3304 samples, image engine: time over that of importing what it is made of
    (``import sionna.rt, matplotlib.pyplot, pandas``). The real one where AERPAW_CMP_FIELD_DATA is set, else a simulated.
-2. The sample flight: seconds and peak memory.
+2. The sample flight: seconds and peak memory; the same without audit and table of speed.
+   The first and the second report of part 1 with ``--audit later``, caches empty before the first: over those imports,
+   and over the imports without Sionna, which such a report does not load.
 3. The second report of a flight over the first, ``sionna`` engine, path cache empty before the first.
 
     python benchmarks/report.py [--quick] [--json]
@@ -25,6 +27,7 @@ import yaml
 
 ROOT = Path(__file__).parents[1]
 IMPORTS = "import sionna.rt, matplotlib.pyplot, pandas"
+LIGHT = "import matplotlib.pyplot, pandas"
 
 
 def run(command: list[str], **environment: str) -> dict[str, float]:
@@ -60,6 +63,19 @@ def two_channels(folder: Path) -> tuple[Path, list[str], str]:
     return flight, [], "simulated, one tower, two channels"
 
 
+def without_audit(flight: Path, options: list[str], folder: Path, repeats: int) -> dict[str, dict[str, float]]:
+    """First (cold) and next (warm) report without its audit, by processor time over the imports; medians."""
+    found: dict[str, list[dict[str, float]]] = {"cold": [], "warm": []}
+    for number in range(repeats):
+        kept = folder / f"kept{number}"
+        empty = {key: str(kept / key) for key in ("XDG_CACHE_HOME", "MPLCONFIGDIR", "AERPAW_CMP_CACHE")}
+        for name, rows in found.items():
+            imports, light = (run([sys.executable, "-c", text])["cpu_s"] for text in (IMPORTS, LIGHT))
+            one = run(report(flight, folder / f"{name}{number}", *options, "--audit", "later"), **empty)
+            rows.append({**one, "ratio": one["cpu_s"] / imports, "ratio_light": one["cpu_s"] / light})
+    return {name: {key: statistics.median(row[key] for row in rows) for key in rows[0]} for name, rows in found.items()}
+
+
 def main() -> None:
     """Print the three parts."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -89,7 +105,10 @@ def main() -> None:
             for _ in range(2)
         ]
         stages = json.loads((folder / "s" / "metrics.json").read_text())["stages"]
-        sample = run(report(ROOT / "sample_logs" / "flight.yaml", folder / "sample"))
+        some = ROOT / "sample_logs" / "flight.yaml"
+        sample = run(report(some, folder / "sample"))
+        sample_later = run(report(some, folder / "sample_later", "--audit", "later"))
+        later = without_audit(flight, options, folder, repeats)
     result = {
         "two_channels": {
             "flight": source,
@@ -100,6 +119,8 @@ def main() -> None:
             "peak_mib": max(r["peak_mib"] for r in reports),
         },
         "sample": sample,
+        "sample_later": sample_later,
+        "later": later,
         "second_report": {
             "first_s": both[0]["wall_s"],
             "second_s": both[1]["wall_s"],
@@ -117,6 +138,11 @@ def main() -> None:
         f"{one['ratio']:.2f} x the imports of {one['imports_s']:.1f} s ({one['ratio_cpu']:.2f} x in processor time)"
     )
     print(f"sample flight: {two['wall_s']:.1f} s, peak memory {two['peak_mib']:.0f} MiB")
+    print(f"sample flight without audit and table of speed: {sample_later['cpu_s']:.1f} s of processor, "
+          f"{sample_later['wall_s']:.1f} s, {sample_later['peak_mib']:.0f} MiB")  # fmt: skip
+    for name, row in later.items():
+        print(f"--audit later, {name}: {row['cpu_s']:.1f} s of processor ({row['wall_s']:.1f} s), {row['ratio']:.2f} x "
+              f"the imports, {row['ratio_light']:.2f} x the imports without Sionna")  # fmt: skip
     print(
         f"second report, sionna, {three['samples']} samples: {three['first_s']:.1f} s, then {three['second_s']:.1f} s,"
         f" {three['times_faster']:.1f} times faster (replay stage of the second: {three['second_replay_s']:.2f} s)"

@@ -51,6 +51,11 @@ LogsRoot = Annotated[
 ]
 
 
+Workers = Annotated[int, typer.Option(min=1, help="Workers of this machine that share the tasks.")]
+Scheduler = Annotated[
+    Optional[str],  # noqa: UP045
+    typer.Option("--scheduler", "--cluster", help="Address of a Dask scheduler, in place of workers here."),
+]
 DryRun = Annotated[
     bool, typer.Option("--dry-run", help="Only say what would run and about how long; nothing is written.")
 ]

@@ -7,7 +7,9 @@ from typing import Annotated, Any, Optional
 
 import typer
 
-from .app import Export, Force, Json, LogsRoot, Out, command
+from ..common.errors import UsageError
+from ..common.stages import duration
+from .app import Export, Force, Json, LogsRoot, Out, Scheduler, Workers, command
 from .shown import number, print_json, say, table
 
 
@@ -16,20 +18,30 @@ from .shown import number, print_json, say, table
     examples=[
         "aerpaw-cmp campaign campaign.yaml --workers 4",
         "aerpaw-cmp campaign campaign.yaml -o reports/spring --keep outcomes --strict",
-        "aerpaw-cmp campaign campaign.yaml --cluster tcp://scheduler:8786 --json",
+        "aerpaw-cmp campaign campaign.yaml --scheduler tcp://scheduler:8786 --keep s3://lab/season",
+        "aerpaw-cmp campaign status campaign.yaml",
     ],
 )
 def campaign(
-    campaign_yaml: Annotated[Path, typer.Argument(metavar="CAMPAIGN", help="campaign.yaml")],
+    words: Annotated[
+        list[str],
+        typer.Argument(
+            metavar="[status|resume] CAMPAIGN",
+            help="campaign.yaml; with 'status', what is kept and what is to do; with 'resume', that and then the rest.",
+        ),
+    ],
     out: Out = None,
     logs_root: LogsRoot = None,
-    workers: Annotated[int, typer.Option(min=1, help="Processes that share the flights and settings.")] = 1,
-    cluster: Annotated[Optional[str], typer.Option(help="Address of a Dask scheduler, in place of processes.")] = None,  # noqa: UP045
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
     keep: Annotated[
-        Optional[Path],  # noqa: UP045
-        typer.Option(help="Folder of the outcomes of single tasks; a rerun computes only what is missing there."),
+        Optional[str],  # noqa: UP045
+        typer.Option(help="Folder or URL of the outcomes of tasks; a rerun computes only what is missing there."),
     ] = None,
     fresh: Annotated[bool, typer.Option("--fresh", help="Keep no outcomes and take none.")] = False,
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell what is kept, what would be computed and how long; compute nothing.")
+    ] = False,
     strict: Annotated[
         bool, typer.Option("--strict", help="Exit code 1 when a flight or a stated check failed.")
     ] = False,
@@ -40,13 +52,21 @@ def campaign(
     """Many flights and settings, with what can be said only of several flights."""
     from ..jobs import run
 
+    action, campaign_yaml = _action(words)
+    if dry_run or action != "run":
+        status = run.campaign_status(campaign_yaml, logs_root=logs_root, keep=keep, fresh=fresh, workers=workers)
+        if action != "resume" or dry_run:
+            print_json(status.metrics()) if as_json else _print_status(status)
+            return 0
+        say(_one_line(status))
     outcome = run.run_campaign(
         campaign_yaml,
         out=out,
         logs_root=logs_root,
         workers=workers,
-        cluster=cluster,
-        keep=None if fresh else keep or run.outcomes_folder(),
+        scheduler=scheduler,
+        keep=keep,
+        fresh=fresh,
         force=force,
         export=export or (),
         progress=say,
@@ -60,6 +80,42 @@ def campaign(
     if outcome.nothing_done:
         return 3
     return 1 if strict and outcome.failed_checks else 0
+
+
+def _action(words: list[str]) -> tuple[str, Path]:
+    """What is asked for, and the campaign.yaml."""
+    if len(words) == 1 and words[0] not in ("status", "resume"):
+        return "run", Path(words[0])
+    if len(words) == 2 and words[0] in ("status", "resume"):
+        return words[0], Path(words[1])
+    raise UsageError(
+        f"campaign {' '.join(words)}",
+        expected="campaign CAMPAIGN, or campaign status (or resume) CAMPAIGN",
+    )
+
+
+def _one_line(status: Any) -> str:
+    time = "no time was measured yet" if status.estimate_s is None else f"about {duration(status.estimate_s)}"
+    if not status.to_do:
+        time = "nothing to compute"
+    return (
+        f"{status.name}: {len(status.states)} tasks, {status.kept} kept in {status.keep}, {status.failed} failed the "
+        f"last time, {status.to_do} to do, {time} with {status.workers} worker{'s' if status.workers > 1 else ''}"
+    )
+
+
+_SHOWN = 20
+"""Tasks of a list on the terminal; --json has them all."""
+
+
+def _print_status(status: Any) -> None:
+    print(_one_line(status))
+    rows = [[s.task.flight, s.task.setting, (s.failure or s.trouble)[:100]] for s in status.states if not s.kept]
+    if rows:
+        title = "To do" if len(rows) <= _SHOWN else f"To do: the first {_SHOWN} of {len(rows)}"
+        table(["flight", "setting", "last failure"], rows[:_SHOWN], title)
+    for failure in status.failures:
+        print(f"{failure.flight}: {failure.message}")
 
 
 def _print_campaign_summary(outcome: Any) -> None:
@@ -93,10 +149,12 @@ def _print_campaign_summary(outcome: Any) -> None:
     rows = [
         [f"{p['tower']} {p['channel']}", f"{p['first']}, {p['second']}", str(p["n"]), number(p["rmse_db"], "{:.2f}"),
          number(p["place_correlation"], "{:.2f}")]
-        for p in m["repeatability"]["pairs"]
+        for p in sorted(m["repeatability"]["pairs"], key=lambda p: -p["n"])[:_SHOWN]
     ]  # fmt: skip
     if rows:
-        table(["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, "Same places, two flights")
+        more = len(m["repeatability"]["pairs"]) - len(rows)
+        title = "Same places, two flights" + (f"; {more} more in campaign.json" if more else "")
+        table(["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, title)
     rows = [
         [", ".join(fold["fitted_on"]), r["flight"], f"{r['tower']} {r['channel']}",
          "fitted here" if r["fitted_here"] else "transferred", number(r["start_rmse_db"], "{:.2f}"),

@@ -9,7 +9,7 @@ from typing import Annotated, Any, Literal, Optional
 import typer
 
 from ..common.errors import one_line
-from .app import DryRun, Export, Force, Json, LogsRoot, Out, command
+from .app import DryRun, Export, Force, Json, LogsRoot, Out, Scheduler, Workers, command
 from .shown import number, print_files, print_json, print_plan, say, table
 
 
@@ -203,13 +203,23 @@ def calibrate(
     calibration_yaml: Annotated[Path, typer.Argument(metavar="CALIBRATION", help="calibration.yaml")],
     out: Out = None,
     logs_root: LogsRoot = None,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
     force: Force = False,
     as_json: Json = False,
 ) -> None:
     """Learn antennas and ground from several flights."""
     from ..jobs import run
 
-    outcome = run.run_calibrate(calibration_yaml, out=out, logs_root=logs_root, force=force, progress=say)
+    outcome = run.run_calibrate(
+        calibration_yaml,
+        out=out,
+        logs_root=logs_root,
+        workers=workers,
+        scheduler=scheduler,
+        force=force,
+        progress=say,
+    )
     if as_json:
         print_json(outcome.metrics)
         return

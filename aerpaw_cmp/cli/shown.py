@@ -4,21 +4,27 @@ from __future__ import annotations
 
 import json
 import sys
+import time
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
+
+_EVERY_S = 30.0
 
 
 class ProgressLines:
     """Progress on standard error, so that standard output stays clean.
 
-    On a terminal a share is a bar with the time left; elsewhere every quarter is a line. With ``quiet`` nothing is
-    said but what :meth:`warn` gets.
+    On a terminal a share is a bar with the time left; elsewhere every quarter is a line. What stands behind a tab in
+    the text may change from call to call: it is shown with the bar, and elsewhere every half minute. With ``quiet``
+    nothing is said but what :meth:`warn` gets.
     """
 
     def __init__(self) -> None:
         self._bar: Any = None
         self._quarters: dict[str, int] = {}
+        self._name = ""
+        self._last = time.monotonic()
         self.quiet = False
 
     def __call__(self, text: str, fraction: float | None = None, /) -> None:
@@ -29,9 +35,12 @@ class ProgressLines:
             self.warn(text)
         elif sys.stderr.isatty():
             self._draw(text, fraction)
-        elif int(4 * fraction) > self._quarters.get(text, 0):
-            self._quarters[text] = int(4 * fraction)
-            print(f"{text} {100 * fraction:.0f} %", file=sys.stderr, flush=True)
+        else:
+            name, _, tail = text.partition("\t")
+            late = tail and time.monotonic() - self._last >= _EVERY_S
+            if late or int(4 * fraction) > self._quarters.get(name, 0):
+                self._quarters[name], self._last = int(4 * fraction), time.monotonic()
+                print(f"{name} {100 * fraction:.0f} %{tail and ': ' + tail}", file=sys.stderr, flush=True)
 
     def warn(self, text: str) -> None:
         """Show a line, also where all else is quiet."""
@@ -39,12 +48,14 @@ class ProgressLines:
         print(text, file=sys.stderr, flush=True)
 
     def _draw(self, text: str, fraction: float) -> None:
-        if self._bar is None or self._bar.tasks[0].description != text:
+        name, _, tail = text.partition("\t")
+        shown = f"{name}: {tail}" if tail else name
+        if self._bar is None or self._name != name:
             self.end()
-            self._bar = _bar()
-            self._bar.add_task(text, total=1.0)
+            self._bar, self._name = _bar(), name
+            self._bar.add_task(shown, total=1.0)
             self._bar.start()
-        self._bar.update(self._bar.tasks[0].id, completed=fraction)
+        self._bar.update(self._bar.tasks[0].id, completed=fraction, description=shown)
         if fraction >= 1.0:
             self.end()
 

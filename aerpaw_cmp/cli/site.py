@@ -7,7 +7,7 @@ from typing import Annotated, Any, Literal, Optional
 
 import typer
 
-from .app import DryRun, Force, Json, LogsRoot, Out, command, site_app
+from .app import DryRun, Force, Json, LogsRoot, Out, Scheduler, Workers, command, site_app
 from .shown import print_files, print_json, print_plan, say, table
 
 
@@ -172,6 +172,8 @@ def map_(
         typer.Option(help="A level below it is out of coverage. Default: only no path is."),
     ] = None,
     study: Annotated[bool, typer.Option("--study/--no-study", help="Correlation and interpolation, too.")] = True,
+    workers: Workers = 1,
+    scheduler: Scheduler = None,
     dry_run: DryRun = False,
     force: Force = False,
     as_json: Json = False,
@@ -198,7 +200,16 @@ def map_(
         print_plan(run.plan_map(site, out=out, quick=quick, flight=flight, force=force, **wanted), as_json)
         return
     outcome = run.run_map(
-        site, out=out, quick=quick, flight=flight, logs_root=logs_root, force=force, progress=say, **wanted
+        site,
+        out=out,
+        quick=quick,
+        flight=flight,
+        logs_root=logs_root,
+        workers=workers,
+        scheduler=scheduler,
+        force=force,
+        progress=say,
+        **wanted,
     )
     if as_json:
         print_json(outcome.metrics)

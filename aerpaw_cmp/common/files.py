@@ -61,6 +61,26 @@ def _clear_old_parts(folder: Path, prefix: str) -> None:
                 part.unlink()
 
 
+def seal(content: bytes, mark: bytes) -> bytes:
+    """Content with a mark and its SHA-256 behind it."""
+    return content + mark + hashlib.sha256(content).digest()
+
+
+def unseal(entry: bytes, mark: bytes) -> bytes:
+    """The content of what :func:`seal` made.
+
+    Raises
+    ------
+    ValueError
+        If the entry is damaged, or another kind of file: seen before any of it is parsed, since damaged archives make
+        their readers fail in a dozen ways.
+    """
+    content, end = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
+    if end != mark + hashlib.sha256(content).digest():
+        raise ValueError("the seal does not fit the content")
+    return content
+
+
 def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
     """Write an entry of a cache whole or not at all, with a mark and the SHA-256 of its content behind it.
 
@@ -69,7 +89,7 @@ def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
         with whole(path) as part:
-            part.write_bytes(content + mark + hashlib.sha256(content).digest())
+            part.write_bytes(seal(content, mark))
 
 
 def read_sealed(path: Path, mark: bytes) -> bytes | None:
@@ -78,17 +98,13 @@ def read_sealed(path: Path, mark: bytes) -> bytes | None:
     Raises
     ------
     ValueError
-        If the entry is damaged, or another kind of file: seen before any of it is parsed, since damaged archives make
-        their readers fail in a dozen ways.
+        As :func:`unseal`.
     """
     try:
         entry = path.read_bytes()
     except OSError:
         return None
-    content, seal = entry[: -len(mark) - 32], entry[-len(mark) - 32 :]
-    if seal != mark + hashlib.sha256(content).digest():
-        raise ValueError(f"the seal of {path} does not fit its content")
-    return content
+    return unseal(entry, mark)
 
 
 def write_whole(path: Path, content: str | bytes) -> None:

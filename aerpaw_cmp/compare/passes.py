@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
-from .statistics import NO_INTERVAL, Interval, autocorrelation, correlation, of_spread
+from .statistics import NO_INTERVAL, Interval, autocorrelation, block_variance, correlation, of_spread
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -107,23 +107,13 @@ def spread_interval(difference_db: FloatArray) -> Interval:
     known = of_spread(autocorrelation(d), autocorrelation(squared))
     if not known.enough:
         return NO_INTERVAL
-    of_mean, of_square = (_variance_of_mean(x, known.block_length) for x in (d, squared))
+    of_mean, of_square = (block_variance(x, known.block_length) for x in (d, squared))
     bias = -0.5 * (of_mean / mean_square + 0.5 * of_square / mean_square**2)
     reach = known.half_width * 0.5 * float(np.sqrt(of_square)) / mean_square
     value = 0.5 * float(np.log(mean_square))
     low, high = (float(np.exp(value - bias + sign * reach)) for sign in (-1.0, 1.0))
     rmse = float(np.sqrt(mean_square))
     return min(low, rmse), max(high, rmse)
-
-
-def _variance_of_mean(values: FloatArray, length: int) -> float:
-    """Variance of the mean of a circular block resample."""
-    n = len(values)
-    running = np.concatenate([[0.0], np.cumsum(np.concatenate([values, values[:length]]))])
-    blocks = -(-n // length)
-    rest = n - (blocks - 1) * length
-    whole, last = running[length : length + n] - running[:n], running[rest : rest + n] - running[:n]
-    return float(((blocks - 1) * whole.var() + last.var()) / n**2)
 
 
 # --- every pair -----------------------------------------------------------------------------------------------------
@@ -178,6 +168,41 @@ class _Prepared:
     heights: FloatArray
 
 
+class PassTable:
+    """Passes ready to be paired.
+
+    Parameters
+    ----------
+    passes : sequence of Pass
+    cell_m : float
+        Edge of the cells of the plan.
+    """
+
+    def __init__(self, passes: Sequence[Pass], cell_m: float) -> None:
+        self._places: dict[bytes, _Places] = {}
+        self._flights: dict[str, list[tuple[int, _Prepared]]] = {}
+        for number, one in enumerate(passes):
+            self._flights.setdefault(one.flight, []).append((number, _prepare(one, cell_m, self._places)))
+
+    def pairs(
+        self, *, radius_m: float, heading_within_deg: float | None, first_flights: Iterable[str] | None = None
+    ) -> Iterator[PassPair]:
+        """Every pair of two flights' passes on one link; parameters as in :func:`pass_pairs`."""
+        names = list(self._flights)
+        chosen = set(names if first_flights is None else first_flights)
+        rule = radius_m, heading_within_deg
+        for i, first in enumerate(names):
+            for second in names[i + 1 :] if first in chosen else ():
+                found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
+                shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
+                partners: dict[str, list[tuple[int, _Prepared]]] = {}
+                for number, entry in self._flights[second]:
+                    partners.setdefault(entry.one.link, []).append((number, entry))
+                for number, here in self._flights[first]:
+                    for other, there in partners.get(here.one.link, ()):
+                        yield _pair(number, here, other, there, self._places, found, shared, rule)
+
+
 def pass_pairs(
     passes: Sequence[Pass],
     *,
@@ -205,22 +230,10 @@ def pass_pairs(
     PassPair
         By first flight, second flight and link, each in the order given.
     """
-    places: dict[bytes, _Places] = {}
-    by_flight: dict[str, list[tuple[int, _Prepared]]] = {}
-    for number, one in enumerate(passes):
-        by_flight.setdefault(one.flight, []).append((number, _prepare(one, cell_m, places)))
-    names = list(by_flight)
-    chosen = set(names if first_flights is None else first_flights)
-    for i, first in enumerate(names):
-        for second in names[i + 1 :] if first in chosen else ():
-            found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
-            shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
-            partners: dict[str, list[tuple[int, _Prepared]]] = {}
-            for number, entry in by_flight[second]:
-                partners.setdefault(entry.one.link, []).append((number, entry))
-            for number, here in by_flight[first]:
-                for other, there in partners.get(here.one.link, ()):
-                    yield _pair(number, here, other, there, places, found, shared, (radius_m, heading_within_deg))
+    table = PassTable(passes, cell_m)
+    yield from table.pairs(
+        radius_m=radius_m, heading_within_deg=heading_within_deg, first_flights=first_flights
+    )  # fmt: skip
 
 
 def _prepare(one: Pass, cell_m: float, places: dict[bytes, _Places]) -> _Prepared:

@@ -20,6 +20,7 @@ from .statistics import (
     SEED,
     Interval,
     autocorrelation,
+    block_variance,
     bootstrap_means,
     interval,
     plain,
@@ -893,7 +894,7 @@ def repeat_rank(
     radius_m, heading_deg, other_heading_deg
         As in :func:`~aerpaw_cmp.compare.statistics.same_places`.
     replicates, seed : int
-        Bootstrap.
+        Bootstrap; with 0 replicates the interval is in closed form, to first order.
     """
     one, two = _ranks(rank), _ranks(other_rank)
     known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
@@ -908,9 +909,25 @@ def repeat_rank(
     if not len(first):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     agree, kappa = agreement(first, second), cohen_kappa(first, second)
+    if replicates:
+        a, b = _pairs(first, second)
+        bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates, seed)[1]
+    else:
+        bounds = _kappa_interval(first, second, kappa)
+    return RankRepeat(kappa=kappa, kappa_ci95=bounds, agreement=agree, n=len(first))
+
+
+def _kappa_interval(first: FloatArray, second: FloatArray, kappa: float) -> Interval:
+    """95 % interval of kappa to first order: block variance of what each pair adds to it, without resamples."""
     a, b = _pairs(first, second)
-    bounds = _pair_intervals(a, b, (agree, kappa, float("nan"), float("nan")), replicates, seed)
-    return RankRepeat(kappa=kappa, kappa_ci95=bounds[1], agreement=agree, n=len(first))
+    if len(a) < 2 or not np.isfinite(kappa):
+        return NO_INTERVAL
+    influence, _, (low, high) = _pair_statistics((a == b).astype(np.float64), _indicators(a), _indicators(b))[1]
+    known = autocorrelation(influence)
+    if not known.enough:
+        return NO_INTERVAL
+    reach = known.half_width * float(np.sqrt(block_variance(influence - influence.mean(), known.block_length)))
+    return max(low, kappa - reach), min(high, kappa + reach)
 
 
 def _pair_intervals(

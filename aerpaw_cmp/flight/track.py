@@ -90,8 +90,8 @@ class TrackPoses:
         Aircraft body (forward-left-up) to east-north-up; NaN where not valid.
     valid : (n,) bool
         False before, after and inside gaps of the telemetry.
-    reason : (n,) str
-        Empty where valid, else one of :data:`REASONS`.
+    reason_code : (n,) int8
+        Which of :data:`REASONS` it is; 0 where valid.
     attitude_known : (n,) bool
         False where level flight along the course stands in for the attitude.
     raised : (n,) bool
@@ -103,13 +103,18 @@ class TrackPoses:
     position_m: FloatArray
     rotation: FloatArray
     valid: BoolArray
-    reason: AnyArray
+    reason_code: AnyArray
     attitude_known: BoolArray
     raised: BoolArray
     velocity_mps: FloatArray
 
     def __len__(self) -> int:
         return len(self.valid)
+
+    @property
+    def reason(self) -> AnyArray:
+        """Why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
+        return np.asarray(REASONS)[self.reason_code]
 
     @property
     def heading_deg(self) -> FloatArray:
@@ -315,12 +320,11 @@ class Track:
             floor = self.ground_m + self.minimum_height_m
             raised[valid] = position[valid, 2] < floor
             position[raised, 2] = floor
-        reason = np.asarray(REASONS)[code]
         return TrackPoses(
             position_m=position,
             rotation=rotation,
             valid=valid,
-            reason=reason,
+            reason_code=code.astype(np.int8),
             attitude_known=known,
             raised=raised,
             velocity_mps=velocity,

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import uuid
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
@@ -33,6 +35,7 @@ from ..flight.settings import AntennaSettings, Settings, load_flight, load_patte
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from .calibrate_rank import RankFitSettings
+from .workers import Lost, Workers
 
 ROUGHNESS_M = (0.0, 0.005, 0.01, 0.02, 0.03, 0.05, 0.08, 0.12, 0.2, math.inf)
 """Heights of roughness that are tried [m]; infinite is no ground ray."""
@@ -118,8 +121,20 @@ def load_calibration(path: Path) -> CalibrationFile:
     return settings
 
 
-def calibrate(path: Path, *, logs_root: Path | None = None, stages: Stages | None = None) -> Calibration:
+def calibrate(
+    path: Path, *, logs_root: Path | None = None, stages: Stages | None = None, workers: Workers | None = None
+) -> Calibration:
     """Read the flights, learn, score.
+
+    Parameters
+    ----------
+    path : Path
+        calibration.yaml.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    stages : Stages, optional
+    workers : Workers, optional
+        Share the scores and the controls.
 
     Raises
     ------
@@ -144,7 +159,10 @@ def calibrate(path: Path, *, logs_root: Path | None = None, stages: Stages | Non
     with stages("ground"):
         ground = fit_ground(flights, observed, learned) if settings.fit.ground else None
     with stages("scores"):
-        scores, controls = score_all(observed, recipe, stages)
+        if workers is not None and workers.count > 1 and len(calibration.flights_of(observed)) > 1:
+            scores, controls = score_on(workers, path, logs_root, recipe)
+        else:
+            scores, controls = score_all(observed, recipe, stages)
     warnings += mount_warnings(learned)
     return Calibration(
         settings=settings,
@@ -347,9 +365,16 @@ def score_all(
     observed: Sequence[Observed], recipe: Recipe, stages: Stages
 ) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
     """Every split, and the controls, all on flights that had no part in the fit."""
-    scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     if len(calibration.flights_of(observed)) < 2:
-        return scores, {}
+        return dict.fromkeys(calibration.SPLITS, ()), {}
+    scores = splits_of(observed, recipe, stages)
+    stages.progress("scores: controls")
+    return scores, controls_of(observed, recipe)
+
+
+def splits_of(observed: Sequence[Observed], recipe: Recipe, stages: Stages) -> dict[str, tuple[Score, ...]]:
+    """Every split; fits of one are used by the next."""
+    scores: dict[str, tuple[Score, ...]] = dict.fromkeys(calibration.SPLITS, ())
     kept: dict[str, Learned] = {}
     scores["flight_left_out"] = calibration.flight_left_out(observed, recipe, kept)
     for split, parts, own in (
@@ -360,12 +385,16 @@ def score_all(
     ):
         stages.progress(f"scores: {split.replace('_', ' ')}")
         scores[split] = calibration.parts_left_out(observed, recipe, kept, parts, own=own)
-    stages.progress("scores: controls")
-    return scores, controls_of(observed, recipe)
+    return scores
 
 
 def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple[Score, ...]]:
     """Simpler and wrong models, each flight left out in turn."""
+    return {name: run() for name, run in _controls(observed, recipe).items()}
+
+
+def _controls(observed: Sequence[Observed], recipe: Recipe) -> dict[str, Callable[[], tuple[Score, ...]]]:
+    """What computes each control."""
     bare = dataclasses.replace(recipe, patterns={})
     out: dict[str, Callable[[], tuple[Score, ...]]] = {
         "world frame at the UAV": lambda: calibration.flight_left_out(calibration.world_frame(observed), bare),
@@ -381,7 +410,52 @@ def controls_of(observed: Sequence[Observed], recipe: Recipe) -> dict[str, tuple
         out["patterns with fitted mounts only"] = lambda: calibration.flight_left_out(
             observed, calibration.only_terms(recipe, ())
         )
-    return {name: run() for name, run in out.items()}
+    return out
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ScoreOrder:
+    """The splits (``control`` empty) or one control of a calibration, for a worker."""
+
+    path: Path
+    logs_root: Path | None
+    control: str
+    stamp: str
+    """Of this run: a worker that lives on reads the flights anew."""
+
+
+def score_on(
+    workers: Workers, path: Path, logs_root: Path | None, recipe: Recipe
+) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
+    """What :func:`score_all` gives, by workers that read the flights themselves."""
+    stamp = uuid.uuid4().hex
+    names = ["", *_controls((), recipe)]
+    orders = [ScoreOrder(path=path, logs_root=logs_root, control=name, stamp=stamp) for name in names]
+    found: dict[int, dict[str, tuple[Score, ...]]] = {}
+
+    def done(number: int, result: dict[str, tuple[Score, ...]] | Lost) -> None:
+        if isinstance(result, Lost):
+            raise InputError(f"scores of the calibration: {result.message}")
+        found[number] = result
+
+    workers.run(score_part, orders, done)
+    controls = {name: scores for number in range(1, len(names)) for name, scores in found[number].items()}
+    return found[0], controls
+
+
+def score_part(order: ScoreOrder) -> dict[str, tuple[Score, ...]]:
+    """The splits, or one control by its name."""
+    observed, recipe = _prepared(order.path, order.logs_root, order.stamp)
+    if order.control:
+        return {order.control: _controls(observed, recipe)[order.control]()}
+    return splits_of(observed, recipe, Stages())
+
+
+@lru_cache(maxsize=1)
+def _prepared(path: Path, logs_root: Path | None, _stamp: str) -> tuple[list[Observed], Recipe]:
+    settings = load_calibration(path)
+    observed, _ = observe(read_flights(settings, path.parent, logs_root))
+    return observed, recipe_of(settings, observed, logs_root or path.parent)
 
 
 def mount_warnings(learned: Learned) -> list[str]:

@@ -6,48 +6,36 @@ A campaign.yaml names flight files and, optionally, settings: labels with overri
 
 from __future__ import annotations
 
-import sys
-import tempfile
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
-from concurrent.futures import BrokenExecutor, Executor, ProcessPoolExecutor, as_completed
-from contextlib import nullcontext, suppress
-from dataclasses import dataclass
+from contextlib import nullcontext
+from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import lru_cache
-from multiprocessing import get_context
 from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
 from pydantic import Field
 
-from ..common.errors import AerpawCmpError, UsageError
+from ..common.errors import AerpawCmpError, InputError, UsageError
 from ..common.stages import Progress, silent
-from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
-from ..compare import rank, result, rss, statistics
-from ..compare.result import FlightResult, RankResult, RssResult
-from ..flight.data import FlightData, gather, read_logs
+from ..compare.heldout import rmse
 from ..flight.overrides import Overrides, overridden
-from ..flight.settings import FlightFile, RssSettings, Settings, load_flight
-from ..report import campaign_data
-from ..report.campaign_data import (
-    CampaignData,
-    Failure,
-    FlownRank,
-    FlownTrack,
-    RankRow,
-    RssRow,
-)
-from . import over_flights
-from .campaign_fit import fit_all
-from .flight_run import run_flight
-from .outcomes import OutcomeStore, records_of, task_key
+from ..flight.settings import FlightFile, Settings, load_flight
+from ..report.campaign_data import CampaignData, Failure, RssRow
+from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
+from .campaign_plan import compute, kept_outcomes
+from .campaign_tasks import Task, fitted_to, flight_data
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
+from .place import check_place, open_place
+from .workers import Lost, Workers, open_workers
 
 Stage = Callable[[str], Any]
+
+MANY_FLIGHTS = 30
+"""From here on pairs of flights are worth workers of their own, even where every outcome is kept."""
 
 AS_WRITTEN = "as written"
 """Label of the only setting of a campaign that names none."""
@@ -78,6 +66,8 @@ class CampaignFile(Settings):
     calibration: Literal["link", "tower", "channel", "flight", "all"] = "link"
     held_out: HeldOutSettings | None = None
     repeatability: RepeatSettings = RepeatSettings()
+    keep: str | None = None
+    """Where outcomes are kept: a folder, against this file's, or a URL such as ``s3://bucket/season``."""
     export: list[str] = Field(default_factory=list)
     """Formats of the samples: those of ``report.export`` of a flight."""
 
@@ -106,311 +96,7 @@ def load_campaign(path: Path) -> CampaignFile:
     return campaign
 
 
-# --- one flight under one setting ----------------------------------------------------------------------------------
-
-
-@dataclass(frozen=True, slots=True)
-class Task:
-    """One flight file under one setting."""
-
-    path: Path
-    flight: str
-    setting: str
-    overrides: Overrides
-    logs_root: Path | None
-    reference: bool = True
-    """Overlays are drawn for this setting: places and times are kept."""
-
-
-@dataclass(frozen=True, slots=True)
-class Outcome:
-    """Rows of one task, or why there are none."""
-
-    rss: tuple[RssRow, ...] = ()
-    rank: tuple[RankRow, ...] = ()
-    failure: Failure | None = None
-    track: FlownTrack | None = None
-    flown: tuple[FlownRank, ...] = ()
-
-
-@lru_cache(maxsize=2)
-def _logs(path: Path, logs: str, zone: str | None, logs_root: Path | None, settings: _ByText) -> Any:
-    """The logs of a flight: settings after settings reads them once."""
-    del logs, zone  # they make the key
-    return read_logs(settings.value, path.parent, logs_root)
-
-
-@dataclass(frozen=True, slots=True)
-class _ByText:
-    """Carries a value through a cache whose key is made of the other arguments."""
-
-    value: FlightFile
-
-    def __eq__(self, other: object) -> bool:
-        return isinstance(other, _ByText)
-
-    def __hash__(self) -> int:
-        return 0
-
-
-def flight_data(task: Task) -> FlightData:
-    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
-    settings = overridden(load_flight(task.path), task.overrides)
-    text = "\n".join(log.model_dump_json() for log in settings.logs)
-    files = _logs(task.path, text, settings.timezone, task.logs_root, _ByText(settings))
-    return gather(settings, task.path.parent, files, task.logs_root)
-
-
-def run_task(task: Task) -> Outcome:
-    """Replay and compare one flight under one setting; whatever goes wrong becomes a message.
-
-    This runs in worker processes: it takes and gives plain data.
-    """
-    try:
-        found = run_flight(flight_data(task), audit=False)
-    except AerpawCmpError as error:
-        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=str(error)))
-    except Exception as error:  # one flight's fault must not cost the others their numbers
-        text = f"a fault of the program itself: {type(error).__name__}: {error}"
-        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
-    return Outcome(
-        rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
-        rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
-        track=_flown(task, found.result),
-        flown=tuple(
-            FlownRank(
-                flight=task.flight,
-                tower=one.tower,
-                position_m=one.position_m,
-                rank=one.measured,
-                simulated=one.rank,
-                time_s=_elapsed_s(one.time),
-                start_ns=_start_ns(one.time),
-            )
-            for one in found.result.rank
-            if task.reference
-        ),
-    )
-
-
-def _flown(task: Task, result: FlightResult) -> FlownTrack:
-    first = result.rss[0] if result.rss else result.rank[0]
-    return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
-
-
-def _start_ns(time: AnyArray) -> int:
-    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
-
-
-def _elapsed_s(time: AnyArray) -> FloatArray:
-    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
-
-
-def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
-    score, clock = found.score, found.further.clock
-    return RssRow(
-        flight=task.flight,
-        setting=task.setting,
-        tower=found.tower,
-        channel=found.channel,
-        unit=found.unit,
-        offset_db=score.offset_db,
-        rmse_db=score.rmse_db,
-        correlation=score.correlation,
-        n=score.n,
-        n_out_of_coverage=score.n_out_of_coverage,
-        at_search_edge=score.at_edge,
-        rmse_ci95_db=score.rmse_ci95_db,
-        offset_ci95_db=score.intervals.offset_db,
-        correlation_ci95=score.intervals.correlation,
-        n_effective=score.intervals.autocorrelation.n_effective,
-        lag_s=score.lag_s,
-        lag_verdict="" if clock is None else clock.verdict,
-        fitted=score.fitted_on_scored,
-        baselines={name: model.rmse_db for name, model in found.baselines.items()},
-        step_db=rules.step_db,
-        span_db=rules.span_db,
-        measured_db=found.measured_db,
-        simulated_dbm=found.simulated_dbm,
-        time_s=_elapsed_s(found.time) if task.reference else np.zeros(0),
-        start_ns=_start_ns(found.time),
-        position_m=found.position_m if task.reference else np.zeros((0, 3)),
-        distance_m=found.geometry["distance_m"] if task.reference else np.zeros(0),
-        heading_deg=found.geometry.get("heading_deg") if task.reference else None,
-        within=found.further.repeatability,
-    )
-
-
-def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
-    score = found.score
-    return [
-        RankRow(
-            flight=task.flight,
-            setting=task.setting,
-            tower=found.tower,
-            n=score.n,
-            best_k=score.best_k,
-            best_k_ci95=score.curve.best_k_interval,
-            k=k,
-            n_out_of_coverage=fit.out_of_coverage,
-            agreement=fit.agreement,
-            agreement_ci95=fit.agreement_ci95,
-            kappa=fit.kappa,
-            total_variation=fit.total_variation,
-            total_variation_ci95=fit.total_variation_ci95,
-            wasserstein=fit.wasserstein,
-            commonest_agreement=found.further.commonest.agreement,
-        )
-        for k, fit in score.simulated.items()
-    ]
-
-
-def cluster_executor(address: str) -> Executor:
-    """Workers of a running Dask scheduler, which must see the same files under the same paths.
-
-    Raises
-    ------
-    UsageError
-        Without the package ``distributed``, or if no scheduler answers.
-    """
-    try:
-        from distributed import Client
-    except ImportError:
-        raise UsageError(
-            f"--cluster {address!r} needs the package 'distributed'", expected="pip install distributed"
-        ) from None
-    try:
-        executor: Executor = Client(address, timeout="10s").get_executor()
-    except (OSError, ValueError) as error:
-        raise UsageError(f"--cluster {address!r}: no scheduler answers ({error})") from error
-    return executor
-
-
-TRIES = 2
-"""A task in work when a worker is lost is tried again; after so many tries once more, alone; then it is a failure."""
-
-
-def run_tasks(
-    tasks: Sequence[Task], workers: int, cluster: str | None, progress: Progress, keep: Path | None = None
-) -> list[Outcome]:
-    """All tasks in order: here, in a pool of processes, or on a cluster.
-
-    Parameters
-    ----------
-    tasks : sequence of Task
-    workers : int
-        Processes; with one the tasks run here.
-    cluster : str, optional
-        Address of a Dask scheduler, in place of processes.
-    progress : Progress
-        Gets a line per finished task.
-    keep : Path, optional
-        Folder of outcomes: what stands there is taken, what is computed is put there as soon as it is done.
-
-    Returns
-    -------
-    list of Outcome
-        In the order of the tasks; what goes wrong in one is its failure.
-    """
-    store, keys = (None, {}) if keep is None else _kept(tasks, keep)
-    found: dict[int, Outcome] = {}
-    if store is not None:
-        found = {i: outcome for i, key in keys.items() if (outcome := store.load(key)) is not None}
-        for text in store.told:
-            progress(text)
-        if found:
-            progress(f"{len(found)} of {len(tasks)} outcomes are kept from before")
-
-    def done(number: int, outcome: Outcome) -> None:
-        found[number] = outcome
-        if store is not None and outcome.failure is None and number in keys:
-            store.save(keys[number], outcome)
-        progress(f"{tasks[number].flight}: {tasks[number].setting}", len(found) / len(tasks))
-
-    todo = [i for i in range(len(tasks)) if i not in found]
-    if cluster is None and workers <= 1:
-        for i in todo:
-            done(i, run_task(tasks[i]))
-    elif cluster is not None:
-        with cluster_executor(cluster) as pool:
-            _collect(pool, tasks, todo, done)
-    elif todo:
-        _in_processes(tasks, todo, workers, done)
-    return [found[i] for i in range(len(tasks))]
-
-
-def _kept(tasks: Sequence[Task], keep: Path) -> tuple[OutcomeStore, dict[int, str]]:
-    """The store, and the key of every task whose inputs can be read."""
-    keys = {}
-    for number, task in enumerate(tasks):
-        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
-            settings = overridden(load_flight(task.path), task.overrides)
-            more = (task.flight, task.setting, task.reference)
-            keys[number] = task_key(settings, task.path, task.logs_root, *more)
-    return OutcomeStore(
-        keep, records_of(sys.modules[__name__], over_flights, campaign_data, rank, result, rss, statistics)
-    ), keys
-
-
-def _collect(pool: Executor, tasks: Sequence[Task], todo: Sequence[int], done: Callable[[int, Outcome], None]) -> None:
-    """Outcomes of a pool as they come; a lost one is a failure."""
-    futures = {pool.submit(run_task, tasks[i]): i for i in todo}
-    for future in as_completed(futures):
-        error = future.exception()
-        done(futures[future], future.result() if error is None else _lost(tasks[futures[future]], error))
-
-
-def _lost(task: Task, error: BaseException) -> Outcome:
-    text = f"its worker process ended: {error or type(error).__name__}"
-    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=text))
-
-
-def _in_processes(
-    tasks: Sequence[Task], todo: Sequence[int], workers: int, done: Callable[[int, Outcome], None]
-) -> None:
-    """A pool of processes that is made anew when a worker is lost: only what was running is tried again.
-
-    A pool breaks as a whole, and does not say whose process ended. Each task leaves a mark when it begins, so that
-    those in work are known; the others lost nothing. A task that was in work twice when a worker was lost runs a last
-    time alone, so that it does not pay for its neighbour.
-    """
-    tries: Counter[int] = Counter()
-    waiting = list(todo)
-    with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-tasks-") as marks:
-        while waiting:
-            together = [i for i in waiting if tries[i] < TRIES] or waiting[:1]
-            lost = _round(tasks, together, min(workers, len(together)), Path(marks), done)
-            for number, error in lost.items():
-                mark = Path(marks) / str(number)
-                if mark.exists():
-                    mark.unlink()
-                    tries[number] += 1
-                if tries[number] > TRIES:
-                    done(number, _lost(tasks[number], error))
-            waiting = [i for i in waiting if (i in lost and tries[i] <= TRIES) or i not in together]
-
-
-def _round(
-    tasks: Sequence[Task], numbers: Sequence[int], workers: int, marks: Path, done: Callable[[int, Outcome], None]
-) -> dict[int, BaseException]:
-    """One pool, until it is through or breaks; gives the tasks that it did not finish."""
-    lost: dict[int, BaseException] = {}
-    # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-    with ProcessPoolExecutor(max_workers=workers, mp_context=get_context("spawn")) as pool:
-        futures = {pool.submit(_marked, tasks[i], str(marks / str(i))): i for i in numbers}
-        for future in as_completed(futures):
-            number, error = futures[future], future.exception()
-            if isinstance(error, BrokenExecutor):
-                lost[number] = error
-            else:
-                done(number, future.result() if error is None else _lost(tasks[number], error))
-    return lost
-
-
-def _marked(task: Task, mark: str) -> Outcome:
-    """Run a task; its mark stands from its beginning on."""
-    Path(mark).touch()
-    return run_task(task)
+# --- all of it --------------------------------------------------------------------------------------------------------
 
 
 def run(
@@ -419,8 +105,8 @@ def run(
     *,
     logs_root: Path | None = None,
     workers: int = 1,
-    cluster: str | None = None,
-    keep: Path | None = None,
+    scheduler: str | None = None,
+    keep: str | Path | None = None,
     stage: Stage = lambda _name: nullcontext(),
     progress: Progress = silent,
 ) -> CampaignData:
@@ -434,11 +120,11 @@ def run(
     logs_root : Path, optional
         Against which the paths of logs resolve, in place of each flight file's folder.
     workers : int
-        Processes.
-    cluster : str, optional
-        Address of a Dask scheduler, in place of processes here.
-    keep : Path, optional
-        Folder of outcomes, taken and added to.
+        On this machine; 1 computes in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler, in place of workers here.
+    keep : str or Path, optional
+        Folder or URL of outcomes, taken and added to.
     stage, progress : callable
         A context manager per named stage; lines of progress.
 
@@ -447,32 +133,43 @@ def run(
     UsageError
         Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
     """
+    if scheduler is not None:  # workers may stand in another folder
+        folder, logs_root, keep = absolute(folder), absolute(logs_root), absolute(keep)
+    tasks, files, failures = campaign_tasks(campaign, folder, logs_root)
     settings = campaign.settings or {AS_WRITTEN: {}}
-    files, failures = _flight_files(campaign, folder, settings)
-    tasks = [
-        Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
-        for name, (path, _) in files.items()
-        for label, overrides in settings.items()
-    ]
-    _check_names(campaign, files, failures)
+    where = None if keep is None else str(keep)
+    if where is not None:
+        check_place(open_place(where))
     with stage("flights"):
-        outcomes = run_tasks(tasks, workers, cluster, progress, keep) if tasks else []
-    failures += [o.failure for o in outcomes if o.failure is not None]
-    with stage("pool"):
-        rows, pooled = pool_offsets([row for o in outcomes for row in o.rss], campaign.calibration)
-        reference = [row for row in rows if row.setting == next(iter(settings))]
-        found = repeats(reference, campaign.repeatability)
-    folds: list[Any] = []
-    trouble = ""
-    if campaign.held_out is not None:
-        with stage("held-out"):
-            try:
-                folds = _held_out(campaign.held_out, tasks, rows, progress)
-            except AerpawCmpError as error:
-                trouble = str(error)
-    good = [t for t, o in zip(tasks, outcomes, strict=True) if o.failure is None]
-    rank = tuple(row for o in outcomes for row in o.rank)
-    tracks = {o.track.flight: o.track for o in reversed(outcomes) if o.track is not None}
+        outcomes, orders = kept_outcomes(tasks, where, progress)
+    seen = [path for path, _ in files.values()]
+    seen += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
+    seen = [path for path in seen if path.exists()]  # what is missing here, too, is a row of the result
+    much = len(orders) > 1 or campaign.held_out is not None or len(files) > MANY_FLIGHTS
+    with open_workers(
+        workers if much else 1, scheduler if much else None, paths=seen, keep=where, progress=progress
+    ) as crew:
+        with stage("flights"):
+            compute(tasks, orders, crew, progress, outcomes)
+        results = [fitted_to(task, outcomes[number]) for number, task in enumerate(tasks)]
+        failures += [o.failure for o in results if o.failure is not None]
+        with stage("pool"):
+            rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
+            reference = [row for row in rows if row.setting == next(iter(settings))]
+            found = repeats(reference, campaign.repeatability, crew, where if scheduler else None)
+            flown = [f for o in results for f in o.flown]
+            ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
+        folds: list[Any] = []
+        trouble = ""
+        if campaign.held_out is not None:
+            with stage("held-out"):
+                try:
+                    folds = _held_out(campaign.held_out, tasks, rows, crew, progress)
+                except AerpawCmpError as error:
+                    trouble = str(error)
+    good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
+    rank = tuple(row for o in results for row in o.rank)
+    tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
         name=campaign.campaign,
         title=campaign.title or campaign.campaign,
@@ -485,11 +182,11 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
-        flown_ranks=tuple(one for o in outcomes for one in o.flown),
+        flown_ranks=tuple(one for o in results for one in o.flown),
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),
-        rank_repeats=tuple(rank_repeats([f for o in outcomes for f in o.flown], campaign.repeatability.radius_m)),
+        rank_repeats=tuple(ranks_again),
         held_out=tuple(folds),
         held_out_failure=trouble,
         radius_m=campaign.repeatability.radius_m,
@@ -501,21 +198,50 @@ def run(
     )
 
 
+def absolute(path: Any) -> Any:
+    """A path as every process understands it; URLs stay."""
+    if path is None or "://" in str(path):
+        return path
+    return Path(path).expanduser().absolute()
+
+
+def campaign_tasks(
+    campaign: CampaignFile, folder: Path, logs_root: Path | None = None
+) -> tuple[list[Task], dict[str, tuple[Path, FlightFile]], list[Failure]]:
+    """Every setting on every flight, the flight files by name, and those that cannot be read.
+
+    Raises
+    ------
+    UsageError
+        Overrides that no flight file could have, two flights of one name, an unknown flight in ``fit_on``.
+    """
+    settings = campaign.settings or {AS_WRITTEN: {}}
+    files, failures = _flight_files(campaign, folder, settings)
+    _check_names(campaign, files, failures)
+    tasks = [
+        Task(path, name, label, overrides, logs_root, reference=label == next(iter(settings)))
+        for name, (path, _) in files.items()
+        for label, overrides in settings.items()
+    ]
+    return tasks, files, failures
+
+
 def _held_out(
-    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], progress: Progress
+    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], workers: Workers, progress: Progress
 ) -> list[Any]:
     """Fit under one setting on the flights that gave RSS under it."""
     label = settings.setting or tasks[0].setting if tasks else ""
     with_rss = {row.flight for row in rows if row.setting == label}
-    flights = {task.flight: flight_data(task) for task in tasks if task.setting == label and task.flight in with_rss}
+    of = {task.flight: task for task in tasks if task.setting == label and task.flight in with_rss}
     return fit_all(
-        flights,
+        {flight: flight_data(task) for flight, task in of.items()},
         settings.fit,
         settings.fit_on,
         setting=label,
         samples=settings.samples,
         refine=settings.refine,
         progress=progress,
+        spread=spread_over(workers, of, settings),
     )
 
 
@@ -568,3 +294,64 @@ def _check_names(
                 raise UsageError(
                     f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause
                 ) from None
+
+
+def spread_over(workers: Workers, tasks: Mapping[str, Task], settings: HeldOutSettings) -> Spread | None:
+    """Errors of many points and flights, computed by workers; None where there is only this process."""
+    if workers.count <= 1:
+        return None
+
+    def errors(points: Mapping[str, Sequence[Point]]) -> dict[str, list[float]]:
+        pieces = max(1, -(-2 * workers.count // max(len(points), 1)))
+        orders = [
+            PointsOrder(task=tasks[flight], points=tuple(dict(p) for p in some), samples=settings.samples)
+            for flight, wanted in points.items()
+            for some in _parts(wanted, pieces)
+        ]
+        found: dict[int, list[float]] = {}
+
+        def done(number: int, result: list[float] | Lost) -> None:
+            if isinstance(result, Lost):
+                raise InputError(f"held-out fit of {orders[number].task.flight}: {result.message}")
+            found[number] = result
+
+        workers.run(point_errors, orders, done)
+        out: dict[str, list[float]] = {}
+        for number, order in enumerate(orders):
+            out.setdefault(order.task.flight, []).extend(found[number])
+        return out
+
+    return errors
+
+
+def _parts(items: Sequence[Point], count: int) -> list[Sequence[Point]]:
+    size = -(-len(items) // count)
+    return [items[i : i + size] for i in range(0, len(items), size)]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PointsOrder:
+    """Points of the held-out search on one flight, for a worker."""
+
+    task: Task
+    points: tuple[dict[str, float], ...]
+    samples: int
+
+
+def point_errors(order: PointsOrder) -> list[float]:
+    """RMSE [dB] of a flight at some points of the search."""
+    bench = _bench(_Wanted(order.task.path, str(dict(order.task.overrides)), order.samples, order.task))
+    return [rmse(bench.residual_db(point)) for point in order.points]
+
+
+@dataclass(frozen=True, slots=True)
+class _Wanted:
+    path: Path
+    overrides: str
+    samples: int
+    task: Task = field(compare=False)
+
+
+@lru_cache(maxsize=2)
+def _bench(wanted: _Wanted) -> Bench:
+    return bench_of(flight_data(wanted.task)).thinned(wanted.samples)

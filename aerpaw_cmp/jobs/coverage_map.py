@@ -15,8 +15,8 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.stages import Progress, Stages, share_of
+from ..common.errors import InputError, UsageError
+from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import AnyArray, ComplexArray, FloatArray, wavelength_m
 from ..compare.rank import singular_values
 from ..maps import export
@@ -33,6 +33,7 @@ from ..maps.evaluate import (
 from ..maps.grid import Grid
 from ..maps.interpolate import InverseDistance, Nearest, ServingTowerMean
 from ..maps.job import (
+    CHUNK,
     PAPER_KS,
     PAPER_RANK_ALTITUDES_M,
     PAPER_RSS_ALTITUDES_M,
@@ -57,7 +58,9 @@ from ..propagation.scene import Scene
 from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
 from ..site.site import Site
+from ..site.siteyaml import load_site
 from .what_if import p833_note
+from .workers import Lost, Workers
 
 FOLIAGE = ("none", "attenuating", "opaque")
 """Modes of the trees, from no loss to total loss; the paper's is the last."""
@@ -184,6 +187,37 @@ class SiteChannels:
 
         return evaluate
 
+    def spread(self, workers: Workers, site: str, grid: Grid, progress: Progress = silent) -> None:
+        """Let workers evaluate every piece of the grid at every height; they get its number, not its points.
+
+        Parameters
+        ----------
+        workers : Workers
+        site : str
+            As :func:`~aerpaw_cmp.site.siteyaml.load_site` takes it.
+        grid : Grid
+        progress : Progress
+        """
+        s = self.settings
+        heights = sorted({*map(float, s.rss_altitudes_m), *map(float, s.rank_altitudes_m)})
+        orders = [
+            PieceOrder(site=site, settings=s, height_m=height, start=start)
+            for height in heights
+            for start in range(0, len(grid), CHUNK)
+        ]
+
+        def done(number: int, result: PieceDone | Lost) -> None:
+            if isinstance(result, Lost):
+                raise InputError(f"a piece of the map: {result.message}")
+            order = orders[number]
+            chunk = grid.positions_m(order.height_m)[order.start : order.start + CHUNK].tobytes()
+            self._kept |= {(mode, chunk): found for mode, found in result.modes.items()}
+            self.paths += result.paths
+            self.paths_off_crowns += result.paths_off_crowns
+            progress("maps on workers", len(self._kept) / (len(orders) * len(s.foliage)))
+
+        workers.run(map_piece, orders, done)
+
     def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (len(position_m), 3, 3)))
         s = self.settings
@@ -249,6 +283,34 @@ class SiteChannels:
         return np.asarray(h)
 
 
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceOrder:
+    """Some positions of a map, for a worker: from ``start`` on, :data:`~aerpaw_cmp.maps.job.CHUNK` of them."""
+
+    site: str
+    settings: MapSettings
+    height_m: float
+    start: int
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PieceDone:
+    """What a worker gives back: an evaluation per foliage mode, and how many paths there were."""
+
+    modes: Mapping[str, Evaluation]
+    paths: int
+    paths_off_crowns: int
+
+
+def map_piece(order: PieceOrder) -> PieceDone:
+    """Evaluate some positions of a map."""
+    site = load_site(order.site)
+    channels = SiteChannels(site, order.settings)
+    positions = Grid.over_area(site.area_m, order.settings.spacing_m).positions_m(order.height_m)
+    modes = channels._all_modes(positions[order.start : order.start + CHUNK])
+    return PieceDone(modes=modes, paths=channels.paths, paths_off_crowns=channels.paths_off_crowns)
+
+
 def beam_power(h: ComplexArray) -> FloatArray:
     """Received share of the transmit power of channels (..., n_rx, n_tx): equal feed in phase, mean over receivers."""
     amplitude = h.sum(axis=-1) / np.sqrt(h.shape[-1])
@@ -289,13 +351,28 @@ class MapOutcome:
         return sorted(self.maps.items(), key=lambda item: -FOLIAGE.index(item[0]))
 
 
-def make_maps(site: Site, settings: MapSettings, stages: Stages) -> MapOutcome:
-    """Evaluate the grid of a site in every foliage mode."""
+def make_maps(
+    site: Site, settings: MapSettings, stages: Stages, *, workers: Workers | None = None, name: str = ""
+) -> MapOutcome:
+    """Evaluate the grid of a site in every foliage mode.
+
+    Parameters
+    ----------
+    site : Site
+    settings : MapSettings
+    stages : Stages
+    workers : Workers, optional
+        Share the pieces of the grid.
+    name : str
+        The site as workers load it.
+    """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
     channels = SiteChannels(site, settings)
     towers = {name: tower.position_m for name, tower in site.towers.items()}
     with stages("maps"):
+        if workers is not None and workers.count > 1:
+            channels.spread(workers, name, grid, stages.progress)
         for mode in settings.foliage:
             outcome.maps[mode] = map_job(
                 grid, towers, channels.of(mode), rss_altitudes_m=settings.rss_altitudes_m,

@@ -1,4 +1,4 @@
-"""Outcomes of a campaign's tasks, kept on disk by what they depend on: nothing finished is computed twice."""
+"""Outcomes of a campaign's tasks, kept by what they depend on: nothing finished is computed twice."""
 
 from __future__ import annotations
 
@@ -17,24 +17,28 @@ from typing import Any
 
 import numpy as np
 
-from ..common.files import read_sealed, write_sealed
+from ..common.files import seal, unseal
 from ..common.outputs import file_digest
 from ..flight.settings import FlightFile
 from .manifest import other_inputs
+from .place import Place, open_place
 
-LAYOUT = 1
+LAYOUT = 2
 """Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
 
+READERS = "aerpaw_cmp.readers"
+"""Entry points of readers: those of other packages count with their version."""
+
 
 class OutcomeStore:
-    """Results of tasks as ``<sha256>.npz`` in one folder, each sealed by the digest of its content.
+    """Results of tasks by key: ``<key>.npz``, sealed by the digest of its content, and ``<key>.json``, its manifest.
 
     Parameters
     ----------
-    folder : Path
-        Made when the first entry is saved.
+    place : Place or Path
+        A folder or an object store.
     types : iterable of type
         Frozen dataclasses that an entry may hold (:func:`records_of`); nothing else is ever built from a file.
 
@@ -44,38 +48,74 @@ class OutcomeStore:
         Damaged entries that were not used.
     """
 
-    def __init__(self, folder: Path, types: Iterable[type]) -> None:
-        self.folder = folder
+    def __init__(self, place: Place | Path, types: Iterable[type]) -> None:
+        self.place = open_place(place) if isinstance(place, Path) else place
         self._types = {kind.__name__: kind for kind in types}
         self.told: list[str] = []
 
     def load(self, key: str) -> Any | None:
         """The outcome of a key, or None where there is no sound entry."""
-        place = self.folder / f"{key}.npz"
-        try:
-            entry = read_sealed(place, _SEAL)
-        except ValueError:
-            self.told.append(f"a damaged outcome was not used, its task is computed anew: {place}")
-            return None
+        entry = self.place.read(f"{key}.npz")
         if entry is None:
             return None
-        with np.load(io.BytesIO(entry), allow_pickle=False) as arrays:
+        try:
+            content = unseal(entry, _SEAL)
+        except ValueError:
+            self.told.append(f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz")
+            return None
+        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
             return self._decode(json.loads(str(arrays["content"])), arrays)
 
     def _knows(self, value: Any) -> bool:
         """Whether :meth:`load` could give a record back."""
         return self._types.get(type(value).__name__) is type(value)
 
-    def save(self, key: str, outcome: Any) -> None:
-        """Write an entry whole or not at all; a folder that cannot be written costs the entry, not the run."""
+    def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> bool:
+        """Write an entry whole or not at all, then its manifest; False where the place does not take it."""
         arrays: dict[str, Any] = {}
         content = json.dumps(self._encode(outcome, arrays))
         entry = io.BytesIO()
         np.savez_compressed(entry, content=np.array(content), **arrays)
-        write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)
+        sealed = seal(entry.getvalue(), _SEAL)
+        try:
+            self.place.write(f"{key}.npz", sealed)
+            if manifest is not None:
+                whole = {**manifest, "sha256": hashlib.sha256(sealed).hexdigest(), "bytes": len(sealed)}
+                self.place.write(f"{key}.json", (json.dumps(whole, indent=1, default=str) + "\n").encode())
+        except OSError:
+            return False
+        self.place.remove(f"{key}.failed.json")
+        return True
 
-    def __contains__(self, key: str) -> bool:
-        return (self.folder / f"{key}.npz").is_file()
+    def save_failure(self, key: str, manifest: Mapping[str, Any]) -> None:
+        """Remember that a task failed, and how; it is never taken for an outcome."""
+        with contextlib.suppress(OSError):
+            self.place.write(f"{key}.failed.json", (json.dumps(manifest, indent=1, default=str) + "\n").encode())
+
+    def manifests(self, keys: Iterable[str], *, failed: bool = False) -> dict[str, dict[str, Any]]:
+        """What stands beside the outcomes (or failures) of some keys, where it can be read."""
+        end = ".failed.json" if failed else ".json"
+        found = {}
+        for name, content in self.place.read_many(f"{key}{end}" for key in keys).items():
+            with contextlib.suppress(ValueError):
+                found[name.removesuffix(end)] = json.loads(content)
+        return found
+
+    def keys(self) -> tuple[set[str], set[str]]:
+        """Keys that have an outcome, and keys that failed the last time."""
+        names = self.place.names()
+        kept = {name.removesuffix(".npz") for name in names if name.endswith(".npz")}
+        return kept, {name.removesuffix(".failed.json") for name in names if name.endswith(".failed.json")}
+
+    def sound(self, key: str) -> bool:
+        """Whether there is an outcome that :meth:`load` could take."""
+        entry = self.place.read(f"{key}.npz")
+        if entry is None:
+            return False
+        with contextlib.suppress(ValueError):
+            unseal(entry, _SEAL)
+            return True
+        return False
 
     def _encode(self, value: Any, arrays: dict[str, Any]) -> Any:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -118,8 +158,12 @@ def records_of(*modules: ModuleType) -> set[type]:
     }
 
 
-def task_key(settings: FlightFile, flight: Path, logs_root: Path | None, *more: object) -> str:
-    """Digest of what an outcome depends on: checked settings, content of every file, code, and ``more``.
+_WITHOUT_EFFECT: dict[str, Any] = {"flight": True, "report": True, "rt": {"audit_links", "cache"}}
+"""Settings that a campaign's outcome does not depend on: names, the plan of a simulation, pages, the audit, caches."""
+
+
+def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> list[dict[str, str]]:
+    """Role, path and SHA-256 of every file that an outcome depends on, logs last.
 
     Raises
     ------
@@ -128,14 +172,27 @@ def task_key(settings: FlightFile, flight: Path, logs_root: Path | None, *more: 
     UsageError
         If the site cannot.
     """
+    found = [
+        {"role": one.role, "path": one.path, "sha256": one.sha256}
+        for one in other_inputs(settings, flight, logs_root)
+        if one.role != "flight file"  # what it says stands in the settings, overrides included
+    ]
+    for log in settings.logs:
+        path = (logs_root or flight.parent) / log.path
+        found.append({"role": "log", "path": log.path, "sha256": _content(path)})
+    return found
+
+
+def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
+    """Digest of what an outcome depends on: settings that matter, content of every input, code, and ``more``.
+
+    Labels do not: a flight or a setting that gets another name keeps its outcomes.
+    """
     digest = hashlib.sha256()
     digest.update("\n".join([str(LAYOUT), code_digest(), *map(str, more)]).encode())
-    digest.update(settings.model_dump_json().encode())
-    for one in other_inputs(settings, flight, logs_root):
-        if one.role != "flight file":  # what it says stands in the settings, overrides included
-            digest.update(f"{one.role} {one.sha256}\n".encode())
-    for log in settings.logs:
-        digest.update(_content((logs_root or flight.parent) / log.path).encode())
+    digest.update(settings.model_dump_json(exclude=_WITHOUT_EFFECT).encode())
+    for one in inputs:
+        digest.update(f"{one['role']} {one['sha256']}\n".encode())
     return digest.hexdigest()
 
 
@@ -149,16 +206,32 @@ def _digest_of(path: Path, _size: int, _mtime_ns: int) -> str:
     return file_digest(path)
 
 
+_ROOMS_ASIDE = ("cli/", "live/", "maps/", "report/", "__main__.py")
+_BUT = ("report/__init__.py", "report/campaign_data.py", "report/data.py")
+
+
+def shapes_numbers(module: str) -> bool:
+    """Whether a file of the package (path below it, with /) can change a campaign's outcome.
+
+    Pages, the tap, maps and the command line cannot; ``tests/jobs/test_outcomes.py`` holds that no task loads them.
+    """
+    return module in _BUT or not module.startswith(_ROOMS_ASIDE)
+
+
 @cache
 def code_digest() -> str:
-    """Digest of this package's source and of the versions of what it computes with."""
+    """Digest of the source that a task runs and of the versions of what it computes with."""
     digest = hashlib.sha256()
     for name in ("aerpaw_cmp", "aerpaw_parsers"):
         with contextlib.suppress(ImportError):
             root = Path(str(import_module(name).__file__)).parent
             for path in sorted(root.rglob("*.py")):
-                digest.update(path.read_bytes())
+                module = path.relative_to(root).as_posix()
+                if name != "aerpaw_cmp" or shapes_numbers(module):
+                    digest.update(module.encode() + b"\0" + path.read_bytes())
     for name in ("numpy", "scipy", "sionna-rt"):
         with contextlib.suppress(metadata.PackageNotFoundError):
             digest.update(f"{name} {metadata.version(name)}".encode())
+    for plugin in sorted({str(p.dist and (p.dist.name, p.dist.version)) for p in metadata.entry_points(group=READERS)}):
+        digest.update(plugin.encode())
     return digest.hexdigest()

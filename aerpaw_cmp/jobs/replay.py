@@ -89,7 +89,7 @@ def replay_rss(
         link = data.rss[members[0]].link.build([tower], data.folder)
         tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
         poses = [_poses(track, rt.attitude) for track in tracks]
-        joined = Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
+        joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
         whole = replay_poses(data.site, rt, link, joined, progress=progress)
@@ -106,6 +106,10 @@ def replay_rss(
             )
             start = stop
     return [out[i] for i in range(len(data.rss))]
+
+
+def _joined_poses(poses: Sequence[Poses]) -> Poses:
+    return Poses(np.concatenate([p.position_m for p in poses]), np.concatenate([p.rotation for p in poses]))
 
 
 def telemetry_time(time: Times, clock: Clock | None) -> Times:
@@ -273,6 +277,8 @@ def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:
     """The replay of poses ``start`` to ``stop``."""
+    if (start, stop) == (0, len(whole.rss_dbm)):
+        return whole
     paths = whole.paths
     chosen = (paths.pose >= start) & (paths.pose < stop)
     share = (stop - start) / max(len(whole.rss_dbm), 1)
@@ -312,7 +318,12 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
 
 def _track_poses(track: Track | None, time: Any) -> TrackPoses:
     assert track is not None
-    return track.pose_at(time)
+    if len(time) <= BLOCK:
+        return track.pose_at(time)
+    parts = [track.pose_at(part) for part in _in_blocks(time)]
+    return TrackPoses(
+        **{one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in dataclasses.fields(TrackPoses)}
+    )
 
 
 def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
@@ -326,8 +337,10 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def _poses(track: TrackPoses, attitude: str) -> Poses:
-    rotation = np.ascontiguousarray(attitude_rotation(track, attitude)[track.valid])
-    return Poses(track.position_m[track.valid], rotation)
+    rotation = attitude_rotation(track, attitude)
+    if track.valid.all():  # the very arrays of the track: a long flight has one copy of them
+        return Poses(track.position_m, np.ascontiguousarray(rotation))
+    return Poses(track.position_m[track.valid], np.ascontiguousarray(rotation[track.valid]))
 
 
 def replay_poses(
@@ -348,6 +361,16 @@ def replay_poses(
         Share done; of the sionna engine alone.
     """
     engine = engine or rt.engine
+    crowns = reflecting_crowns(site.trees, rt)
+    # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
+    if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
+        parts = []
+        for rows in _in_blocks(np.arange(len(poses))):
+            progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
+            some = Poses(poses.position_m[rows], poses.rotation[rows])
+            parts.append(replay_poses(site, rt, link, some, engine=engine))
+        progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
+        return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
     return replay(
         site,
@@ -358,13 +381,38 @@ def replay_poses(
         samples=rt.samples,
         batch=rt.batch,
         loss=path_loss(site.trees, rt, link.carrier_hz),
-        crowns=reflecting_crowns(site.trees, rt),
+        crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
+    )
+
+
+def _joined_replays(parts: list[Replay]) -> Replay:
+    """One replay of parts that follow each other; the parts are taken apart, so that memory holds them once."""
+    first, starts = parts[0], np.cumsum([0, *(len(p.rss_dbm) for p in parts)])
+    arrays: dict[str, Any] = {}
+    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
+        arrays[name] = np.concatenate([getattr(p, name) for p in parts])
+    differ = [p.pairs_differ for p in parts if p.pairs_differ is not None]
+    seconds, search = sum(p.seconds for p in parts), sum(p.search_seconds for p in parts)
+    left_out = list(dict.fromkeys(text for p in parts for text in p.left_out))
+    sets = [dataclasses.replace(p.paths, pose=p.paths.pose + s) for p, s in zip(parts, starts, strict=False)]
+    parts.clear()
+    columns: dict[str, Any] = {}
+    for field in dataclasses.fields(PathSet):
+        columns[field.name] = np.concatenate([getattr(s, field.name) for s in sets])
+    return dataclasses.replace(
+        first,
+        **arrays,
+        pairs_differ=np.concatenate(differ) if differ else None,
+        paths=PathSet(**columns),
+        seconds=seconds,
+        search_seconds=search,
+        left_out=left_out,
     )
 
 

@@ -628,7 +628,8 @@ class MapsOutcome:
 
 def run_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None,
-    logs_root: Path | None = None, force: bool = False, progress: Progress = silent, **options: Any,
+    logs_root: Path | None = None, workers: int = 1, scheduler: str | None = None, force: bool = False,
+    progress: Progress = silent, **options: Any,
 ) -> MapsOutcome:  # fmt: skip
     """Coverage and rank maps of a site, their correlation and interpolation, as a page and as files.
 
@@ -642,6 +643,8 @@ def run_map(
         A coarse map; what ``options`` state still counts.
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
+    workers, scheduler
+        Who evaluates the pieces of the grid: workers of this machine, or of a Dask scheduler.
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
     """
@@ -650,6 +653,7 @@ def run_map(
     from ..site.siteyaml import load_site
     from . import coverage_map as mapping
     from .paper_table import paper_markdown, paper_rows
+    from .workers import open_workers
 
     settings = _map_settings(quick, options)
     place = load_site(site)
@@ -658,7 +662,9 @@ def run_map(
     inputs = [Path(site), *([] if flight is None else [flight])]
     stages = Stages(progress)
     with OutputFolder(folder, job="map", inputs=inputs, force=force) as output:
-        outcome = mapping.make_maps(place, settings, stages)
+        file = [Path(site).absolute()] if Path(site).is_file() else []
+        with open_workers(workers, scheduler, paths=file, progress=progress) as crew:
+            outcome = mapping.make_maps(place, settings, stages, workers=crew, name=str(file[0] if file else site))
         if settings.study:
             if flight is not None:
                 outcome.trajectory_m, outcome.trajectory_name = _flown_line(flight, logs_root)
@@ -745,8 +751,9 @@ def run_campaign(
     out: Path | None = None,
     logs_root: Path | None = None,
     workers: int = 1,
-    cluster: str | None = None,
-    keep: Path | None = None,
+    scheduler: str | None = None,
+    keep: str | None = None,
+    fresh: bool = False,
     force: bool = False,
     export: Sequence[str] = (),
     progress: Progress = silent,
@@ -762,11 +769,14 @@ def run_campaign(
     logs_root : Path, optional
         Folder against which logs resolve.
     workers : int
-        Processes.
-    cluster : str, optional
-        Address of a Dask scheduler, in place of processes.
-    keep : Path, optional
-        Folder of the outcomes of single tasks: a rerun, or one after an interruption, computes only what is missing.
+        On this machine.
+    scheduler : str, optional
+        Address of a Dask scheduler, in place of workers here.
+    keep : str, optional
+        Folder or URL of the outcomes of single tasks, in place of what campaign.yaml says: a rerun, or one after an
+        interruption, computes only what is missing.
+    fresh : bool
+        Keep nothing and take nothing.
     force : bool
         Write into a folder that holds files of others.
     export : sequence of str
@@ -785,6 +795,7 @@ def run_campaign(
     from ..report.exports.write import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
+    from .season import find_reports, with_season
 
     stages = Stages(progress)
     campaign = load_campaign(path)
@@ -800,20 +811,55 @@ def run_campaign(
             path.parent,
             logs_root=logs_root,
             workers=workers,
-            cluster=cluster,
-            keep=keep,
+            scheduler=scheduler,
+            keep=None if fresh else campaign_keep(campaign, path, keep),
             stage=stages,
             progress=progress,
         )
+        data = with_season(data, find_reports(data.flights, folder, [folder.parent, Path("reports")]))
         with stages("report"), output.filling() as place:
             finished = replace(data, stages_s=dict(stages.seconds))
             write_campaign(finished, place, exports=formats, progress=progress)
+            write_tracebacks(data.failures, place)
     edges = [text for text in warnings(data) if "edge of the searched span" in text]
     failed = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
     if data.held_out_failure:
         failed.append(f"held-out fit: {data.held_out_failure}")
     metrics = campaign_metrics(replace(data, stages_s=dict(stages.seconds)))
     return CampaignOutcome(folder, metrics, tuple(failed + edges), not (data.rss or data.rank))
+
+
+def campaign_keep(campaign: Any, path: Path, keep: str | None = None) -> str:
+    """Where outcomes are kept: as asked, else as campaign.yaml says, else in the user's cache."""
+    if keep is not None:
+        return keep
+    if campaign.keep is None:
+        return str(outcomes_folder())
+    return str(campaign.keep) if "://" in campaign.keep else str(path.parent / campaign.keep)
+
+
+def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
+    """A file per failed task in ``failures/``: its message, and where in the program it came from."""
+    from ..report.names import safe_name
+
+    for one in failures:
+        if one.traceback:
+            target = folder / "failures" / f"{safe_name(one.flight)}__{safe_name(one.setting)}.txt"
+            target.parent.mkdir(exist_ok=True)
+            target.write_text(f"{one.flight}, {one.setting}: {one.message}\n\n{one.traceback}", encoding="utf-8")
+
+
+def campaign_status(
+    path: Path, *, logs_root: Path | None = None, keep: str | None = None, fresh: bool = False, workers: int = 1
+) -> Any:
+    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`)."""
+    from . import campaign_plan
+    from .campaign import campaign_tasks, load_campaign
+
+    campaign = load_campaign(path)
+    tasks, _, failures = campaign_tasks(campaign, path.parent, logs_root)
+    where = None if fresh else campaign_keep(campaign, path, keep)
+    return campaign_plan.campaign_status(campaign.campaign, tasks, failures, where, workers=workers)
 
 
 @dataclass(frozen=True, slots=True)
@@ -830,6 +876,8 @@ def run_calibrate(
     *,
     out: Path | None = None,
     logs_root: Path | None = None,
+    workers: int = 1,
+    scheduler: str | None = None,
     force: bool = False,
     progress: Progress = silent,
 ) -> CalibrateOutcome:
@@ -843,6 +891,8 @@ def run_calibrate(
         The file to write; the folder lies beside it.
     logs_root : Path, optional
         Where the paths of logs and antennas resolve.
+    workers, scheduler
+        Who computes the scores: workers of this machine, or of a Dask scheduler.
     force : bool
         Replace also what this tool did not write; never an input.
     progress : Progress
@@ -857,6 +907,8 @@ def run_calibrate(
     from ..report.calibration_html import calibration_metrics
     from .calibrate import calibrate, load_calibration
     from .calibration_files import MARK, write_files
+    from .campaign import absolute
+    from .workers import open_workers
 
     settings = load_calibration(path)
     target = out or Path(f"{settings.calibration}.calibrated.yaml")
@@ -880,7 +932,9 @@ def run_calibrate(
                 (place / "metrics.json").write_text(json.dumps(metrics, indent=2) + "\n", encoding="utf-8")
                 (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
         else:
-            found = calibrate(path, logs_root=logs_root, stages=stages)
+            path, logs_root = (path, logs_root) if scheduler is None else (absolute(path), absolute(logs_root))
+            with open_workers(workers, scheduler, paths=[path], progress=progress) as crew:
+                found = calibrate(path, logs_root=logs_root, stages=stages, workers=crew)
             if ranked is not None:
                 found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
             with output.filling() as place:

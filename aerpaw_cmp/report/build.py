@@ -81,6 +81,7 @@ def report_data(
         pairs=tuple(pair_panel(one) for one in result.pairs),
         extra_metrics=metrics_beyond_panels(result),
         engine=result.engine,
+        serving=result.serving,
         ladder=result.ladder,
         speed=tuple(speed),
         synthetic=settings.flight.synthetic,
@@ -98,7 +99,7 @@ def _serving_note(result: FlightResult) -> list[str]:
     hits, most = 100 * result.serving.hit_share, 100 * result.serving.majority_share
     return [
         f"Serving cell: the one predicted strongest served in {hits:.0f} % of {result.serving.n} samples; "
-        f"always naming the most frequent one hits {most:.0f} % (confusion matrix: metrics.json, serving)."
+        f"always naming the most frequent one hits {most:.0f} %."
     ]
 
 

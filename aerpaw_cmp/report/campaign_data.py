@@ -20,10 +20,11 @@ class RssRow:
     """RSS of one flight, setting, tower and channel.
 
     ``offset_db`` and ``rmse_db`` come from this row's own samples; ``pooled_offset_db`` is shared as the campaign's
-    ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row. ``baselines`` are RMSE [dB] by name, each with
-    an offset of its own; ``span_db`` and ``step_db`` are those of the offset search; ``within`` is the repeatability of
-    the flight's two halves. Arrays (n,) are at the samples, NaN where a side is missing; times, places, distances and
-    headings are kept for the first setting only, and empty elsewhere.
+    ``calibration`` says, ``pooled_rmse_db`` what it leaves on this row; ``held_out_offset_db`` comes from the other
+    flights of the same setting, tower and channel, ``held_out_rmse_db`` is what that leaves here (NaN without another).
+    ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` and ``step_db`` are those of the
+    offset search; ``within`` is the repeatability of the flight's two halves. Arrays (n,) are at the samples, NaN where
+    a side is missing; times, places, distances and headings are kept for the first setting only, and empty elsewhere.
     """
 
     flight: str
@@ -58,6 +59,8 @@ class RssRow:
     within: Mapping[str, Repeated] = field(default_factory=dict)
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
+    held_out_offset_db: float = float("nan")
+    held_out_rmse_db: float = float("nan")
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -139,11 +142,12 @@ class RankPairing:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Failure:
-    """A flight (and setting) that gave no numbers, and why."""
+    """A flight (and setting) that gave no numbers, and why; ``traceback`` for whoever mends it, never on the page."""
 
     flight: str
     setting: str
     message: str
+    traceback: str = field(repr=False, default="")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -276,6 +280,106 @@ class FlownTrack:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class SettingRank:
+    """One setting against the one of least mean error, over flights.
+
+    Parameters
+    ----------
+    setting : str
+    link : str
+        Tower and channel that it is about; empty: all.
+    n_flights : int
+        Flights with an error under this setting.
+    mean_db : float
+        Mean over flights of the mean error over towers and channels [dB]: held out where there is another flight.
+    quantiles_db : tuple of float
+        0, 10, 25, 50, 75, 90 and 100 % of the flights.
+    difference_db, difference_ci95_db : float, Interval or None
+        Mean over flights of this minus the first setting, on the links that both scored; None for the first itself.
+    n_paired : int
+        Flights in that difference.
+    verdict : str
+        "first", "worse", "no difference shown" or "none given".
+    """
+
+    setting: str
+    link: str
+    n_flights: int
+    mean_db: float
+    quantiles_db: tuple[float, ...]
+    difference_db: float
+    difference_ci95_db: Interval | None
+    n_paired: int
+    verdict: str
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Drift:
+    """Own offset of one setting, tower and channel over the dates of the flights.
+
+    ``spread_db`` is the standard deviation of the offsets, ``scatter_db`` that about the line; NaN where there are
+    fewer than three dated flights.
+    """
+
+    setting: str
+    tower: str
+    channel: str
+    n: int
+    slope_db_per_30_days: float
+    slope_ci95_db: Interval
+    scatter_db: float
+    spread_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class PlaceMap:
+    """Mean residual of cells of the plan over flights, each (cells,); tower and channel empty: all together.
+
+    ``east_m``, ``north_m`` are the middles; ``mean_db`` is the mean over flights of the mean residual of each in the
+    cell, ``spread_db`` their standard deviation (NaN for one), ``n`` their number.
+    """
+
+    tower: str
+    channel: str
+    east_m: FloatArray
+    north_m: FloatArray
+    mean_db: FloatArray
+    spread_db: FloatArray
+    n: IntArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Season:
+    """What the flights say together.
+
+    Parameters
+    ----------
+    held_out : bool
+        Whether the errors are held out; with one flight they are its own.
+    started : mapping of str to str
+        First instant of a flight, UTC, ISO 8601; none for logs with relative times.
+    ranking : tuple of SettingRank
+        Over all links, best first, then for each link where there are several.
+    drift : tuple of Drift
+    places : tuple of PlaceMap
+        Of the first setting.
+    reports : mapping of str to str
+        Address of a flight's report, against the campaign's folder.
+    """
+
+    held_out: bool = False
+    started: Mapping[str, str] = field(default_factory=dict)
+    ranking: tuple[SettingRank, ...] = ()
+    drift: tuple[Drift, ...] = ()
+    places: tuple[PlaceMap, ...] = ()
+    reports: Mapping[str, str] = field(default_factory=dict)
+
+    def over_all(self) -> tuple[SettingRank, ...]:
+        """The ranking over all towers and channels."""
+        return tuple(entry for entry in self.ranking if not entry.link)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class CampaignData:
     """Everything the page shows. ``settings`` are overrides by label; ``flights`` the names in order."""
 
@@ -304,6 +408,7 @@ class CampaignData:
     synthetic: tuple[str, ...] = ()
     stages_s: Mapping[str, float] = field(default_factory=dict)
     workers: int = 1
+    season: Season = Season()
 
     @property
     def reference(self) -> str:

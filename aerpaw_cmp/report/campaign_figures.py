@@ -37,6 +37,15 @@ FEWEST_PER_BIN = 8
 
 MAPS_PER_ROW = 3
 
+MOST_BARS = 200
+"""Flights, links and settings together that a figure with a line for each still shows; the season's figures stand for
+more."""
+
+MOST_SETTINGS = 40
+
+MOST_FLIGHTS = 12
+"""Flights that are told apart by colour, or have a map each."""
+
 TALLEST = 40.0
 """No figure is higher than this [inch], however many flights there are."""
 
@@ -133,8 +142,119 @@ def tracks(data: CampaignData, site: Site, numbers: dict[str, int]) -> Figure:
     height.set_xlabel("Time after the first radio sample of each flight [s]")
     height.set_ylabel("Height above ground [m]")
     handles, labels = plan.get_legend_handles_labels()
-    fig.legend(handles, labels, loc="outside lower center", ncols=4)
+    if len(firsts) <= MOST_FLIGHTS:
+        fig.legend(handles, labels, loc="outside lower center", ncols=4)
     return fig
+
+
+def season_errors(data: CampaignData) -> Figure:
+    """Errors of the flights under every setting: 10 to 90 %, 25 to 75 %, median and mean, best setting on top."""
+    ranking = data.season.over_all()[:MOST_SETTINGS]
+    fig = figure((9.2, 1.2 + 0.27 * len(ranking)))
+    ax = fig.subplots()
+    for y, entry in enumerate(ranking):
+        q = entry.quantiles_db
+        ax.plot([q[1], q[5]], [y, y], color="#555555", linewidth=1.2, label="10 to 90 %" if not y else None)
+        ax.plot([q[2], q[4]], [y, y], color="#56B4E9", linewidth=7, alpha=0.8, label="25 to 75 %" if not y else None)
+        ax.plot(q[3], y, marker="|", markersize=11, color="black", linestyle="none", label="median" if not y else None)
+        ax.plot(entry.mean_db, y, marker="o", markersize=4, color="#D55E00", label="mean" if not y else None,
+                linestyle="none")  # fmt: skip
+    ax.set_yticks(range(len(ranking)), [entry.setting for entry in ranking])
+    ax.invert_yaxis()
+    ax.grid(visible=False, axis="y")
+    held = "Held-out error" if data.season.held_out else "Error with the flight's own offset"
+    ax.set_xlabel(f"{held} of a flight, mean over towers and channels [dB]")
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=4)
+    return fig
+
+
+def season_drift(data: CampaignData) -> Figure:
+    """Own offset of every flight over its date, the first setting, a colour and marker per tower and channel."""
+    fig = figure((9.2, 3.6))
+    ax = fig.subplots()
+    dated = len(data.season.started) >= len(data.flights) / 2 and len(data.season.started) > 1
+    numbers = {name: number for number, name in enumerate(data.flights)}
+    for number, (link, rows) in enumerate(grouped(data.reference_rows, lambda r: r.link).items()):
+        good = [r for r in rows if np.isfinite(r.offset_db) and (not dated or r.flight in data.season.started)]
+        at = [np.datetime64(data.season.started[r.flight][:-1]) if dated else numbers[r.flight] + 1 for r in good]
+        ax.plot(
+            np.array(at), [r.offset_db for r in good], linestyle="none", marker=MARKERS[number % len(MARKERS)],
+            markersize=3.5, color=COLOURS[number % len(COLOURS)], alpha=0.7, label=link,
+        )  # fmt: skip
+    ax.set_xlabel("Start of the flight (UTC)" if dated else "Number of the flight in the campaign")
+    ax.set_ylabel("Offset [dB]")
+    ax.tick_params(axis="x", labelsize=8, rotation=20 if dated else 0)
+    fig.legend(*ax.get_legend_handles_labels(), loc="outside lower center", ncols=5)
+    return fig
+
+
+def season_places(data: CampaignData) -> Figure:
+    """Mean residual of each cell of the plan over flights, all towers and channels."""
+    found = (
+        data.season.places[0] if len(data.season.places) == 1 else next(p for p in data.season.places if not p.tower)
+    )
+    first = np.array([found.east_m.min(), found.north_m.min()])
+    column = np.rint((found.east_m - first[0]) / data.cell_m).astype(int)
+    row = np.rint((found.north_m - first[1]) / data.cell_m).astype(int)
+    image = np.full((row.max() + 1, column.max() + 1), np.nan)
+    image[row, column] = found.mean_db
+    west, south = first - data.cell_m / 2
+    reach = max(float(np.percentile(np.abs(found.mean_db), 98)), 0.1)
+    fig = figure((7.0, 5.0))
+    ax = fig.subplots()
+    ax.set_facecolor("#F4F4F4")
+    extent = (west, west + image.shape[1] * data.cell_m, south, south + image.shape[0] * data.cell_m)
+    mesh = ax.imshow(
+        image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="none", zorder=2
+    )
+    east, north = found.east_m, found.north_m
+    for tower in () if data.site is None else dict.fromkeys(r.tower for r in data.reference_rows):
+        at = data.site.towers.get(tower) if data.site is not None else None
+        if at is not None:
+            ax.plot(at.east_m, at.north_m, marker="^", markersize=9, color="#C1121F", markeredgecolor="white", zorder=5)
+            east, north = np.append(east, at.east_m), np.append(north, at.north_m)
+    plan_axes(ax)
+    frame_around(ax, east, north)
+    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(found.mean_db, -reach, reach))
+    return fig
+
+
+def season_plates(data: CampaignData) -> list[Plate]:
+    """What stands on the page where no script runs, and in print."""
+    if not data.season.over_all():
+        return []
+    found = [
+        Plate(
+            name="season_errors",
+            section="season",
+            title="Error of the flights under every setting",
+            caption="Best setting on top"
+            + (f", {MOST_SETTINGS} of {len(data.settings)}." if len(data.settings) > MOST_SETTINGS else "."),
+            alt="Distribution of the error over flights for each setting",
+            draw=lambda: season_errors(data),
+        ),
+        Plate(
+            name="season_drift",
+            section="season",
+            title="Offsets over the season",
+            caption=f"Each flight's own offset under “{data.reference}”, by tower and channel.",
+            alt="Offset of every flight over its date",
+            draw=lambda: season_drift(data),
+        ),
+    ]
+    if any(len(p.n) for p in data.season.places):
+        found.append(
+            Plate(
+                name="season_places",
+                section="season",
+                title="Where the simulation errs, over all flights",
+                caption=f"Mean over flights of the mean residual in cells of {data.cell_m:g} m, “{data.reference}”, "
+                "all towers and channels.",
+                alt="Map of the mean residual over all flights",
+                draw=lambda: season_places(data),
+            )
+        )
+    return found
 
 
 def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
@@ -288,8 +408,8 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
 def plates(data: CampaignData) -> list[Plate]:
     """Every figure that the campaign has numbers for."""
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    found: list[Plate] = []
-    if data.rss:
+    found: list[Plate] = season_plates(data)
+    if data.rss and len(data.rss) <= MOST_BARS:
         found.append(
             Plate(
                 name="settings_rmse",
@@ -302,7 +422,7 @@ def plates(data: CampaignData) -> list[Plate]:
                 draw=lambda: settings_rmse(data),
             )
         )
-    if data.rank:
+    if data.rank and len(data.rank) <= MOST_BARS:
         found.append(
             Plate(
                 name="rank_tv",
@@ -328,14 +448,14 @@ def plates(data: CampaignData) -> list[Plate]:
         )
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
         found += _link_plates(data, link, rows, numbers)
-    for number, fold in enumerate(data.held_out):
+    for number, fold in enumerate(data.held_out[:MOST_FLIGHTS]):
         found.append(_fold_plate(fold, number, numbers))
     return found
 
 
 def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[Plate]:
     scored = [row for row in rows if row.n > 0]
-    if not scored:
+    if not scored or len(scored) > MOST_FLIGHTS:
         return []
     return [
         Plate(

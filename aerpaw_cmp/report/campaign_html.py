@@ -10,18 +10,36 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+from markupsafe import Markup
 
 from ..common.jsonable import json_safe
 from ..common.stages import Progress, silent
 from ..compare.result import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankRow, RssRow
+from .campaign_explorer import payload
 from .canvas import Picture
+from .explorer import as_json
 from .export import write_file
 from .exports.samples import of_campaign
 from .exports.write import write_exports
-from .html import by_section, environment, policy
+from .html import by_section, environment, policy, script
 from .names import k_key
+
+FEW, MANY = 8, 200
+"""Warnings that stand open, and that stand on the page at all."""
+
+FEW_SETTINGS = 4
+"""Settings that a sentence names."""
+
+FEW_FLIGHTS = 20
+"""Flights of a table that has a column or a heading for each."""
+
+ROWS_SHOWN, FOLD_ROWS = 300, 60
+"""Rows of a table on the page; the files beside it hold all."""
+
+COMPACT_ROWS = 2000
+"""From so many rows on campaign.json is written without indentation."""
 
 FEW_PAIRS = 0.25
 """Below this share of samples with a pair, a repeatability floor is that of a few places."""
@@ -42,13 +60,15 @@ def rss_flights(data: CampaignData) -> list[str]:
 
 def mean_rmse(data: CampaignData) -> dict[str, dict[str, float]]:
     """Mean RMSE over the links of each setting and flight [dB]; NaN where there is none."""
-    table: dict[str, dict[str, float]] = {}
-    for setting in data.settings:
-        table[setting] = {}
-        for flight in rss_flights(data):
-            values = [r.rmse_db for r in data.rss if r.setting == setting and r.flight == flight]
-            known = [v for v in values if np.isfinite(v)]
-            table[setting][flight] = float(np.mean(known)) if known else float("nan")
+    known: dict[tuple[str, str], list[float]] = {}
+    for row in data.rss:
+        if np.isfinite(row.rmse_db):
+            known.setdefault((row.setting, row.flight), []).append(row.rmse_db)
+    flights, nan = rss_flights(data), float("nan")
+    table = {
+        setting: {name: float(np.mean(known[setting, name])) if (setting, name) in known else nan for name in flights}
+        for setting in data.settings
+    }
     return table
 
 
@@ -65,7 +85,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         ],
         "settings": data.settings,
         "reference": data.reference,
-        "failures": _entries(data.failures),
+        "failures": _entries(data.failures, ("traceback",)),
         "mean_rmse_db": mean_rmse(data),
         "rss": _entries(data.rss, ARRAYS),
         "rank": _entries(data.rank),
@@ -83,6 +103,13 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "folds": [
                 {**_entries([fold], ("rows", "curves"))[0], "scores": _entries(fold.rows)} for fold in data.held_out
             ],
+        },
+        "season": {
+            "held_out": data.season.held_out,
+            "started": data.season.started,
+            "ranking": _entries(data.season.ranking),
+            "drift": _entries(data.season.drift),
+            "places": [{"tower": p.tower, "channel": p.channel, "cells": len(p.n)} for p in data.season.places],
         },
         "workers": data.workers,
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
@@ -105,7 +132,8 @@ def campaign_frame(data: CampaignData) -> pd.DataFrame:
 CSV_COLUMNS = [
     "kind", "flight", "setting", "tower", "channel", "k", "offset_db", "offset_low_db", "offset_high_db", "rmse_db",
     "rmse_low_db", "rmse_high_db", "free_space_rmse_db", "two_ray_rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
-    "n_out_of_coverage", "correlation", "correlation_low", "correlation_high", "at_search_edge", "lag_s", "lag_verdict",
+    "n_out_of_coverage", "held_out_offset_db", "held_out_rmse_db", "correlation", "correlation_low", "correlation_high",
+    "at_search_edge", "lag_s", "lag_verdict",
     "fitted", "total_variation", "total_variation_low", "total_variation_high", "agreement", "agreement_low",
     "agreement_high", "kappa", "wasserstein", "best_k", "message",
 ]  # fmt: skip
@@ -118,8 +146,9 @@ def _bounds(name: str, value: tuple[float, float] | None, end: str = "") -> dict
 
 def _rss_line(row: RssRow) -> dict[str, Any]:
     names = (
-        "flight", "setting", "tower", "channel", "offset_db", "rmse_db", "pooled_offset_db", "pooled_rmse_db", "n",
-        "n_out_of_coverage", "correlation", "at_search_edge", "lag_s", "lag_verdict",
+        "flight", "setting", "tower", "channel", "offset_db", "rmse_db", "pooled_offset_db", "pooled_rmse_db",
+        "held_out_offset_db", "held_out_rmse_db", "n", "n_out_of_coverage", "correlation", "at_search_edge", "lag_s",
+        "lag_verdict",
     )  # fmt: skip
     return {
         "kind": "rss",
@@ -177,11 +206,13 @@ def headline(data: CampaignData) -> list[str]:
     if means:
         best = min(means, key=lambda s: float(means[s].mean()))
         spread = np.ptp([v.mean() for v in means.values()])
+        shown = means if len(means) <= FEW_SETTINGS else {best: means[best], data.reference: means.get(data.reference)}
         out.append(
-            "Mean RMSE over flights and links: "
-            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in means.items())
+            ("Mean RMSE over flights and links" + ("" if shown is means else f", {len(means)} settings") + ": ")
+            + "; ".join(f"{s}: {v.mean():.2f} dB" for s, v in shown.items() if v is not None)
             + (f". Least: {best}." if spread > 0.005 else ".")
         )
+    out += _ranked_words(data)
     for setting in data.settings:
         moved = [t for t in data.rank_transfers if t.setting == setting]
         if moved:
@@ -211,9 +242,27 @@ def headline(data: CampaignData) -> list[str]:
     return out
 
 
+def _ranked_words(data: CampaignData) -> list[str]:
+    """What the ranking by held-out error shows, and what it does not."""
+    ranking = data.season.over_all()
+    if len(ranking) < 2 or not data.season.held_out:
+        return []
+    like = [entry.setting for entry in ranking[1:] if entry.verdict != "worse"]
+    named = ", ".join(like[:FEW_SETTINGS]) + (
+        f" and {len(like) - FEW_SETTINGS} more" if len(like) > FEW_SETTINGS else ""
+    )
+    return [
+        f"With the offset of the other flights, {ranking[0].setting} errs least ({ranking[0].mean_db:.2f} dB over "
+        f"{ranking[0].n_flights} flights); "
+        + (f"not shown to be worse: {named}." if like else "every other setting is shown to be worse.")
+    ]
+
+
 def warnings(data: CampaignData) -> list[str]:
     """What must be known before the numbers are believed."""
-    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures]
+    out = [f"{f.flight} ({f.setting}): {f.message}" for f in data.failures[:FEW]]
+    if len(data.failures) > FEW:
+        out = [f"{len(data.failures)} flights or settings gave no numbers: they stand under Failures."]
     if data.held_out_failure:
         out.append(f"Held-out fit: {data.held_out_failure}")
     for fold in data.held_out:
@@ -243,9 +292,23 @@ def warnings(data: CampaignData) -> list[str]:
     return list(dict.fromkeys(out))
 
 
+def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
+    """Flights under the first-ranked setting, largest error first: name, mean error over links [dB], worst link."""
+    order = data.season.over_all()
+    by: dict[str, list[tuple[float, str]]] = {}
+    for row in data.rss if order else ():
+        error = row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
+        if row.setting == order[0].setting and np.isfinite(error):
+            by.setdefault(row.flight, []).append((error, row.link))
+    found = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
+    return sorted(found, key=lambda entry: -entry[1])
+
+
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
     template = environment().get_template("campaign.html.jinja")
+    linked = payload(data)
+    code = script("common.js", "campaign_explorer.js") if linked else ""
     text: str = template.render(
         data=data,
         sections=by_section(pictures),
@@ -258,9 +321,32 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         rss_flights=rss_flights(data),
         pretty=canvas.pretty,
         files=files,
-        content_policy=policy(),
+        season=data.season.over_all(),
+        worst=worst_flights(data),
+        worst_rows=sorted(data.rss, key=lambda r: -np.nan_to_num(r.rmse_db, nan=-1.0))[:ROWS_SHOWN]
+        if len(data.rss) > ROWS_SHOWN
+        else data.rss,
+        few=FEW,
+        many=MANY,
+        few_flights=FEW_FLIGHTS,
+        rows_shown=ROWS_SHOWN,
+        fold_rows=FOLD_ROWS,
+        explorer=Markup(as_json(linked)) if linked else "",
+        script=Markup(code),
+        content_policy=policy(code),
     )
     return text
+
+
+def write_parquet(table: pd.DataFrame, path: Path, progress: Progress = silent) -> list[Path]:
+    """The table as Parquet; nothing but a line of progress where pyarrow is not installed."""
+    try:
+        import pyarrow  # noqa: F401
+    except ImportError:
+        progress("campaign.parquet was not written: it needs pyarrow (pip install 'aerpaw-cmp[geo]')")
+        return []
+    # a column of numbers without any text is one of numbers, whatever else its rows are about
+    return [write_file(path, table.to_parquet(index=False, engine="pyarrow"))]
 
 
 def write_campaign(
@@ -281,14 +367,20 @@ def write_campaign(
         Figures done.
     """
     folder = Path(folder)
-    numbers = json.dumps(campaign_metrics(data), indent=2, ensure_ascii=False, allow_nan=False) + "\n"
-    table = campaign_frame(data).to_csv(index=False, lineterminator="\n")
-    written = [write_file(folder / "campaign.json", numbers), write_file(folder / "campaign.csv", table)]
+    indent = 2 if len(data.rss) + len(data.rank) < COMPACT_ROWS else None
+    numbers = json.dumps(campaign_metrics(data), indent=indent, ensure_ascii=False, allow_nan=False) + "\n"
+    table = campaign_frame(data)
+    written = [
+        write_file(folder / "campaign.json", numbers),
+        write_file(folder / "campaign.csv", table.to_csv(index=False, lineterminator="\n")),
+        *write_parquet(table, folder / "campaign.parquet", progress),
+    ]
+    tables = [path.name for path in written]
     drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
     written += pictures
     samples = of_campaign(data) if exports else None
     exported = [] if samples is None else write_exports(samples, folder, exports, progress)
-    files = ["campaign.json", "campaign.csv", *(path.relative_to(folder).as_posix() for path in exported)]
+    files = [*tables, *(path.relative_to(folder).as_posix() for path in exported)]
     written += exported
     page = write_file(folder / "campaign.html", campaign_page(data, drawn, files))
     return [page, *written]

@@ -11,6 +11,7 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,7 @@ from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
+from .drawing import in_order
 from .export import write_file
 
 if TYPE_CHECKING:
@@ -45,6 +47,7 @@ RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 RANK_HATCH = {1: "", 2: "///", 3: "xx", 4: ".."}
 
 POINTS_PER_LINE = 3000
+POINTS_PER_CLOUD = 30_000
 RASTER_DPI = 130
 WIDE = (9.2, 4.2)
 
@@ -202,7 +205,7 @@ def write_plates(
     kind: str = "screen",
     progress: Progress = silent,
 ) -> tuple[list[Picture], list[Path]]:
-    """Draw plates one after the other and write each in its formats; gives the pictures and the files.
+    """Draw plates and write each in its formats; gives the pictures and the files.
 
     Parameters
     ----------
@@ -216,10 +219,13 @@ def write_plates(
     progress : Progress
         Share of the figures that are drawn.
     """
-    drawn, written = [], []
-    for number, plate in enumerate(plates):
-        progress("figures", number / len(plates))
-        picture = render(plate, formats, kind)
+    drawn: list[Picture] = []
+    written: list[Path] = []
+    if plates:
+        import matplotlib.backends.backend_agg
+        import matplotlib.figure  # noqa: F401  once, before further processes are made
+    for picture in in_order([partial(render, plate, formats, kind) for plate in plates]):
+        progress("figures", len(drawn) / len(plates))
         drawn.append(picture)
         written += [write_file(folder / f"{picture.name}.{name}", content) for name, content in picture.formats.items()]
     if plates:
@@ -318,6 +324,37 @@ def spread_out(count: int, most: int) -> AnyArray:
     return np.linspace(0, count - 1, min(count, most)).round().astype(np.int64) if count else np.zeros(0, np.int64)
 
 
+def cloud(values: FloatArray, limit: int = POINTS_PER_CLOUD) -> AnyArray:
+    """Rows of a cloud of points that are drawn: all up to ``limit``; of more, evenly spread ones and every extreme.
+
+    Parameters
+    ----------
+    values : (n,)
+        The ordinate, in the order of the abscissa; NaN is no extreme.
+    limit : int
+        Points wanted.
+
+    Examples
+    --------
+    >>> values = np.sin(np.arange(1e5) / 9e3)
+    >>> values[31_415] = 7.0
+    >>> rows = cloud(values, 2000)
+    >>> 2000 <= len(rows) < 3100, bool(values[rows].max() == 7.0), len(cloud(values[:50]))
+    (True, True, 50)
+    """
+    n = len(values)
+    if n <= limit:
+        return np.arange(n)
+    per = -(-n // 600)  # about two pixels of a figure
+    padded = np.full(-(-n // per) * per, np.nan)
+    padded[:n] = values
+    table = padded.reshape(-1, per)
+    base = np.arange(len(table)) * per
+    ends = [np.where(np.isnan(table), fill, table) for fill in (np.inf, -np.inf)]
+    extremes = np.concatenate([base + ends[0].argmin(axis=1), base + ends[1].argmax(axis=1)])
+    return np.unique(np.concatenate([spread_out(n, limit), np.minimum(extremes, n - 1)]))
+
+
 def runs(mask: BoolArray) -> list[tuple[int, int]]:
     """Stretches of True as (first, last) indices, both inside.
 
@@ -367,7 +404,7 @@ def draw_out_of_coverage(
     if not mask.any():
         return
     step = float(np.median(np.diff(seconds))) if len(seconds) > 1 else 1.0
-    spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in runs(mask)]
+    spans = [(seconds[a] - step / 2, seconds[b] - seconds[a] + step) for a, b in _apart(runs(mask), seconds)]
     bars = ax.broken_barh(
         spans, (0.0, height), transform=ax.get_xaxis_transform(), facecolor="#EEEEEE", edgecolor="#888888",
         hatch=hatch, linewidth=0.0, label=label, zorder=0.5 if height == 1.0 else 4.0,
@@ -380,6 +417,24 @@ def draw_out_of_coverage(
                 left + width / 2, 0.93, "Z", transform=ax.get_xaxis_transform(), ha="center", va="center", zorder=6,
                 fontweight="bold", bbox={"facecolor": "white", "edgecolor": "none", "pad": 1.0},
             )  # fmt: skip
+
+
+_SPANS = 2000
+"""More spans than this are joined where no eye could part them."""
+
+
+def _apart(spans: list[tuple[int, int]], seconds: FloatArray) -> list[tuple[int, int]]:
+    """Spans with those joined that are nearer than a pixel, where there are very many."""
+    if len(spans) <= _SPANS:
+        return spans
+    least = float(seconds[-1] - seconds[0]) / _SPANS
+    joined = [spans[0]]
+    for first, last in spans[1:]:
+        if seconds[first] - seconds[joined[-1][1]] < least:
+            joined[-1] = (joined[-1][0], last)
+        else:
+            joined.append((first, last))
+    return joined
 
 
 def draw_waypoints(ax: Axes, data: ReportData, start: np.datetime64, *, names: bool = True) -> None:

@@ -17,6 +17,7 @@ import numpy as np
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.ladder import LadderRow
 from ..compare.result import AuditResult, EngineResult
+from ..compare.serving import ServingComparison
 from ..compare.statistics import PairedDifference
 from ..logs.records import RejectedLine
 from ..site.site import Site
@@ -449,6 +450,8 @@ class ReportData:
         The checked flight.yaml, nested mappings of plain values.
     stages_s : mapping of str to float
         Seconds per named stage.
+    serving : ServingComparison, optional
+        Cells that served against cells predicted strongest, where a log tells which cell served.
     extra_metrics : mapping
         Merged into ``metrics.json`` last, key by key.
     audit_command : str
@@ -476,4 +479,5 @@ class ReportData:
     stages_s: Mapping[str, float] = field(default_factory=dict)
     extra_metrics: Mapping[str, Any] = field(default_factory=dict)
     paths: tuple[PosePaths, ...] = ()
+    serving: ServingComparison | None = None
     audit_command: str = ""

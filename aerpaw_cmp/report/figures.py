@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .canvas import Plate
+from .canvas import POINTS_PER_CLOUD, Plate, count
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track
 from .names import safe_name
 from .rank_figures import agreement_curve, confusion, rank_histograms, rank_maps, rank_over_time
@@ -23,6 +23,7 @@ from .rss_figures import (
     seen_from_antennas,
     trajectory,
 )
+from .serving_figures import serving_plate
 from .speed_figures import pareto, rank_changes
 
 if TYPE_CHECKING:
@@ -57,6 +58,8 @@ def plates(data: ReportData) -> list[Plate]:
                 page=True,
             )
         )
+    if data.serving is not None and data.serving.n:
+        result.append(serving_plate(data.serving))
     for rank in data.rank:
         if len(rank.time):
             result += _rank_plates(data, rank)
@@ -152,7 +155,12 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
                 if panel.simulated_out_of_coverage.any()
                 else ""
             )
-            + "Bottom: residual; dashed lines are plus and minus one RMSE.",
+            + "Bottom: residual; dashed lines are plus and minus one RMSE."
+            + (
+                f" Of {count(len(panel.time))} samples {count(POINTS_PER_CLOUD)} are drawn, and every extreme."
+                if len(panel.time) > POINTS_PER_CLOUD
+                else ""
+            ),
             alt=f"RSS of {panel.name} over time, measured against simulated; RMSE {panel.rmse_db:.1f} dB over "
             f"{panel.n} samples.",
             draw=lambda: rss_over_time(data, panel),

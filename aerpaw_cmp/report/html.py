@@ -102,6 +102,17 @@ def clock(instant: Any, start: Any) -> str:
     return number(float((instant - start) / np.timedelta64(1, "s")))
 
 
+def more(rows: Sequence[Any], limit: int) -> str:
+    """Words for a caption where a table does not show all rows.
+
+    Examples
+    --------
+    >>> more([1, 2, 3], 2), more([1, 2], 2)
+    (' (the first 2 of 3; the files beside this page hold all)', '')
+    """
+    return f" (the first {limit} of {len(rows)}; the files beside this page hold all)" if len(rows) > limit else ""
+
+
 def short(value: Any) -> str:
     """A value as text; numbers to 6 digits, which metrics.json holds in full; an en dash where there is none."""
     if value is None:
@@ -146,7 +157,7 @@ def environment() -> Any:
     )
     environment.filters.update(
         num=number, interval=interval, percent=percent, duration=duration, data_uri=data_uri, k=k_key,
-        flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri,
+        flat=lambda s: list(flat(s)), clock=clock, picture_uri=picture_uri, more=more,
     )  # fmt: skip
     return environment
 
@@ -189,7 +200,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     """
     template = environment().get_template("report.html.jinja")
     linked = bool(data.rss or data.rank)
-    code = script("uplot.min.js", "explorer.js") if linked else ""
+    code = script("uplot.min.js", "common.js", "explorer.js") if linked else ""
     sections = by_section(pictures)
     text: str = template.render(
         data=data,

@@ -11,11 +11,13 @@ from ..common.units import FloatArray
 from ..compare.ladder import LadderRow
 from .canvas import (
     MEASURED,
+    POINTS_PER_CLOUD,
     SIMULATED,
     TOWER,
     WAYPOINT,
     baseline_style,
     beyond,
+    cloud,
     colour_bar,
     count,
     draw_out_of_coverage,
@@ -30,6 +32,7 @@ from .canvas import (
     robust_limits,
     seconds_since,
     signed,
+    spread_out,
     start_of,
     thinned,
     thinned_plan,
@@ -50,8 +53,9 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
     residual = panel.residual_db
     if panel.east_m is not None and panel.north_m is not None:
         draw_site(plan, data.site, towers=[panel.tower])
+        few = cloud(residual)
         points = plan.scatter(
-            panel.east_m, panel.north_m, c=residual, cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
+            panel.east_m[few], panel.north_m[few], c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
             rasterized=True, zorder=5,
         )  # fmt: skip
         tower = data.site.towers.get(panel.tower)
@@ -60,14 +64,16 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
         colour_bar(fig, points, plan, "Residual [dB]", "both")
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
+    calibrated = panel.calibrated_db
+    few = cloud(calibrated)
     right.plot(
-        seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
         label="measured, calibrated",
     )  # fmt: skip
     right.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing")
     right.set_xlabel(time_label(start))
     right.set_ylabel("RSS [dBm]")
-    robust_limits(right, [panel.calibrated_db, panel.simulated_dbm])
+    robust_limits(right, [calibrated, panel.simulated_dbm])
     fig.legend(*right.get_legend_handles_labels(), loc="outside lower right", ncols=2)
     return fig
 
@@ -137,8 +143,10 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     draw_out_of_coverage(
         ax, seconds, panel.measured_out_of_coverage, "no signal in the measurement", height=0.05, hatch="xxxxx"
     )
+    calibrated, residual = panel.calibrated_db, panel.residual_db
+    few = cloud(calibrated)
     ax.plot(
-        seconds, panel.calibrated_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
+        seconds[few], calibrated[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
         label=f"measured {signed(panel.offset_db)} dB ({count(panel.n)} scored)", zorder=3.5,
     )  # fmt: skip
     for number, baseline in enumerate(panel.baselines):
@@ -154,11 +162,12 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
     alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
     ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
     draw_waypoints(ax, data, start)
-    robust_limits(ax, [panel.calibrated_db, panel.simulated_dbm])
+    robust_limits(ax, [calibrated, panel.simulated_dbm])
     ax.set_ylabel("RSS [dBm]")
     ax.legend(loc="upper center", bbox_to_anchor=(0.5, -0.03), ncols=3, markerscale=3)
+    few = cloud(residual)
     below.plot(
-        seconds, panel.residual_db, linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
+        seconds[few], residual[few], linestyle="none", marker=".", markersize=2, color="#0072B2", rasterized=True,
         label="measured − simulated",
     )  # fmt: skip
     below.axhline(0.0, color=SIMULATED, linewidth=0.8)
@@ -169,7 +178,7 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
                 label=f"RMSE {panel.rmse_db:.1f} dB" if sign == 1 else None,
             )  # fmt: skip
     draw_waypoints(below, data, start, names=False)
-    robust_limits(below, [panel.residual_db], around=0.0)
+    robust_limits(below, [residual], around=0.0)
     below.set_ylabel("Residual [dB]")
     below.set_xlabel(time_label(start))
     handles, labels = only(below, ("measured − simulated", f"RMSE {panel.rmse_db:.1f} dB"))
@@ -193,8 +202,9 @@ def rss_diagnostics(panel: RssPanel) -> Figure:
 
 def scatter_levels(ax: Axes, panel: RssPanel) -> None:
     """Calibrated measurement against simulation, with the line of equality."""
+    few = cloud(panel.residual_db)
     ax.plot(
-        panel.simulated_dbm, panel.calibrated_db, linestyle="none", marker=".", markersize=2, alpha=0.5,
+        panel.simulated_dbm[few], panel.calibrated_db[few], linestyle="none", marker=".", markersize=2, alpha=0.5,
         color="#0072B2", rasterized=True, label=f"sample ({count(panel.n)})",
     )  # fmt: skip
     both = np.isfinite(panel.simulated_dbm) & np.isfinite(panel.calibrated_db)
@@ -311,8 +321,10 @@ def residual_cloud(ax: Axes, quantity: FloatArray, panel: RssPanel) -> None:
     )
     for label, chosen, colour, marker in groups:
         if chosen.any():
+            rows = np.flatnonzero(chosen)
+            rows = rows[cloud(residual[rows])]
             ax.plot(
-                quantity[chosen], residual[chosen], linestyle="none", marker=marker, markersize=2, alpha=0.5,
+                quantity[rows], residual[rows], linestyle="none", marker=marker, markersize=2, alpha=0.5,
                 color=colour, rasterized=True, label=f"{label} ({count(int(chosen.sum()))})",
             )  # fmt: skip
     ax.axhline(0.0, color=SIMULATED, linewidth=0.8)
@@ -370,12 +382,16 @@ def seen_from_antennas(panel: RssPanel) -> Figure:
     for ax, (words, azimuth, elevation) in zip(axes, views, strict=True):
         good = np.isfinite(residual) & np.isfinite(azimuth) & np.isfinite(elevation)
         if (~good).any():
+            rest = np.flatnonzero(~good)
+            rest = rest[spread_out(len(rest), POINTS_PER_CLOUD)]
             ax.plot(
-                azimuth[~good], elevation[~good], linestyle="none", marker="x", markersize=3, color="#888888",
+                azimuth[rest], elevation[rest], linestyle="none", marker="x", markersize=3, color="#888888",
                 rasterized=True, label=f"not scored ({count(int((~good).sum()))})",
             )  # fmt: skip
+        rows = np.flatnonzero(good)
+        rows = rows[cloud(residual[rows])]
         points = ax.scatter(
-            azimuth[good], elevation[good], c=residual[good], s=6, cmap="cividis", vmin=-reach, vmax=reach,
+            azimuth[rows], elevation[rows], c=residual[rows], s=6, cmap="cividis", vmin=-reach, vmax=reach,
             linewidths=0, rasterized=True, label=f"sample ({count(int(good.sum()))}; colour: residual)",
         )  # fmt: skip
         ax.axvline(0.0, color=SIMULATED, linewidth=0.8, linestyle=(0, (4, 2)), label="boresight")
@@ -395,9 +411,10 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
     seconds = seconds_since(pair.time, start)
     fig = figure((9.2, 3.2))
     ax = fig.subplots()
+    few = cloud(pair.difference_db)
     ax.plot(
-        seconds, pair.difference_db, linestyle="none", marker=".", markersize=2.5, color=MEASURED, rasterized=True,
-        label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
+        seconds[few], pair.difference_db[few], linestyle="none", marker=".", markersize=2.5, color=MEASURED,
+        rasterized=True, label=f"measured ({count(int(np.isfinite(pair.difference_db).sum()))})", zorder=3,
     )  # fmt: skip
     levels = [pair.difference_db]
     if pair.simulated_difference_db is not None:

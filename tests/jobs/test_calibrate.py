@@ -11,9 +11,10 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.compare.calibration import mean_rmse
-from aerpaw_cmp.jobs.calibrate import calibrate
+from aerpaw_cmp.jobs.calibrate import calibrate, load_calibration, observe, read_flights, recipe_of, score_on
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+from tests.jobs.sent_by_pickle import SentByPickle
 
 ROUTES = {
     "first": [(-60, 10, 30), (-250, 60, 30), (-100, 260, 40), (160, 160, 40), (200, -150, 30), (-180, -160, 30)],
@@ -170,3 +171,16 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
     assert mean_rmse(scores) < 3.75
     assert mean_rmse(scores, "rmse_4s_db") < 3.0
     assert mean_rmse(scores, "free_space_rmse_db") == pytest.approx(6.37, abs=0.05)
+
+
+def test_workers_score_to_the_same_digit(folder: Path, metrics: dict) -> None:
+    """They read the flights themselves; splits and controls are those of one process, in its order."""
+    path = folder / "calibration.yaml"
+    observed, _ = observe(read_flights(load_calibration(path), folder, None))
+    crew = SentByPickle()
+    scores, controls = score_on(crew, path, None, recipe_of(load_calibration(path), observed, folder))
+    assert max(crew.sizes) < 2000
+    for found, expected in ((scores, metrics["scores"]), (controls, metrics["controls"])):
+        assert list(found) == list(expected)
+        for name, rows in found.items():
+            assert [row.rmse_db for row in rows] == [row["rmse_db"] for row in expected[name]]

@@ -7,6 +7,7 @@ import json
 import os
 import shutil
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +17,13 @@ import yaml
 
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.stages import silent
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_fit
-from aerpaw_cmp.jobs.campaign import load_campaign, run
+from aerpaw_cmp.jobs.campaign import PointsOrder, _held_out, campaign_tasks, load_campaign, point_errors, run
 from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, transfer_ranks
+from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 
 YAW_DEG = 110.0
@@ -194,6 +197,12 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
     with (folder / "whole_out" / "campaign.csv").open(encoding="utf-8", newline="") as handle:
         rows = list(csv.DictReader(handle))
     assert [r["kind"] for r in rows].count("rss") == 8
+    ranking = [entry for entry in whole["season"]["ranking"] if not entry["link"]]
+    best = ranking[0]["setting"]
+    errors = [float(r["held_out_rmse_db"]) for r in rows if r["kind"] == "rss" and r["setting"] == best]
+    assert sum(errors) / len(errors) == pytest.approx(ranking[0]["mean_db"])
+    assert best == "right azimuth"
+    assert set(whole["season"]["started"]) == {"first", "second"}
     failed = [r for r in rows if r["kind"] == "failed"]
     assert {(r["flight"], r["setting"]) for r in failed} == {
         ("broken", "as written"),
@@ -202,7 +211,7 @@ def test_broken_flights_are_rows_with_their_message(whole: dict[str, Any], folde
     }
     page = (folder / "whole_out" / "campaign.html").read_text(encoding="utf-8")
     assert "gone/&lt;b&gt;USRP1.txt" in page
-    assert "<script" not in page
+    assert page.count("<script") == 2  # its data and its own script
     assert page.rstrip().endswith("</html>")
 
 
@@ -210,7 +219,7 @@ def test_every_figure_is_there_and_old_ones_are_not(whole: dict[str, Any], folde
     figures = folder / "whole_out" / "figures"
     expected = {
         "settings_rmse", "tracks", "distance_LW1_USRP1", "distance_LW1_USRP2", "places_LW1_USRP1", "places_LW1_USRP2",
-        "held_out_1",
+        "held_out_1", "season_errors", "season_drift", "season_places",
     }  # fmt: skip
     assert {p.stem for p in figures.glob("*.svg")} == {p.stem for p in figures.glob("*.png")} == expected
     shutil.copytree(folder / "whole_out", folder / "again_out")
@@ -355,8 +364,9 @@ def test_a_cluster_needs_distributed(
 ) -> None:
     monkeypatch.setitem(sys.modules, "distributed", None)
     path = write_campaign(folder, "cluster")
-    assert main(["campaign", str(path), "-o", str(folder / "c"), "--cluster", "tcp://127.0.0.1:1"]) == 2
-    assert "pip install distributed" in capsys.readouterr().err
+    for option in ("--cluster", "--scheduler"):
+        assert main(["campaign", str(path), "-o", str(folder / "c"), "--fresh", option, "tcp://127.0.0.1:1"]) == 2
+        assert "pip install 'aerpaw-cmp[cluster]'" in capsys.readouterr().err
 
 
 def test_a_channel_of_its_own_starts_as_a_copy(folder: Path) -> None:
@@ -570,3 +580,70 @@ def test_two_real_rank_flights_choose_one_k_when_slanted(tmp_path: Path) -> None
     assert {t["k"] for (setting, _), t in transferred.items() if setting == "slanted"} == {10}
     for (setting, _), t in transferred.items():
         assert (t["total_variation"] < 0.11) == (setting == "slanted")
+
+
+def test_status_dry_run_and_resume_say_what_is_kept(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    settings = {"as written": {"rss.bootstrap": 11}, "level": {"rss.bootstrap": 12}}
+    path = write_campaign(folder, "kept", flights=["first.yaml", "second.yaml"], settings=settings, keep="outcomes")
+    campaign = load_campaign(path)
+    run(
+        load_campaign(write_campaign(folder, "part", flights=["first.yaml"], settings=settings)),
+        folder,
+        keep=folder / "outcomes",
+    )
+    capsys.readouterr()
+    assert main(["campaign", "status", str(path), "--json", "--workers", "2"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert (found["tasks"], found["kept"], found["failed"], found["to_do"]) == (4, 2, 0, 2)
+    assert {one["flight"] for one in found["to_do_tasks"]} == {"second"}
+    assert found["estimate_s"] > 0
+    assert main(["campaign", "--dry-run", str(path)]) == 0
+    text = capsys.readouterr().out
+    assert "4 tasks, 2 kept" in text
+    assert "2 to do, about" in text
+    run(campaign, folder, keep=folder / "outcomes")
+    assert main(["campaign", "status", str(path), "-h"]) == 0
+    assert main(["campaign", "status", str(path)]) == 0
+    assert "0 to do, nothing to compute" in capsys.readouterr().out
+    assert main(["campaign", "statsu", str(path)]) == 2
+    assert "campaign status" in capsys.readouterr().err
+
+
+def test_a_failed_task_leaves_its_traceback_in_a_file(folder: Path) -> None:
+    broken = flight_settings("first", 1, 0.0)
+    broken["flight"] = {"name": "broken2"}
+    broken["logs"][1]["path"] = "gone.txt"
+    (folder / "broken2.yaml").write_text(yaml.safe_dump(broken), encoding="utf-8")
+    found = result(folder, "traced", flights=["broken2.yaml"], code=3)
+    assert "traceback" not in found["failures"][0]
+    text = (folder / "traced_out" / "failures" / "broken2__as_written.txt").read_text(encoding="utf-8")
+    assert "there is no such log" in text
+    assert "Traceback (most recent call last)" in text
+
+
+def test_workers_search_the_held_out_fit_to_the_same_digit(folder: Path) -> None:
+    """Two processes compute the errors of all combinations; parameters, scores and curves are those of one."""
+    path = write_campaign(folder, "spread", held_out={"fit": {YAW: [0, 60, 110, 160]}, "samples": 60})
+    campaign = load_campaign(path)
+    tasks, _, _ = campaign_tasks(campaign, folder)
+    assert campaign.held_out is not None
+
+    class Two(Here):
+        count = 2
+
+    asked: list[int] = []
+
+    def counted(order: PointsOrder) -> list[float]:
+        asked.append(len(order.points))
+        return point_errors(order)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("aerpaw_cmp.jobs.campaign.point_errors", counted)
+        alone, shared = (_held_out(campaign.held_out, tasks, rows(folder), crew, silent) for crew in (Here(), Two()))
+    assert sum(asked) == 8
+    assert repr(alone) == repr(shared)
+
+
+def rows(folder: Path) -> list[RssRow]:
+    """Just enough for the search to know which flights have RSS."""
+    return [replace(row(name, "USRP1", [1.0, 2.0], [0.0, 0.0]), setting="as written") for name in OFFSETS_DB]

@@ -26,6 +26,7 @@ from aerpaw_cmp.propagation.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
+from tests.jobs.sent_by_pickle import SentByPickle
 
 CARRIER_HZ = 3.4e9
 
@@ -363,3 +364,21 @@ def test_the_notes_say_where_p833_is_continued():
     assert "Trees at 3.4 GHz: an extrapolation of ITU-R P.833" in notes(foliage=("opaque", "attenuating"))
     assert "extrapolation" not in notes(foliage=("opaque", "none"))
     assert "extrapolation" not in notes(foliage=("attenuating",), carrier_hz=1.8e9)
+
+
+def test_workers_evaluate_the_pieces_to_the_same_digit(monkeypatch) -> None:
+    from aerpaw_cmp.common.stages import Stages
+    from aerpaw_cmp.site.siteyaml import load_site
+
+    monkeypatch.setattr(mapping, "CHUNK", 16)
+    monkeypatch.setattr("aerpaw_cmp.maps.job.CHUNK", 16)
+    monkeypatch.setattr(mapping.map_job, "__kwdefaults__", {**mapping.map_job.__kwdefaults__, "chunk": 16})
+    some, crew = settings(spacing_m=300.0, rank_altitudes_m=(30.0,), foliage=("none", "opaque")), SentByPickle()
+    alone = mapping.make_maps(load_site("lake_wheeler"), some, Stages())
+    shared = mapping.make_maps(load_site("lake_wheeler"), some, Stages(), workers=crew, name="lake_wheeler")
+    assert len(crew.sizes) > 1
+    assert max(crew.sizes) < 3000
+    assert (shared.paths, shared.paths_off_crowns) == (alone.paths, alone.paths_off_crowns)
+    for mode in some.foliage:
+        assert np.array_equal(shared.maps[mode].rss_siso_dbm, alone.maps[mode].rss_siso_dbm, equal_nan=True)
+        assert np.array_equal(shared.maps[mode].rank, alone.maps[mode].rank)

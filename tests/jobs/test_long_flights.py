@@ -48,3 +48,22 @@ def test_a_part_of_the_flight_turns_as_the_whole_does(one_tower: FlightData) -> 
         part = track.pose_at(instants[few])
         np.testing.assert_allclose(part.rotation, whole.rotation[few], atol=1e-13)
         np.testing.assert_array_equal(part.attitude_known, whole.attitude_known[few])
+
+
+def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Levels, channel matrices, paths and their order; flights beyond a block are replayed a block at a time."""
+    settings = one_tower.settings
+    off = settings.model_copy(update={"rss": settings.rss.model_copy(update={"lag": "off"})})
+    data = dataclasses.replace(one_tower, settings=off)
+    whole = replay_job.replay_rss(data)
+    monkeypatch.setattr(replay_job, "BLOCK", 77)
+    asked: list[float] = []
+    parts = replay_job.replay_rss(data, lambda _text, share=None, /: asked.append(share))
+    assert len([s for s in asked if s is not None]) > 5
+    for one, two in zip(whole, parts, strict=True):
+        np.testing.assert_array_equal(two.replay.rss_dbm, one.replay.rss_dbm)
+        np.testing.assert_array_equal(two.replay.h, one.replay.h)
+        assert len(two.replay.paths) == len(one.replay.paths)
+        for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
+            np.testing.assert_array_equal(getattr(two.replay.paths, name), getattr(one.replay.paths, name))
+        assert two.replay.left_out == one.replay.left_out

@@ -1,8 +1,11 @@
-"""Outcomes of tasks: kept, taken again, never taken when damaged or stale; a lost worker costs its own task only."""
+"""Outcomes of tasks: kept, taken again under any name, never taken when damaged or stale; tried twice, then told."""
 
 from __future__ import annotations
 
+import json
+import multiprocessing
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -12,12 +15,15 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.flight.overrides import overridden
-from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs import campaign, sample
-from aerpaw_cmp.jobs.outcomes import OutcomeStore, task_key
-from aerpaw_cmp.report.campaign_data import Failure, FlownTrack
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
+from aerpaw_cmp.jobs import campaign_tasks, sample
+from aerpaw_cmp.jobs.campaign_plan import campaign_status, run_tasks
+from aerpaw_cmp.jobs.campaign_tasks import Done, Order, Outcome, Task, carry_out, outcome_store, task_facts
+from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, task_key
+from aerpaw_cmp.jobs.workers import Here, Processes
+from aerpaw_cmp.report.campaign_data import Failure, FlownTrack, RankRow, RssRow
 
-TYPES = (campaign.Outcome, campaign.RssRow, campaign.RankRow, FlownTrack)
+TYPES = (Outcome, RssRow, RankRow, FlownTrack)
 
 
 @pytest.fixture(scope="module")
@@ -25,13 +31,11 @@ def flight(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return sample.write_sample(tmp_path_factory.mktemp("season") / "flight")
 
 
-def track(number: float) -> campaign.Outcome:
-    return campaign.Outcome(
-        track=FlownTrack(flight=f"f{number:g}", time_s=np.arange(3.0), position_m=np.full((3, 3), number))
-    )
+def track(number: float) -> Outcome:
+    return Outcome(track=FlownTrack(flight=f"f{number:g}", time_s=np.arange(3.0), position_m=np.full((3, 3), number)))
 
 
-def equal(one: campaign.Outcome, two: campaign.Outcome) -> bool:
+def equal(one: Outcome, two: Outcome) -> bool:
     assert one.track is not None
     assert two.track is not None
     return one.track.flight == two.track.flight and np.array_equal(one.track.position_m, two.track.position_m)
@@ -58,67 +62,143 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     assert "damaged" in store.told[0]
 
 
+def key_of(settings: FlightFile, flight: Path) -> str:
+    return task_key(settings, task_inputs(settings, flight, None))
+
+
 def test_every_record_of_a_real_outcome_can_be_kept(flight: Path, tmp_path: Path) -> None:
     """One task of the sample flight, through the store and back: the same numbers, the same nested records."""
-    quick = {"rss.lag": "off", "rss.bootstrap": 10, "rank.bootstrap": 10}
-    settings = load_flight(flight)
-    known = {
-        key: value for key, value in quick.items() if hasattr(getattr(settings, key.split(".")[0]), key.split(".")[1])
-    }
-    task = campaign.Task(flight, "f", "as written", known, None)
-    (first,) = campaign.run_tasks([task], 1, None, lambda *_: None, tmp_path)
+    task = Task(flight, "f", "as written", {"rss.lag": "off", "rss.bootstrap": 10, "rank.bootstrap": 10}, None)
+    (first,) = run_tasks([task], Here(), keep=str(tmp_path))
     assert first.failure is None
-    store, keys = campaign._kept([task], tmp_path)
-    again = store.load(keys[0])
+    key = task_facts(task).key
+    again = outcome_store(str(tmp_path)).load(key)
     assert repr(again.rank) == repr(first.rank)
     assert [row.rmse_db for row in again.rss] == [row.rmse_db for row in first.rss]
     assert np.array_equal(again.rss[0].measured_db, first.rss[0].measured_db, equal_nan=True)
+    manifest = json.loads((tmp_path / f"{key}.json").read_text())
+    assert manifest["flight"] == "f"
+    assert manifest["versions"]["aerpaw-cmp"]
+    assert manifest["host"]
+    assert {one["role"] for one in manifest["inputs"]} >= {"log", "site file (packaged)"}
+    assert manifest["settings"]["rss"]["bootstrap"] == 10
+    assert manifest["seconds"] > 0
+    assert manifest["links"] > 100
 
 
-def test_a_key_is_of_everything_that_matters(flight: Path) -> None:
+def test_a_key_is_of_everything_that_matters_and_of_nothing_else(flight: Path) -> None:
     settings = load_flight(flight)
-    key = task_key(settings, flight, None, "x")
-    assert key == task_key(load_flight(flight), flight, None, "x")
-    assert key != task_key(settings, flight, None, "y")
-    assert key != task_key(overridden(settings, {"rt.max_depth": 1}), flight, None, "x")
+    key = key_of(settings, flight)
+    assert key == key_of(load_flight(flight), flight)
+    assert key != key_of(overridden(settings, {"rt.max_depth": 1}), flight)
+    assert key != key_of(overridden(settings, {"rss.bootstrap": 7}), flight)
+    for aside in ({"report.speed_table": False}, {"rt.audit_links": 3}, {"rt.cache": False}):
+        assert key == key_of(overridden(settings, aside), flight), aside
     log = flight.parent / settings.logs[0].path
     before = log.read_bytes()
     try:
         log.write_bytes(before + b"\n")
-        assert key != task_key(settings, flight, None, "x")
+        assert key != key_of(settings, flight)
     finally:
         log.write_bytes(before)
-    assert key == task_key(settings, flight, None, "x")
+    assert key == key_of(settings, flight)
 
 
-def tasks_of(flight: Path, count: int = 4) -> list[campaign.Task]:
-    return [campaign.Task(flight, f"f{i}", "as written", {"rt.max_depth": 1 + i % 2}, None) for i in range(count)]
+LOADED = """
+import sys
+from pathlib import Path
+from aerpaw_cmp.jobs.campaign_tasks import Task, run_task
+task = Task(Path(sys.argv[1]), "f", "s", {"rss.bootstrap": 10, "rank.bootstrap": 10, "rss.lag": "off"}, None)
+assert run_task(task).failure is None
+root = Path(sys.modules["aerpaw_cmp"].__file__).parent
+for module in list(sys.modules.values()):
+    file = getattr(module, "__file__", None) or ""
+    if file.startswith(str(root)):
+        print(Path(file).relative_to(root).as_posix())
+"""
+
+
+def test_no_task_loads_code_that_its_key_leaves_out(flight: Path) -> None:
+    done = subprocess.run([sys.executable, "-c", LOADED, str(flight)], capture_output=True, text=True, check=True)
+    modules = done.stdout.split()
+    assert "compare/rss.py" in modules
+    assert [module for module in modules if not shapes_numbers(module)] == []
+
+
+def tasks_of(flight: Path, count: int = 4) -> list[Task]:
+    return [Task(flight, f"f{i}", "as written", {"rss.bootstrap": i}, None) for i in range(count)]
 
 
 def test_what_is_kept_is_not_computed_again(flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     asked: list[str] = []
 
-    def one(task: campaign.Task) -> campaign.Outcome:
+    def one(task: Task) -> Outcome:
         asked.append(task.flight)
-        if task.flight == "f3" and len(asked) < 6:
-            return campaign.Outcome(failure=Failure(flight="f3", setting="as written", message="no luck"))
+        if task.flight == "f3" and len(asked) < 7:
+            return Outcome(failure=Failure(flight="f3", setting="as written", message="no luck", traceback="line 1"))
         return track(float(task.flight[1:]))
 
-    monkeypatch.setattr(campaign, "run_task", one)
+    monkeypatch.setattr(campaign_tasks, "run_task", one)
     tasks = tasks_of(flight)
-    first = campaign.run_tasks(tasks, 1, None, lambda *_: None, tmp_path)
-    assert asked == ["f0", "f1", "f2", "f3"]
-    again = campaign.run_tasks(tasks, 1, None, lambda *_: None, tmp_path)
-    assert asked[4:] == ["f3"], "only the failure is tried again"
+    first = run_tasks(tasks, Here(), keep=str(tmp_path))
+    assert asked == ["f0", "f1", "f2", "f3", "f3"], "a failed task is tried once more"
+    assert first[3].failure is not None
+    status = campaign_status("c", tasks, [], str(tmp_path), workers=2)
+    assert (status.kept, status.failed, status.to_do) == (3, 1, 1)
+    assert status.estimate_s == pytest.approx(np.mean([s.seconds for s in status.states if s.kept]))
+    assert [s.failure for s in status.states] == ["", "", "", "no luck"]
+    assert "line 1" in next(tmp_path.glob("*.failed.json")).read_text()
+    again = run_tasks(tasks, Here(), keep=str(tmp_path))
+    assert asked[5:] == ["f3", "f3"], "only the failure is tried again"
     assert all(equal(a, b) for a, b in zip(first[:3], again[:3], strict=True))
-    campaign.run_tasks(tasks, 1, None, lambda *_: None)
-    assert len(asked) == 9, "nothing is kept unless asked for"
+    run_tasks(tasks, Here(), keep=str(tmp_path))
+    assert len(asked) == 7
+    assert not list(tmp_path.glob("*.failed.json")), "what succeeds is no failure any more"
+    run_tasks(tasks, Here())
+    assert len(asked) == 11, "nothing is kept unless asked for"
+
+
+def test_a_new_name_or_place_in_the_list_computes_nothing(
+    flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A setting put before the first, a label that is another: the outcomes are those that were kept, renamed."""
+    asked: list[str] = []
+    monkeypatch.setattr(campaign_tasks, "run_task", lambda task: asked.append(task.setting) or track(1.0))
+    run_tasks([Task(flight, "f", "a", {}, None, True)], Here(), keep=str(tmp_path))
+    new = [Task(flight, "g", "first", {"rss.bootstrap": 3}, None, True), Task(flight, "g", "b", {}, None, False)]
+    found = run_tasks(new, Here(), keep=str(tmp_path))
+    assert asked == ["a", "first"]
+    assert [one.track.flight for one in found if one.track is not None] == ["g", "g"]
+
+
+def test_a_worker_that_sees_other_files_fails_the_task(flight: Path, tmp_path: Path) -> None:
+    task = Task(flight, "f", "a", {}, None)
+    done = carry_out(Order(task=task, key="0" * 64, keep=str(tmp_path)))
+    assert done.outcome is not None
+    assert done.outcome.failure is not None
+    assert "sees other inputs" in done.outcome.failure.message
+    assert not list(tmp_path.glob("*.npz"))
+
+
+def test_a_log_that_changes_is_read_again_by_a_worker_that_lives_on(flight: Path, tmp_path: Path) -> None:
+    """A worker of a cluster serves campaign after campaign; its cache of logs is of content, not of names."""
+    for name in flight.parent.iterdir():
+        shutil.copy(name, tmp_path) if name.is_file() else shutil.copytree(name, tmp_path / name.name)
+    task = Task(tmp_path / flight.name, "f", "a", {}, None)
+    before = campaign_tasks.flight_data(task)
+    log = tmp_path / before.settings.logs[-1].path
+    lines = log.read_bytes().splitlines(keepends=True)
+    log.write_bytes(b"".join(lines[: len(lines) // 2]))
+    after = campaign_tasks.flight_data(task)
+    assert len(after.files[-1].result.streams[0].frame) < len(before.files[-1].result.streams[0].frame)
 
 
 KILLED = """
 import os, signal, sys
 from pathlib import Path
-from aerpaw_cmp.jobs import campaign
+from aerpaw_cmp.jobs import campaign_tasks
+from aerpaw_cmp.jobs.campaign_plan import run_tasks
+from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np
 
@@ -126,12 +206,14 @@ def one(task):
     if task.flight == "f2":
         os.kill(os.getpid(), signal.SIGKILL)
     number = float(task.flight[1:])
-    return campaign.Outcome(track=FlownTrack(flight=task.flight, time_s=np.arange(3.0), position_m=np.full((3, 3), number)))
+    return campaign_tasks.Outcome(
+        track=FlownTrack(flight=task.flight, time_s=np.arange(3.0), position_m=np.full((3, 3), number))
+    )
 
-campaign.run_task = one
+campaign_tasks.run_task = one
 flight = Path(sys.argv[1])
-tasks = [campaign.Task(flight, f"f{i}", "as written", {"rt.max_depth": 1 + i % 2}, None) for i in range(4)]
-campaign.run_tasks(tasks, 1, None, lambda *_: None, Path(sys.argv[2]))
+tasks = [campaign_tasks.Task(flight, f"f{i}", "as written", {"rss.bootstrap": i}, None) for i in range(4)]
+run_tasks(tasks, Here(), keep=sys.argv[2])
 """
 
 
@@ -141,20 +223,23 @@ def test_after_sigkill_only_what_is_missing_is_computed(
     done = subprocess.run([sys.executable, "-c", KILLED, str(flight), str(tmp_path)], check=False)
     assert done.returncode == -signal.SIGKILL
     asked: list[str] = []
-    monkeypatch.setattr(campaign, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:])))
-    found = campaign.run_tasks(tasks_of(flight), 1, None, lambda *_: None, tmp_path)
+    monkeypatch.setattr(
+        campaign_tasks, "run_task", lambda task: asked.append(task.flight) or track(float(task.flight[1:]))
+    )
+    found = run_tasks(tasks_of(flight), Here(), keep=str(tmp_path))
     assert asked == ["f2", "f3"]
     assert all(equal(one, track(float(i))) for i, one in enumerate(found))
 
 
-def lethal(task: campaign.Task) -> campaign.Outcome:
+def lethal(order: Order) -> Done:
     """Ends its worker: once where a file says so, always for the task called poison."""
+    task = order.task
     if task.flight == "poison" or (task.flight == "f1" and not _happened(task)):
         os.kill(os.getpid(), signal.SIGKILL)
-    return track(float(task.flight[1:]))
+    return Done(outcome=track(float(task.flight[1:])))
 
 
-def _happened(task: campaign.Task) -> bool:
+def _happened(task: Task) -> bool:
     mark = Path(os.environ["AERPAW_CMP_TEST_MARKS"]) / task.flight
     if mark.exists():
         return True
@@ -162,20 +247,15 @@ def _happened(task: campaign.Task) -> bool:
     return False
 
 
-def marked(task: campaign.Task, mark: str) -> campaign.Outcome:
-    Path(mark).touch()
-    return lethal(task)
-
-
 def test_a_lost_worker_costs_its_own_task_one_more_try(
     flight: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Fails on one pool for everything: there a killed worker loses all tasks."""
     monkeypatch.setenv("AERPAW_CMP_TEST_MARKS", str(tmp_path))
-    monkeypatch.setattr(campaign, "_marked", marked)
-    monkeypatch.setattr(campaign, "get_context", lambda _kind: __import__("multiprocessing").get_context("fork"))
-    tasks = [*tasks_of(flight, 6), campaign.Task(flight, "poison", "as written", {}, None)]
-    found = campaign.run_tasks(tasks, 2, None, lambda *_: None)
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaign_plan.carry_out", lethal)
+    monkeypatch.setattr("aerpaw_cmp.jobs.workers.get_context", lambda _kind: multiprocessing.get_context("fork"))
+    tasks = [*tasks_of(flight, 6), Task(flight, "poison", "as written", {}, None)]
+    found = run_tasks(tasks, Processes(2))
     assert [one.failure is None for one in found] == [True] * 6 + [False]
     assert found[-1].failure is not None
     assert "worker process ended" in found[-1].failure.message

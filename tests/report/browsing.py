@@ -63,6 +63,7 @@ def serious_findings(driver) -> dict[str, list[str]]:
     driver.execute_script(source.read_text(encoding="utf-8"))
     # HTML 5.2 lets <div> group the items of a <dl>, which the packaged axe does not know yet
     rules = {"rules": {"dlitem": {"enabled": False}}}
+    driver.set_script_timeout(120)  # a busy machine: axe looks at every cell of every table
     found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
     return {
         v["id"]: [n["html"][:120] for n in v["nodes"]]

@@ -373,3 +373,29 @@ def test_names_are_drawn_as_they_are(small_report):
             FigureCanvasAgg(fig).draw()
     assert "A_$" in seen
     assert "σ₂/σ₁" in seen
+
+
+def test_a_cloud_of_a_long_flight_is_thinned_and_its_extremes_stay(monkeypatch):
+    """One sample in many is drawn, spread over the whole flight; a spike or a gap between them is not lost."""
+    rng = np.random.default_rng(5)
+    values = rng.normal(0, 1, 100_000)
+    values[[12_345, 77_777]] = 40.0, -30.0
+    values[50_000:50_400] = np.nan
+    rows = canvas.cloud(values, 5_000)
+    assert {0, 12_345, 77_777, 99_999} <= set(rows.tolist())
+    assert 5_000 <= len(rows) <= 6_200
+    assert np.diff(rows).max() <= 21
+    drawn = values[rows]
+    assert abs(np.nanmedian(drawn)) < 0.1, "the middle of the cloud is not its extremes"
+    assert len(canvas.cloud(np.full(70, np.nan), 10)) >= 10
+
+
+def test_very_many_outages_are_joined_where_no_eye_parts_them():
+    seconds = np.arange(100_000.0)
+    spans = canvas.runs(seconds % 10 < 5)
+    joined = canvas._apart(spans, seconds)
+    assert len(spans) == 10_000
+    assert len(joined) < 2_001
+    assert (joined[0][0], joined[-1][1]) == (spans[0][0], spans[-1][1])
+    few = canvas.runs(seconds % 1000 < 5)
+    assert canvas._apart(few, seconds) is few

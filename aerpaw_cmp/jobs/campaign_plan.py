@@ -1,0 +1,275 @@
+"""What of a campaign is kept and what is to do; tasks handed to workers, outcomes gathered."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import AerpawCmpError
+from ..common.stages import Progress, duration, silent
+from ..report.campaign_data import Failure
+from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, outcome_store, task_facts
+from .workers import Lost, Workers
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TaskState:
+    """One task of a campaign before it runs.
+
+    ``key`` is the digest of what it depends on, None where an input cannot be read (``trouble`` says which).
+    ``seconds`` is what it cost, where it is kept; ``failure`` the message of the last run, where that failed.
+    """
+
+    task: Task
+    key: str | None
+    kept: bool = False
+    seconds: float | None = None
+    failure: str = ""
+    trouble: str = ""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class CampaignStatus:
+    """What ``campaign status`` tells.
+
+    ``estimate_s`` is the time of what is to do with ``workers`` tasks side by side: for every task the mean cost of
+    the kept tasks of its setting, else of all; None where nothing was measured yet.
+    """
+
+    name: str
+    keep: str
+    states: tuple[TaskState, ...]
+    failures: tuple[Failure, ...]
+    estimate_s: float | None
+    workers: int
+
+    @property
+    def kept(self) -> int:
+        """Tasks whose outcome is kept."""
+        return sum(state.kept for state in self.states)
+
+    @property
+    def failed(self) -> int:
+        """Tasks that failed the last time; they are to do."""
+        return sum(bool(state.failure) and not state.kept for state in self.states)
+
+    @property
+    def to_do(self) -> int:
+        """Tasks that a run would compute."""
+        return len(self.states) - self.kept
+
+    def metrics(self) -> dict[str, Any]:
+        """For ``--json``."""
+        return {
+            "campaign": self.name,
+            "keep": self.keep,
+            "tasks": len(self.states),
+            "kept": self.kept,
+            "failed": self.failed,
+            "to_do": self.to_do,
+            "estimate_s": self.estimate_s,
+            "workers": self.workers,
+            "to_do_tasks": [
+                {"flight": s.task.flight, "setting": s.task.setting, "last_failure": s.failure or s.trouble or None}
+                for s in self.states
+                if not s.kept
+            ],
+            "failures": [{"flight": f.flight, "setting": f.setting, "message": f.message} for f in self.failures],
+        }
+
+
+def campaign_status(
+    name: str, tasks: Sequence[Task], failures: Sequence[Failure], keep: str | None, *, workers: int = 1
+) -> CampaignStatus:
+    """What of a campaign is kept, what is to do and how long that may take; nothing is computed.
+
+    Parameters
+    ----------
+    name : str
+        Of the campaign.
+    tasks : sequence of Task
+    failures : sequence of Failure
+        Flights whose files cannot be read.
+    keep : str, optional
+        Folder or URL of the outcomes; None where nothing is kept.
+    workers : int
+        Tasks side by side, for the time.
+    """
+    states = [TaskState(task=task, key=None) for task in tasks] if keep is None else task_states(tasks, keep)
+    by_setting: dict[str, list[float]] = {}
+    for state in states:
+        if state.seconds is not None:
+            by_setting.setdefault(state.task.setting, []).append(state.seconds)
+    everything = [seconds for some in by_setting.values() for seconds in some]
+    estimate = None
+    if everything:
+        costs = [float(np.mean(by_setting.get(s.task.setting, everything))) for s in states if not s.kept]
+        estimate = max(sum(costs) / max(workers, 1), max(costs, default=0.0))
+    return CampaignStatus(
+        name=name,
+        keep="no place (--fresh)" if keep is None else outcome_store(keep).place.url,
+        states=tuple(states),
+        failures=tuple(failures),
+        estimate_s=estimate,
+        workers=workers,
+    )
+
+
+def task_states(tasks: Sequence[Task], keep: str) -> list[TaskState]:
+    """Key, outcome and cost of every task, by what the store says of itself."""
+    store = outcome_store(keep)
+    kept, failed = store.keys()
+    keys: list[str | None] = []
+    trouble = {}
+    for number, task in enumerate(tasks):
+        try:
+            keys.append(task_facts(task).key)
+        except (AerpawCmpError, OSError) as error:
+            keys.append(None)
+            trouble[number] = str(error)
+    costs = store.manifests({key for key in keys if key in kept})
+    words = store.manifests({key for key in keys if key in failed}, failed=True)
+    states = []
+    for number, (task, key) in enumerate(zip(tasks, keys, strict=True)):
+        cost, word = costs.get(key or "", {}), words.get(key or "", {})
+        seconds = cost.get("seconds")
+        states.append(
+            TaskState(
+                task=task,
+                key=key,
+                kept=key in kept,
+                seconds=float(seconds) if isinstance(seconds, (int, float)) else None,
+                failure=str(word.get("message", "")),
+                trouble=trouble.get(number, ""),
+            )
+        )
+    return states
+
+
+class Watch:
+    """Progress of tasks: done, failed, running, links per second, time left.
+
+    Parameters
+    ----------
+    total, kept : int
+        Tasks of the campaign, and those that are not computed.
+    workers : int
+        Tasks at a time.
+    progress : Progress
+    """
+
+    def __init__(self, total: int, kept: int, workers: int, progress: Progress) -> None:
+        self.total, self.kept, self.workers, self.progress = total, kept, max(workers, 1), progress
+        self.done = self.failed = self.links = 0
+        self._start = time.monotonic()
+
+    def __call__(self, outcome: Outcome, links: int) -> None:
+        """One more is through."""
+        self.done += 1
+        self.failed += outcome.failure is not None
+        self.links += links
+        self.progress(f"flights\t{self.words()}", (self.kept + self.done) / max(self.total, 1))
+
+    def words(self) -> str:
+        """One line."""
+        spent = max(time.monotonic() - self._start, 1e-9)
+        left = self.total - self.kept - self.done
+        parts = [f"{self.kept + self.done} of {self.total} done"]
+        parts += [f"{self.failed} failed"] if self.failed else []
+        parts += [f"{min(left, self.workers)} running", f"{self.links / spent:.0f} links/s"]
+        parts += [f"{duration(spent / self.done * left)} left"] if left and self.done else []
+        return ", ".join(parts)
+
+
+_SEEN_AFTER_S = (0.0, 0.1, 0.5, 2.0, 5.0, 10.0, 20.0)
+"""A file that a worker wrote may be seen later here (network file systems remember for a while that it was not)."""
+
+
+def run_tasks(
+    tasks: Sequence[Task], workers: Workers, progress: Progress = silent, keep: str | None = None
+) -> list[Outcome]:
+    """All tasks in order.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    workers : Workers
+        Who computes what is not kept.
+    progress : Progress
+        Counts and time left with every finished task.
+    keep : str, optional
+        Folder or URL of outcomes: what stands there is taken, what is computed is put there as soon as it is done.
+
+    Returns
+    -------
+    list of Outcome
+        In the order of the tasks; what goes wrong in one is its failure.
+    """
+    found, orders = kept_outcomes(tasks, keep, progress)
+    compute(tasks, orders, workers, progress, found)
+    return [fitted_to(task, found[number]) for number, task in enumerate(tasks)]
+
+
+def kept_outcomes(
+    tasks: Sequence[Task], keep: str | None, progress: Progress
+) -> tuple[dict[int, Outcome], dict[int, Order]]:
+    """Outcomes that are there, and what is to be computed, by number."""
+    found: dict[int, Outcome] = {}
+    orders = {number: Order(task=task) for number, task in enumerate(tasks)}
+    if keep is None:
+        return found, orders
+    store = outcome_store(keep)
+    there, _ = store.keys()
+    for number, task in enumerate(tasks):
+        with suppress(AerpawCmpError, OSError):  # such a task will say itself what is wrong
+            key = task_facts(task).key
+            orders[number] = Order(task=task, key=key, keep=keep)
+            outcome = store.load(key) if key in there else None
+            if outcome is not None:
+                found[number] = outcome
+                del orders[number]
+    for text in store.told:
+        progress(text)
+    if found:
+        progress(f"{len(found)} of {len(tasks)} outcomes are kept from before in {store.place.url}")
+    return found, orders
+
+
+def compute(
+    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, found: dict[int, Outcome]
+) -> None:
+    """Let the workers do what is to do; each outcome is put into ``found``."""
+    if not orders:
+        return
+    numbers = list(orders)
+    watch = Watch(len(tasks), len(tasks) - len(orders), workers.count, progress)
+
+    def done(place: int, result: Done | Lost) -> None:
+        number = numbers[place]
+        outcome = _outcome(orders[number], result)
+        found[number] = outcome
+        watch(outcome, 0 if isinstance(result, Lost) else result.links)
+
+    workers.run(carry_out, [orders[number] for number in numbers], done)
+
+
+def _outcome(order: Order, result: Done | Lost) -> Outcome:
+    """What a worker gave back, or put into the store."""
+    task = order.task
+    if isinstance(result, Lost):
+        return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=result.message))
+    if result.outcome is not None:
+        return result.outcome
+    store = outcome_store(str(order.keep))
+    for wait in _SEEN_AFTER_S:
+        time.sleep(wait)
+        outcome: Outcome | None = store.load(str(order.key))
+        if outcome is not None:
+            return outcome
+    message = f"the worker on {result.host} kept the outcome in {order.keep}, but it is not seen here"
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))

@@ -1,0 +1,348 @@
+"""One flight under one setting: what a worker of any kind is given, does, keeps and gives back."""
+
+from __future__ import annotations
+
+import dataclasses
+import os
+import platform
+import sys
+import time
+import traceback
+from dataclasses import dataclass, field
+from datetime import datetime, timezone
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import AerpawCmpError
+from ..common.units import AnyArray, FloatArray
+from ..common.versions import versions
+from ..compare import rank, result, rss, statistics
+from ..compare.result import FlightResult, RankResult, RssResult
+from ..flight.data import FlightData, gather, read_logs
+from ..flight.overrides import Overrides, overridden
+from ..flight.settings import FlightFile, RssSettings, load_flight
+from ..report import campaign_data
+from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
+from .flight_run import run_flight
+from .outcomes import OutcomeStore, code_digest, records_of, task_inputs, task_key
+from .place import open_place
+
+_this = sys.modules[__name__]
+
+
+@dataclass(frozen=True, slots=True)
+class Task:
+    """One flight file under one setting."""
+
+    path: Path
+    flight: str
+    setting: str
+    overrides: Overrides
+    logs_root: Path | None
+    reference: bool = True
+    """Overlays are drawn for this setting: places and times are kept."""
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """Rows of one task, or why there are none."""
+
+    rss: tuple[RssRow, ...] = ()
+    rank: tuple[RankRow, ...] = ()
+    failure: Failure | None = None
+    track: FlownTrack | None = None
+    flown: tuple[FlownRank, ...] = ()
+
+
+def _stamp(path: Path) -> tuple[int, int]:
+    """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
+    try:
+        found = os.stat(path)  # noqa: PTH116
+    except OSError:
+        return 0, 0
+    return found.st_size, found.st_mtime_ns
+
+
+@lru_cache(maxsize=512)
+def _flight_file(path: Path, _size: int, _mtime_ns: int) -> FlightFile:
+    return load_flight(path)
+
+
+@lru_cache(maxsize=2)
+def _logs(key: _Logs) -> Any:
+    """The logs of a flight: settings after settings reads them once."""
+    return read_logs(key.settings, key.folder, key.logs_root)
+
+
+@dataclass(frozen=True, slots=True)
+class _Logs:
+    """What the reading of logs depends on; settings that do not matter to it do not count in comparisons."""
+
+    folder: Path
+    logs_root: Path | None
+    text: str
+    stamps: tuple[tuple[int, int], ...]
+    settings: FlightFile = field(compare=False)
+
+
+def flight_data(task: Task) -> FlightData:
+    """Read and gather the flight of a task; errors as in :mod:`aerpaw_cmp.flight.data`."""
+    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    folder, root = task.path.parent, task.logs_root
+    text = "\n".join([str(settings.timezone), *(log.model_dump_json() for log in settings.logs)])
+    stamps = tuple(_stamp((root or folder) / log.path) for log in settings.logs)
+    return gather(settings, folder, _logs(_Logs(folder, root, text, stamps, settings)), root)
+
+
+def run_task(task: Task) -> Outcome:
+    """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
+    try:
+        found = run_flight(flight_data(task), audit=False)
+    except AerpawCmpError as error:
+        return _failed(task, str(error), error)
+    except Exception as error:  # one flight's fault must not cost the others their numbers
+        return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
+    return Outcome(
+        rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
+        rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
+        track=_flown(task, found.result),
+        flown=tuple(
+            FlownRank(
+                flight=task.flight,
+                tower=one.tower,
+                position_m=one.position_m,
+                rank=one.measured,
+                simulated=one.rank,
+                time_s=_elapsed_s(one.time),
+                start_ns=_start_ns(one.time),
+            )
+            for one in found.result.rank
+        ),
+    )
+
+
+def _failed(task: Task, message: str, error: BaseException) -> Outcome:
+    text = "".join(traceback.format_exception(error))
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message, traceback=text))
+
+
+# --- as a worker does it --------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Order:
+    """What a worker is given: paths and hashes, no arrays.
+
+    Parameters
+    ----------
+    task : Task
+    key : str, optional
+        Digest of what the outcome depends on, as the first process sees it; None where an input cannot be read.
+    keep : str, optional
+        Folder or URL of the outcomes.
+    """
+
+    task: Task
+    key: str | None = None
+    keep: str | None = None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Done:
+    """What a worker gives back.
+
+    ``outcome`` is None where it lies in the store, under the key of the order. ``seconds`` and ``cpu_s`` are what the
+    task cost (0 where another run had kept it meanwhile), ``links`` its poses times towers and channels.
+    """
+
+    outcome: Outcome | None
+    seconds: float = 0.0
+    cpu_s: float = 0.0
+    links: int = 0
+    host: str = ""
+    failed: bool = False
+
+
+TRIES = 2
+"""A task that fails is tried once more."""
+
+
+def carry_out(order: Order) -> Done:
+    """Run a task and keep its outcome; what runs in worker processes of every kind.
+
+    The key is computed anew here: a worker that sees another file or runs other code fails the task instead of
+    keeping a wrong number under a right name.
+    """
+    task = order.task
+    store = None if order.keep is None or order.key is None else outcome_store(order.keep)
+    if store is not None and order.key is not None and store.sound(order.key):
+        return Done(outcome=None, host=platform.node())
+    facts, trouble = _checked(order)
+    start, cpu = time.perf_counter(), time.process_time()
+    tried, outcome = 1, trouble or run_task(task)
+    while trouble is None and outcome.failure is not None and tried < TRIES:
+        tried, outcome = tried + 1, run_task(task)
+    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    links = sum(len(row.measured_db) for row in outcome.rss) + sum({row.tower: row.n for row in outcome.rank}.values())
+    done = Done(outcome=outcome, seconds=seconds, cpu_s=cpu_s, links=links, host=platform.node())
+    if store is None or order.key is None:
+        return done
+    manifest = {
+        "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
+        "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
+        "seconds": seconds, "cpu_s": cpu_s, "links": links, "host": platform.node(), "process": os.getpid(),
+        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"), "versions": versions(),
+        "code": code_digest(), "inputs": [] if facts is None else facts.inputs,
+        "settings": {} if facts is None else facts.settings.model_dump(mode="json"),
+    }  # fmt: skip
+    if outcome.failure is not None:
+        failure = {"message": outcome.failure.message, "traceback": outcome.failure.traceback, "tries": tried}
+        store.save_failure(order.key, {**manifest, **failure})
+        return done
+    return dataclasses.replace(done, outcome=None) if store.save(order.key, outcome, manifest) else done
+
+
+def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
+    """What the task depends on as this process sees it, and its failure where that is something else."""
+    if order.key is None:
+        return None, None
+    try:
+        facts = task_facts(order.task)
+    except (AerpawCmpError, OSError) as error:
+        return None, _failed(order.task, f"an input can no longer be read: {error}", error)
+    return facts, None if facts.key == order.key else _not_the_same(order.task)
+
+
+def _not_the_same(task: Task) -> Outcome:
+    message = (
+        f"the worker on {platform.node()} sees other inputs, or runs another version of the program, than the process "
+        f"that planned the campaign (aerpaw-cmp {versions()['aerpaw-cmp']} there); expected the same everywhere"
+    )
+    return Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Facts:
+    """What an outcome depends on."""
+
+    settings: FlightFile
+    inputs: list[dict[str, str]]
+    key: str
+
+
+def task_facts(task: Task) -> Facts:
+    """Settings, inputs and key of a task.
+
+    Raises
+    ------
+    AerpawCmpError, OSError
+        If an input cannot be read.
+    """
+    settings = overridden(_flight_file(task.path, *_stamp(task.path)), task.overrides)
+    inputs = task_inputs(settings, task.path, task.logs_root)
+    return Facts(settings=settings, inputs=inputs, key=task_key(settings, inputs))
+
+
+def outcome_store(keep: str) -> OutcomeStore:
+    """The outcomes of campaigns in a folder or object store."""
+    return OutcomeStore(open_place(keep), records_of(_this, campaign_data, rank, result, rss, statistics))
+
+
+def fitted_to(task: Task, outcome: Outcome) -> Outcome:
+    """A kept outcome under the names of this campaign, without what only the first setting's figures need."""
+
+    def row(one: RssRow) -> RssRow:
+        named = dataclasses.replace(one, flight=task.flight, setting=task.setting)
+        if task.reference:
+            return named
+        none = np.zeros(0)
+        return dataclasses.replace(
+            named, time_s=none, distance_m=none, position_m=np.zeros((0, 3)), heading_deg=None
+        )  # fmt: skip
+
+    failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
+    return Outcome(
+        rss=tuple(map(row, outcome.rss)),
+        rank=tuple(dataclasses.replace(one, flight=task.flight, setting=task.setting) for one in outcome.rank),
+        failure=failure,
+        track=outcome.track and dataclasses.replace(outcome.track, flight=task.flight),
+        flown=tuple(dataclasses.replace(one, flight=task.flight) for one in outcome.flown) if task.reference else (),
+    )
+
+
+# --- rows -----------------------------------------------------------------------------------------------------------
+
+
+def _flown(task: Task, result: FlightResult) -> FlownTrack:
+    first = result.rss[0] if result.rss else result.rank[0]
+    return FlownTrack(flight=task.flight, time_s=_elapsed_s(first.time), position_m=first.position_m)
+
+
+def _start_ns(time: AnyArray) -> int:
+    return int(time[0].astype("datetime64[ns]").astype(np.int64)) if len(time) else 0
+
+
+def _elapsed_s(time: AnyArray) -> FloatArray:
+    return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
+
+
+def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
+    score, clock = found.score, found.further.clock
+    return RssRow(
+        flight=task.flight,
+        setting=task.setting,
+        tower=found.tower,
+        channel=found.channel,
+        unit=found.unit,
+        offset_db=score.offset_db,
+        rmse_db=score.rmse_db,
+        correlation=score.correlation,
+        n=score.n,
+        n_out_of_coverage=score.n_out_of_coverage,
+        at_search_edge=score.at_edge,
+        rmse_ci95_db=score.rmse_ci95_db,
+        offset_ci95_db=score.intervals.offset_db,
+        correlation_ci95=score.intervals.correlation,
+        n_effective=score.intervals.autocorrelation.n_effective,
+        lag_s=score.lag_s,
+        lag_verdict="" if clock is None else clock.verdict,
+        fitted=score.fitted_on_scored,
+        baselines={name: model.rmse_db for name, model in found.baselines.items()},
+        step_db=rules.step_db,
+        span_db=rules.span_db,
+        measured_db=found.measured_db,
+        simulated_dbm=found.simulated_dbm,
+        time_s=_elapsed_s(found.time),
+        start_ns=_start_ns(found.time),
+        position_m=found.position_m,
+        distance_m=found.geometry["distance_m"],
+        heading_deg=found.geometry.get("heading_deg"),
+        within=found.further.repeatability,
+    )
+
+
+def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
+    score = found.score
+    return [
+        RankRow(
+            flight=task.flight,
+            setting=task.setting,
+            tower=found.tower,
+            n=score.n,
+            best_k=score.best_k,
+            best_k_ci95=score.curve.best_k_interval,
+            k=k,
+            n_out_of_coverage=fit.out_of_coverage,
+            agreement=fit.agreement,
+            agreement_ci95=fit.agreement_ci95,
+            kappa=fit.kappa,
+            total_variation=fit.total_variation,
+            total_variation_ci95=fit.total_variation_ci95,
+            wasserstein=fit.wasserstein,
+            commonest_agreement=found.further.commonest.agreement,
+        )
+        for k, fit in score.simulated.items()
+    ]

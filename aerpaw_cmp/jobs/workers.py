@@ -1,0 +1,459 @@
+"""Independent tasks on workers: here, in processes of this machine, or on a Dask cluster; one function, one result.
+
+Tasks are functions of small records (paths, settings, hashes) that can be pickled. A lost worker costs what it was
+doing: those tasks run again, a last time alone, and only one that loses its worker even then is :class:`Lost`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import logging
+import os
+import platform
+import shutil
+import tempfile
+import threading
+import time
+import uuid
+from collections import Counter, deque
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import BrokenExecutor, CancelledError, ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, Protocol, TypeVar
+
+from ..common.errors import AerpawCmpError, InputError, UsageError
+from ..common.stages import Progress, silent
+from .outcomes import code_digest
+from .place import open_place
+
+Item = TypeVar("Item")
+Result = TypeVar("Result")
+
+TRIES = 2
+"""A task in work when a worker is lost is tried again; after so many tries once more, alone."""
+
+CONNECT_S = 10.0
+"""How long a scheduler may take to answer."""
+
+RECONNECT_S = 60.0
+"""How long a scheduler that went away is waited for."""
+
+_MEMORY_SHARE = 0.85
+"""Of the machine's memory (or of the container's), shared by the workers of this machine."""
+
+
+@dataclass(frozen=True, slots=True)
+class Lost:
+    """In place of a result: the worker ended, again and again, or the task could not be sent or brought back."""
+
+    message: str
+
+
+class Workers(Protocol):
+    """Runs tasks side by side."""
+
+    @property
+    def count(self) -> int:
+        """Tasks at a time."""
+
+    def run(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        """``function`` of every item, in any order; ``done`` gets number and result as they come."""
+
+
+class Here:
+    """One after the other, in this process."""
+
+    count = 1
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        for number, item in enumerate(items):
+            done(number, function(item))
+
+
+# --- processes of this machine, without Dask ------------------------------------------------------------------------
+
+
+class Processes:
+    """A pool of processes that is made anew when a worker is lost.
+
+    A pool breaks as a whole, and does not say whose process ended. Each task leaves a mark when it begins, so that
+    those in work are known; the others lost nothing.
+    """
+
+    def __init__(self, count: int) -> None:
+        self.count = count
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        tries: Counter[int] = Counter()
+        waiting = list(range(len(items)))
+        with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-tasks-") as marks:
+            while waiting:
+                together = [i for i in waiting if tries[i] < TRIES] or waiting[:1]
+                lost = self._round(function, items, together, Path(marks), done)
+                for number, error in lost.items():
+                    mark = Path(marks) / str(number)
+                    if mark.exists():
+                        mark.unlink()
+                        tries[number] += 1
+                    if tries[number] > TRIES:
+                        done(number, _ended(error))
+                waiting = [i for i in waiting if (i in lost and tries[i] <= TRIES) or i not in together]
+
+    def _round(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        numbers: Sequence[int],
+        marks: Path,
+        done: Callable[[int, Result | Lost], None],
+    ) -> dict[int, BaseException]:
+        """One pool, until it is through or breaks; gives the tasks that it did not finish."""
+        lost: dict[int, BaseException] = {}
+        # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
+        count = min(self.count, len(numbers))
+        with ProcessPoolExecutor(max_workers=count, mp_context=get_context("spawn")) as pool:
+            futures = {pool.submit(_marked, function, items[i], str(marks / str(i))): i for i in numbers}
+            for future in as_completed(futures):
+                number, error = futures.pop(future), future.exception()
+                if isinstance(error, BrokenExecutor):
+                    lost[number] = error
+                else:
+                    done(number, future.result() if error is None else _ended(error))
+        return lost
+
+
+def _marked(function: Callable[[Item], Result], item: Item, mark: str) -> Result:
+    """Run a task; its mark stands from its beginning on."""
+    Path(mark).touch()
+    return function(item)
+
+
+def _ended(error: BaseException) -> Lost:
+    if type(error).__name__ == "KilledWorker":
+        return Lost("its worker process ended, time after time: out of memory, or killed")
+    return Lost(f"its worker process ended: {str(error).strip() or type(error).__name__}")
+
+
+# --- Dask -----------------------------------------------------------------------------------------------------------
+
+
+class Cluster:
+    """Workers of a Dask scheduler; a window of tasks is with it at a time, so that its memory does not grow.
+
+    Parameters
+    ----------
+    client : distributed.Client
+    address : str, optional
+        Of a scheduler that can be reached again after it went away; without it, its end is the end.
+    progress : Progress
+    """
+
+    def __init__(self, client: Any, address: str | None = None, progress: Progress = silent) -> None:
+        self._client, self._address, self._progress = client, address, progress
+
+    @property
+    def count(self) -> int:
+        """Threads of all workers that are there now."""
+        return max(1, sum(self._client.nthreads().values())) if self._client.status == "running" else 1
+
+    def run(  # noqa: D102
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        done: Callable[[int, Result | Lost], None],
+    ) -> None:
+        killed = self._through(function, items, range(len(items)), done, alone=False)
+        for number in killed:  # a last time, so that none pays for its neighbour
+            self._through(function, items, [number], done, alone=True)
+
+    def _through(
+        self,
+        function: Callable[[Item], Result],
+        items: Sequence[Item],
+        numbers: Iterable[int],
+        done: Callable[[int, Result | Lost], None],
+        *,
+        alone: bool,
+    ) -> list[int]:
+        """Run some; gives those that lost their worker too often."""
+        waiting = deque(numbers)
+        active: dict[Any, int] = {}
+        killed: list[int] = []
+        came = threading.Event()
+        window, looked = self.count, time.monotonic()
+        while waiting or active:
+            if time.monotonic() - looked > 2.0:  # workers may join and leave
+                window, looked = self.count, time.monotonic()
+            try:
+                while waiting and len(active) < 2 * window + 2:
+                    number = waiting.popleft()
+                    future = self._client.submit(function, items[number], pure=False)
+                    active[future] = number
+                    future.add_done_callback(lambda _future: came.set())
+            except Exception:
+                if self._client.status == "running":
+                    raise
+                waiting.appendleft(number)
+            came.wait(0.5)
+            came.clear()
+            for future in [f for f in active if f.done()]:
+                number = active.pop(future)
+                try:
+                    error = future.exception() if future.status == "error" else None
+                    result: Any = future.result() if error is None else None
+                except (CancelledError, OSError, TimeoutError):  # finished, and the way back was cut
+                    waiting.appendleft(number)
+                    continue
+                if error is None:
+                    done(number, result)
+                elif type(error).__name__ == "KilledWorker" and not alone:
+                    killed.append(number)
+                else:
+                    done(number, _ended(error))
+                future.release()
+            if self._client.status != "running":
+                waiting.extendleft(sorted(active.values(), reverse=True))
+                active.clear()
+                self._reconnect()
+        return killed
+
+    def _reconnect(self) -> None:
+        """Wait for the scheduler to come back; InputError where it does not."""
+        from distributed import Client
+
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=1)
+        if self._address is None:
+            raise InputError("the scheduler of the workers has ended", cause="out of memory, or it was killed")
+        self._progress(f"the scheduler {self._address} went away: waiting up to {RECONNECT_S:.0f} s for it")
+        end = time.monotonic() + RECONNECT_S
+        while time.monotonic() < end:
+            with contextlib.suppress(OSError, ValueError):
+                self._client = Client(self._address, timeout="3s", set_as_default=False)
+                self._progress(f"the scheduler {self._address} is there again")
+                return
+            time.sleep(1.0)
+        raise InputError(
+            f"the scheduler {self._address} went away and did not come back within {RECONNECT_S:.0f} s",
+            cause="it was stopped; what was finished is kept, run the same command again",
+        )
+
+    def close(self) -> None:
+        """Leave the scheduler."""
+        with contextlib.suppress(Exception):
+            self._client.close(timeout=5)
+
+
+@contextlib.contextmanager
+def open_workers(
+    workers: int,
+    scheduler: str | None = None,
+    *,
+    paths: Sequence[Path] = (),
+    keep: str | None = None,
+    progress: Progress = silent,
+) -> Iterator[Workers]:
+    """Workers for the tasks of a job.
+
+    Parameters
+    ----------
+    workers : int
+        On this machine; 1 runs the tasks in this process.
+    scheduler : str, optional
+        Address of a Dask scheduler, in place of workers here.
+    paths : sequence of Path
+        Files and folders that every worker of a scheduler has to see.
+    keep : str, optional
+        Folder or URL of outcomes that it has to reach.
+    progress : Progress
+        Where the workers are, and the address of the dashboard.
+
+    Raises
+    ------
+    UsageError
+        No scheduler answers, ``distributed`` is missing, or workers run other code or do not see the files.
+    """
+    if scheduler is not None:
+        with _scheduler(scheduler, paths, keep, progress) as cluster:
+            yield cluster
+    elif workers <= 1:
+        yield Here()
+    elif _has_dask():
+        with _local_cluster(workers, progress) as cluster:
+            yield cluster
+    else:
+        progress(
+            f"{workers} processes without memory limits and dashboard: "
+            "'distributed' is not installed (pip install 'aerpaw-cmp[cluster]')"
+        )
+        yield Processes(workers)
+
+
+def _has_dask() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec("distributed") is not None
+
+
+@contextlib.contextmanager
+def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
+    """Workers of one thread each, with a share of the memory, of this machine alone."""
+    import dask
+    from distributed import Client, LocalCluster
+    from distributed.system import MEMORY_LIMIT
+
+    _quiet()
+    settings = {
+        "distributed.scheduler.allowed-failures": TRIES - 1,
+        "distributed.scheduler.worker-saturation": 1.0,  # what waits at a worker is not lost with it
+        "distributed.worker.memory.spill": False,
+        "distributed.worker.memory.target": False,
+        "distributed.worker.daemon": True,
+        "distributed.admin.log-format": "%(message)s",
+        "logging.distributed": "critical",
+    }
+    scratch = tempfile.mkdtemp(prefix="aerpaw-cmp-dask-")
+    limit = int(_MEMORY_SHARE * MEMORY_LIMIT / workers)
+    try:
+        with (
+            dask.config.set(settings),
+            LocalCluster(
+                n_workers=workers,
+                threads_per_worker=1,
+                memory_limit=limit,
+                local_directory=scratch,
+                dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
+                silence_logs=50,
+            ) as local,
+            Client(local, set_as_default=False) as client,
+        ):
+            page = f"; dashboard {local.dashboard_link}" if _has_dashboard() else ""
+            progress(f"{workers} workers of at most {limit / 2**30:.1f} GiB each{page}")
+            yield Cluster(client, progress=progress)
+    finally:
+        shutil.rmtree(scratch, ignore_errors=True)
+
+
+def _quiet() -> None:
+    """No log lines of distributed on the terminal: what matters is told once, in our words."""
+    for name in list(logging.root.manager.loggerDict):
+        if name.split(".")[0] in ("distributed", "tornado"):
+            logging.getLogger(name).setLevel(logging.CRITICAL + 1)
+
+
+def _has_dashboard() -> bool:
+    from importlib.util import find_spec
+
+    return find_spec("bokeh") is not None
+
+
+@contextlib.contextmanager
+def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: Progress) -> Iterator[Cluster]:
+    """Workers of a running scheduler."""
+    try:
+        from distributed import Client
+
+        _quiet()
+    except ImportError:
+        raise UsageError(
+            f"--scheduler {address!r} needs the package 'distributed'", expected="pip install 'aerpaw-cmp[cluster]'"
+        ) from None
+    try:
+        client = Client(address, timeout=CONNECT_S, set_as_default=False)
+    except (OSError, ValueError, ImportError) as error:
+        raise UsageError(f"--scheduler {address!r}: no scheduler answers ({error})") from error
+    cluster = Cluster(client, address, progress)
+    try:
+        check_workers(client, paths, keep)
+        page = f"; dashboard {client.dashboard_link}" if _has_dashboard() else ""
+        progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
+        yield cluster
+    finally:
+        cluster.close()
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WorkerFacts:
+    """What a worker says of itself."""
+
+    host: str
+    python: str
+    version: str
+    code: str
+    missing: tuple[str, ...]
+
+
+def worker_facts(paths: Sequence[str], keep: str | None = None, probe: str = "") -> WorkerFacts:
+    """Of the process that this runs in."""
+    from .. import __version__
+
+    missing = [path for path in paths if not os.access(path, os.R_OK)]
+    if keep is not None:
+        try:
+            if open_place(keep).read(probe) is None:
+                missing.append(f"what is kept in {keep}")
+        except AerpawCmpError as error:
+            missing.append(str(error))
+    return WorkerFacts(
+        host=platform.node(),
+        python=platform.python_version(),
+        version=__version__,
+        code=code_digest(),
+        missing=tuple(missing),
+    )
+
+
+def check_workers(client: Any, paths: Sequence[Path], keep: str | None = None) -> None:
+    """One message for all workers that run other code or do not see the files.
+
+    Raises
+    ------
+    UsageError
+        Naming worker, host and what is wrong.
+    """
+    texts, probe = [str(path.absolute()) for path in paths], f"probe-{uuid.uuid4().hex}"
+    if keep is not None:
+        open_place(keep).write(probe, b"seen?")
+    try:
+        found = client.run(worker_facts, texts, keep, probe, on_error="return")
+    finally:
+        if keep is not None:
+            open_place(keep).remove(probe)
+    here = worker_facts([])
+    wrong = [f"{worker}: {text}" for worker, facts in found.items() if (text := _trouble(facts, here))]
+    if wrong:
+        more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
+        raise UsageError(
+            f"{len(wrong)} of {len(found)} workers cannot do this campaign: " + "; ".join(wrong[:4]) + more,
+            expected="the same aerpaw-cmp on every worker, and the same files under the same paths",
+            cause="another environment, or a disk that is not mounted there",
+        )
+
+
+def _trouble(facts: Any, here: WorkerFacts) -> str:
+    if isinstance(facts, BaseException):
+        return f"aerpaw-cmp cannot be loaded there ({type(facts).__name__}: {facts})"
+    if facts.code != here.code:
+        other = f"aerpaw-cmp {facts.version}, here {here.version}" if facts.version != here.version else "another state"
+        return f"{facts.host} runs other code ({other} of the program or of NumPy, SciPy, Sionna RT)"
+    if facts.missing:
+        more = f" and {len(facts.missing) - 1} more" if len(facts.missing) > 1 else ""
+        return f"{facts.host} does not see {facts.missing[0]}{more}"
+    return ""

@@ -1,0 +1,85 @@
+"""Figure of the serving cells: which cell served, and which was predicted strongest."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..common.units import AnyArray
+from ..compare.serving import ServingComparison
+from .canvas import TOWER, Plate, colour_bar, count, figure
+
+MOST_CELLS = 16
+"""Cells with a row of their own; the others stand together."""
+
+OTHER, NONE = "others", "no path"
+
+
+def shown_confusion(serving: ServingComparison, most: int = MOST_CELLS) -> tuple[list[str], AnyArray]:
+    """Names and counts (cells, cells + 1) of a matrix that can be read; the last column: no cell predicted.
+
+    Cells that neither served nor were predicted are left out. Of more than ``most``, those of fewest samples are added
+    up as "others"; that row and column meet in hits and misses alike, so their cell has no frame.
+    """
+    counts = np.asarray(serving.confusion)
+    weight = counts.sum(axis=1) + counts[:, :-1].sum(axis=0)
+    order = [int(i) for i in np.argsort(-weight, kind="stable") if weight[i] > 0]
+    first, rest = sorted(order[:most]), sorted(order[most:])
+    names = [serving.cells[i] for i in first]
+    columns = np.column_stack([counts[:, first], counts[:, rest].sum(axis=1)] if rest else [counts[:, first]])
+    columns = np.column_stack([columns, counts[:, -1]])
+    table = columns[first]
+    if rest:
+        table, names = np.vstack([table, columns[rest].sum(axis=0)]), [*names, OTHER]
+    return names, table
+
+
+def confusion(serving: ServingComparison) -> Any:
+    """Cell that served against cell predicted strongest: counts, coloured by their share of the row."""
+    names, table = shown_confusion(serving)
+    total = table.sum(axis=1, keepdims=True)
+    share = 100 * np.divide(table, total, out=np.zeros(table.shape), where=total > 0)
+    longest = max((len(name) for name in names), default=0)
+    fig = figure((min(9.2, 3.6 + 0.62 * len(names) + 0.05 * longest), 1.9 + 0.42 * len(names)))
+    ax = fig.subplots()
+    image = ax.imshow(np.where(total > 0, share, np.nan), cmap="cividis", vmin=0, vmax=100, aspect="auto")
+    for row, name in enumerate(names):
+        if name != OTHER:
+            ax.add_patch(_frame(row))
+        for column in range(table.shape[1]):
+            ax.text(
+                column, row, count(int(table[row, column])), ha="center", va="center", fontsize=8,
+                color="white" if total[row] > 0 and share[row, column] < 55 else "black",
+            )  # fmt: skip
+    ax.set_xticks(range(len(names) + 1), [*names, NONE], rotation=45 if len(names) > 4 else 0,
+                  ha="right" if len(names) > 4 else "center", fontsize=8)  # fmt: skip
+    ax.set_yticks(range(len(names)), names, fontsize=8)
+    ax.set_xlabel("Cell predicted strongest")
+    ax.set_ylabel("Cell that served")
+    ax.grid(visible=False)
+    colour_bar(fig, image, [ax], "Share of the cell that served [%]")
+    return fig
+
+
+def _frame(place: int) -> Any:
+    """The frame of a hit."""
+    from matplotlib.patches import Rectangle
+
+    return Rectangle((place - 0.47, place - 0.46), 0.94, 0.92, fill=False, edgecolor=TOWER, linewidth=1.4)
+
+
+def serving_plate(serving: ServingComparison) -> Plate:
+    """The matrix with its words."""
+    n_cells = int((np.asarray(serving.confusion).sum(axis=1) > 0).sum())
+    return Plate(
+        name="serving_confusion",
+        page=True,
+        section="serving",
+        title="Which cell serves",
+        caption=f"Counts of {count(serving.n)} samples; colour is the share of each cell that served (rows). Framed: "
+        f"the cell predicted strongest served, {100 * serving.hit_share:.0f} % of all; always naming the cell that "
+        f"served most hits {100 * serving.majority_share:.0f} %. Levels are as simulated, without offsets.",
+        alt=f"Confusion matrix of {n_cells} serving cells against the cells predicted strongest.",
+        draw=lambda: confusion(serving),
+    )

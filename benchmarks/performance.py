@@ -1,0 +1,252 @@
+"""docs/performance.md and its figures from the history of benchmark runs; nothing is measured here.
+
+    python benchmarks/performance.py [--history FILE] [--docs FOLDER]
+
+The last run of the history that measured everything it was asked for is shown; earlier ones make the table of the
+peers' ratios over time. Extrapolations are one line each: the largest measured size, the fitted power, and the size
+that is asked about; how far that is beyond what was measured stands beside it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import math
+from pathlib import Path
+from typing import Any
+
+ROOT = Path(__file__).resolve().parents[1]
+HISTORY = ROOT / "benchmarks" / "history.jsonl"
+FIGURE = "performance_scaling.png"
+AXES = {
+    "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
+    "towers": ("Towers", "replay of 1000 poses, 4 x 4 elements, 12 buildings, depth 2"),
+    "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2; the field grows with them"),
+    "samples": ("Samples of one channel", "comparison with all its intervals, without replay"),
+    "report": ("Samples of a flight", "whole report, two channels, without audit"),
+    "flights": ("Flights", "campaign, one tower, two channels, two settings, 130 s each, one worker"),
+    "workers": ("Workers", "the same campaign of the most flights"),
+}
+"""Title and what was done, by axis of benchmarks/scaling.py."""
+
+SEASON = {"flights": 200, "towers": 5, "settings": 20}
+CITY = {"faces": 50_000}
+
+
+def runs(history: Path) -> list[dict[str, Any]]:
+    """Every run of the history, oldest first."""
+    lines = history.read_text(encoding="utf-8").splitlines() if history.is_file() else []
+    return [json.loads(line) for line in lines if line.strip()]
+
+
+def last_whole(found: list[dict[str, Any]]) -> dict[str, Any]:
+    """The last run that has the scaling.
+
+    Raises
+    ------
+    SystemExit
+        None has.
+    """
+    whole = [run for run in found if "result" in run["benchmarks"].get("scaling", {})]
+    if not whole:
+        raise SystemExit("no run with scaling in the history: python benchmarks/all.py first")
+    return whole[-1]
+
+
+def size_of(row: dict[str, Any]) -> float:
+    """What a row is plotted against."""
+    return float(row.get("samples", row.get("faces", row["size"])))
+
+
+def number(value: float) -> str:
+    """Three digits that count, thousands set apart."""
+    if value >= 100:
+        return f"{value:,.0f}".replace(",", " ")
+    return f"{value:.3g}"
+
+
+def power(value: float | None) -> str:
+    """A fitted power, or a dash."""
+    return "-" if value is None else f"{value:.2f}"
+
+
+def scaling_tables(scaling: dict[str, Any]) -> list[str]:
+    """A table per axis."""
+    out = []
+    for axis, result in scaling.items():
+        title, what = AXES[axis]
+        cpu, memory = power(result["power_cpu"]), power(result["power_memory"])
+        fitted = "" if axis == "workers" else f" Power between the last two sizes: {cpu} (time), {memory} (memory)."
+        out += [f"### {title}", "", f"{what[0].upper()}{what[1:]}.{fitted}", ""]
+        out += ["| size | processor s | wall s | peak MiB |", "| ---: | ---: | ---: | ---: |"]
+        for row in result["rows"]:
+            if "refused" in row:
+                out.append(f"| {number(row['size'])} | {row['refused']} | | |")
+            else:
+                cells = (size_of(row), row["cpu_s"], row["wall_s"], row["peak_mib"])
+                out.append("| " + " | ".join(map(number, cells)) + " |")
+        out.append("")
+    return out
+
+
+def measured(scaling: dict[str, Any], axis: str) -> list[dict[str, Any]]:
+    """Rows of an axis that were not refused."""
+    return [r for r in scaling.get(axis, {}).get("rows", []) if "refused" not in r]
+
+
+def extrapolated(scaling: dict[str, Any], axis: str, size: float) -> tuple[float, float] | None:
+    """Processor seconds at a size, and how many times beyond the largest measured one it is."""
+    rows, result = measured(scaling, axis), scaling.get(axis, {})
+    if not rows or result.get("power_cpu") is None:
+        return None
+    last = size_of(rows[-1])
+    return rows[-1]["cpu_s"] * (size / last) ** result["power_cpu"], size / last
+
+
+def season(scaling: dict[str, Any]) -> list[str]:
+    """A season by the cost of one more task of the campaign."""
+    rows = measured(scaling, "flights")
+    if len(rows) < 2:
+        return []
+    one = (rows[-1]["cpu_s"] - rows[0]["cpu_s"]) / (rows[-1]["size"] - rows[0]["size"]) / 2.0  # two settings
+    tasks = SEASON["flights"] * SEASON["settings"]
+    hours = one * SEASON["towers"] * tasks / 3600.0
+    first, later, *_ = (*measured(scaling, "workers"), None, None)
+    shared = f" Two workers took {later['wall_s'] / first['wall_s']:.2f} of one's wall time." if first and later else ""
+    return [
+        f"- **A season**: {SEASON['flights']} flights x {SEASON['settings']} settings = {number(tasks)} tasks. A task "
+        f"of one tower (two channels, 130 s, 260 samples each) costs {one:.2f} s of processor; with {SEASON['towers']} "
+        f"towers, each as dear, that is {hours:.1f} h of one core. It assumes that tasks cost alike "
+        f"(the campaign grew with power {power(scaling['flights']['power_cpu'])} in flights).{shared}"
+    ]
+
+
+def city(scaling: dict[str, Any]) -> list[str]:
+    """A city by the growth with faces."""
+    found = extrapolated(scaling, "faces", CITY["faces"])
+    if found is None:
+        return []
+    seconds, beyond = found
+    return [
+        f"- **A city**: {number(CITY['faces'])} faces (10 000 buildings), 100 poses of one tower, depth 2: "
+        f"{number(seconds)} s of processor, if the power {power(scaling['faces']['power_cpu'])} holds "
+        f"{beyond:.0f} times beyond the largest scene that was measured. That is far: read it as an order of magnitude."
+    ]
+
+
+def long_flight(scaling: dict[str, Any]) -> list[str]:
+    """A day by the growth of a report with samples."""
+    found = extrapolated(scaling, "report", 2_000_000)
+    if found is None:
+        return []
+    seconds, beyond = found
+    return [
+        f"- **A flight of ten hours** (1 000 000 samples of two channels): {number(seconds)} s of processor, "
+        f"{beyond:.0f} times beyond what was measured here; `python benchmarks/long_flight.py` measures it."
+    ]
+
+
+def peers(found: list[dict[str, Any]]) -> list[str]:
+    """Ratios to the peers in every run of the history that has them."""
+    having = [run for run in found if run["benchmarks"].get("peers", {}).get("result")][-8:]
+    if not having:
+        return []
+    names = list(dict.fromkeys(name for run in having for name in run["benchmarks"]["peers"]["result"]))
+    head = "| times faster than | " + " | ".join(f"{r['date'][:10]}, {r['version']}" for r in having) + " |"
+    out = ["## Against peers", "", "Both sides in one process, by processor time; above 1 we are faster.", "", head]
+    out.append("| --- |" + " ---: |" * len(having))
+    for name in names:
+        values = [run["benchmarks"]["peers"]["result"].get(name) for run in having]
+        out.append(f"| {name} | " + " | ".join("-" if v is None else number(v) for v in values) + " |")
+    return [*out, ""]
+
+
+def reports(run: dict[str, Any]) -> list[str]:
+    """Cold start: reports against the imports they are made of."""
+    result = run["benchmarks"].get("report", {}).get("result")
+    if not result or "later" not in result:
+        return []
+    later, sample = result["later"], result["sample_later"]
+    return [
+        "## Cold start", "",
+        f"A report of two channels ({result['two_channels']['flight']}) with `--audit later`, as processes, by "
+        "processor time, against `import sionna.rt, matplotlib.pyplot, pandas` and against those without Sionna:", "",
+        "| | seconds | x imports | x imports without Sionna |", "| --- | ---: | ---: | ---: |",
+        *(
+            f"| {name} | {later[key]['cpu_s']:.1f} | {later[key]['ratio']:.2f} | {later[key]['ratio_light']:.2f} |"
+            for name, key in (("first report, all caches empty", "cold"), ("the next", "warm"))
+        ),
+        "",
+        f"The sample flight (five towers, ten channels) without audit and table of speed: {sample['cpu_s']:.1f} s of "
+        f"processor, {sample['wall_s']:.1f} s on the wall, {sample['peak_mib']:.0f} MiB.", "",
+    ]  # fmt: skip
+
+
+def page(found: list[dict[str, Any]]) -> str:
+    """The text of docs/performance.md."""
+    run = last_whole(found)
+    machine, scaling = run["machine"], run["benchmarks"]["scaling"]["result"]
+    beside = [f"{name}: {one['failed']}" for name, one in run["benchmarks"].items() if "failed" in one]
+    lines = [
+        "# Performance", "",
+        "Made by `make bench-all` (`python benchmarks/all.py` measures and appends to `benchmarks/history.jsonl`,",
+        "`python benchmarks/performance.py` makes this page from it). Numbers are of one machine and one run.",
+        "Processor seconds count all threads and processes; other work on the machine inflates them, so the load is",
+        "stated.", "",
+        f"Last run: {run['date']}, version {run['version']}, {machine['processor']}, {machine['cpus']} processors, "
+        f"{machine['memory_gib']} GiB, {machine['system']}, Python {machine['python']}; load {run['load_before']} "
+        f"before, {run['seconds'] / 60:.1f} min in all.", "",
+        *([f"Not measured: {'; '.join(beside)}.", ""] if beside else []),
+        "## Cost against size", "",
+        f"![Processor time and memory against size](images/{FIGURE})", "",
+        *scaling_tables(scaling),
+        "## Extrapolated", "",
+        *long_flight(scaling), *season(scaling), *city(scaling), "",
+        *reports(run),
+        *peers(found),
+    ]  # fmt: skip
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def draw(scaling: dict[str, Any], path: Path) -> None:
+    """Processor time (filled) and peak memory (open) against size, an axis each."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+    from matplotlib.figure import Figure
+
+    axes = [axis for axis in scaling if axis != "workers" and measured(scaling, axis)]
+    columns = 3
+    fig = Figure(figsize=(10, 3.1 * math.ceil(len(axes) / columns)), layout="constrained")
+    for number_, axis in enumerate(axes):
+        ax = fig.add_subplot(math.ceil(len(axes) / columns), columns, number_ + 1)
+        rows, title = measured(scaling, axis), AXES[axis][0]
+        sizes = [size_of(row) for row in rows]
+        ax.loglog(sizes, [r["cpu_s"] for r in rows], "o-", color="#0072B2", label="processor [s]")
+        ax.loglog(sizes, [r["peak_mib"] for r in rows], "s--", color="#D55E00", fillstyle="none", label="peak [MiB]")
+        ax.loglog(sizes, [rows[-1]["cpu_s"] * s / sizes[-1] for s in sizes], ":", color="#888888", label="linear")
+        ax.set_xlabel(title)
+        ax.set_title(f"power {power(scaling[axis]['power_cpu'])}", loc="left", fontsize=9)
+        ax.grid(visible=True, color="#E2E2E2")
+        if number_ == 0:
+            ax.legend(fontsize=8)
+    canvas = FigureCanvasAgg(fig)
+    fig.set_dpi(110)
+    with path.open("wb") as file:
+        canvas.print_png(file, metadata={"Software": None})
+
+
+def main() -> None:
+    """Write the page and its figure."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--history", type=Path, default=HISTORY)
+    parser.add_argument("--docs", type=Path, default=ROOT / "docs")
+    arguments = parser.parse_args()
+    found = runs(arguments.history)
+    text = page(found)
+    (arguments.docs / "images").mkdir(parents=True, exist_ok=True)
+    draw(last_whole(found)["benchmarks"]["scaling"]["result"], arguments.docs / "images" / FIGURE)
+    (arguments.docs / "performance.md").write_text(text, encoding="utf-8")
+    print(arguments.docs / "performance.md")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,43 @@
+"""A campaign on a SLURM cluster: workers are SLURM jobs, the scheduler and the campaign run here.
+
+    python slurm_campaign.py campaign.yaml --keep /shared/outcomes [more options of `aerpaw-cmp campaign`]
+
+Run it where `sbatch` works (a login node, or a small job of its own). The environment of this Python and the files of
+the campaign must lie under the same paths on every node. What your site wants (queue, account, memory, time) stands
+in SLURM_CAMPAIGN_..., or change the lines below.
+"""
+
+import os
+import subprocess
+import sys
+
+from dask_jobqueue import SLURMCluster
+
+
+def main() -> int:
+    """Start the workers, run the campaign on them, end them; gives the campaign's exit code."""
+    asked = os.environ
+    with SLURMCluster(
+        queue=asked.get("SLURM_CAMPAIGN_QUEUE"),
+        account=asked.get("SLURM_CAMPAIGN_ACCOUNT"),
+        cores=1,
+        memory=asked.get("SLURM_CAMPAIGN_MEMORY", "4GB"),
+        walltime=asked.get("SLURM_CAMPAIGN_TIME", "04:00:00"),
+        interface=asked.get("SLURM_CAMPAIGN_INTERFACE"),  # the network that nodes and login node share, e.g. ib0
+        python=sys.executable,
+        # the nodes get this environment: PATH, PYTHONPATH and the keys of an object store
+        job_extra_directives=["--export=ALL"],
+        job_script_prologue=["export OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1"],
+        scheduler_options={"dashboard_address": ":0"},
+    ) as cluster:
+        if "--show-job" in sys.argv:
+            print(cluster.job_script())
+            return 0
+        cluster.adapt(minimum_jobs=1, maximum_jobs=int(asked.get("SLURM_CAMPAIGN_JOBS", "40")))
+        cluster.wait_for_workers(1)
+        command = [sys.executable, "-m", "aerpaw_cmp", "campaign", *sys.argv[1:]]
+        return subprocess.run([*command, "--scheduler", cluster.scheduler_address], check=False).returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

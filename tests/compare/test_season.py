@@ -1,0 +1,80 @@
+"""Numbers over a season: against closed forms, brute force, and the coverage of their intervals."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.offset import grid_offset
+from aerpaw_cmp.compare.season import error_at_offset, left_out_offsets, mean_of_flights, trend, verdict_of
+
+
+def test_offset_of_the_others_is_the_search_over_their_samples():
+    rng = np.random.default_rng(3)
+    flights = [(rng.normal(-60, 5, n), rng.normal(-80, 5, n)) for n in (7, 30, 200, 1)]
+    found = left_out_offsets([len(m) for m, _ in flights], [float((s - m).mean()) for m, s in flights])
+    for i in range(len(flights)):
+        rest = [f for j, f in enumerate(flights) if j != i]
+        fit = grid_offset(np.concatenate([m for m, _ in rest]), np.concatenate([s for _, s in rest]))
+        assert found[i] == fit.offset_db
+
+
+def test_a_flight_alone_or_without_samples():
+    assert np.isnan(left_out_offsets([5], [1.0])).all()
+    assert left_out_offsets([5, 0], [1.0, np.nan])[1] == 1.0
+    assert np.isnan(left_out_offsets([5, 0], [1.0, np.nan])[0])
+
+
+def test_error_at_another_offset_is_the_error_of_the_samples_there():
+    rng = np.random.default_rng(4)
+    measured, simulated = rng.normal(-60, 5, 300), rng.normal(-80, 5, 300)
+    fit, mean = grid_offset(measured, simulated), float((simulated - measured).mean())
+    for offset in (-30.0, fit.offset_db, 0.0):
+        expected = np.sqrt(np.mean((measured + offset - simulated) ** 2))
+        assert error_at_offset(offset, fit.rmse_db, fit.offset_db, mean) == pytest.approx(expected, rel=1e-9)
+
+
+@pytest.mark.parametrize("n", [3, 8, 60])
+def test_intervals_of_a_mean_cover_as_they_say(n):
+    rng = np.random.default_rng(n)
+    inside = 0
+    for _ in range(600):
+        found = mean_of_flights(rng.normal(2.0, 1.0, n))
+        inside += found.low <= 2.0 <= found.high
+    assert 0.92 <= inside / 600 <= 0.985
+
+
+def test_flights_that_are_alike_count_as_fewer():
+    rng = np.random.default_rng(9)
+    noise = rng.normal(0, 1, 400)
+    alike = np.convolve(noise, np.ones(20) / 20**0.5, "valid")
+    free, drifting = mean_of_flights(noise[: len(alike)]), mean_of_flights(alike)
+    assert (drifting.high - drifting.low) > 2.5 * (free.high - free.low)
+
+
+def test_few_flights_and_missing_ones():
+    assert mean_of_flights([]).n == 0
+    two = mean_of_flights([1.0, np.nan, 3.0])
+    assert (two.n, two.mean) == (2, 2.0)
+    assert np.isnan(two.low)
+    assert verdict_of(two) == "none given"
+    assert verdict_of(mean_of_flights([1.0, 1.1, 0.9, 1.0])) == "worse"
+    assert verdict_of(mean_of_flights([1.0, -1.0, 0.5, -0.5])) == "no difference shown"
+    same = mean_of_flights(np.full(30, 0.25))
+    assert (same.low, same.high) == (0.25, 0.25)
+
+
+def test_a_drift_is_found_with_its_interval():
+    rng = np.random.default_rng(5)
+    days, inside = np.arange(0.0, 120.0, 2.0), 0
+    for _ in range(300):
+        found = trend(days, 3.0 + 0.4 * days / 30 + rng.normal(0, 0.7, len(days)))
+        inside += found.low <= 0.4 <= found.high
+    assert 0.91 <= inside / 300 <= 0.985
+    assert found.scatter == pytest.approx(0.7, rel=0.3)
+
+
+@pytest.mark.parametrize("days", [[0.0, 1.0], [5.0, 5.0, 5.0], [np.nan, 1.0, np.nan]])
+def test_no_drift_without_dates(days):
+    found = trend(days, np.arange(float(len(days))))
+    assert np.isnan([found.slope, found.low, found.scatter]).all()

@@ -1,0 +1,153 @@
+"""What test_workers.py checks on real Dask clusters, in a process of its own: prints one JSON object.
+
+A process of its own, since killed workers leave open sockets to the collector, which would warn in somebody else's test.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import sys
+import tempfile
+import threading
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import distributed
+from distributed.system import MEMORY_LIMIT
+
+from aerpaw_cmp.common.errors import AerpawCmpError
+from aerpaw_cmp.jobs import workers
+from aerpaw_cmp.jobs.workers import Lost, check_workers, open_workers
+
+
+def square(number: int) -> int:
+    return number * number
+
+
+def slow(number: int) -> int:
+    time.sleep(0.05)
+    return number * number
+
+
+def dies(item: tuple[int, str]) -> int:
+    """The third ends its worker the first time, the fifth every time."""
+    number, folder = item
+    mark = Path(folder) / str(number)
+    if number == 5 or (number == 3 and not mark.exists()):
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
+    found: dict[int, Any] = {}
+
+    def done(number: int, result: Any) -> None:
+        assert number not in found, "no task comes twice"
+        found[number] = result.message if isinstance(result, Lost) else result
+
+    crew.run(function, items, done)
+    return [found[i] for i in range(len(items))]
+
+
+def message(action: Callable[[], Any]) -> str:
+    try:
+        action()
+    except AerpawCmpError as error:
+        return f"{type(error).__name__}: {error}"
+    return "no error"
+
+
+def on_this_machine(folder: Path) -> dict[str, Any]:
+    told: list[str] = []
+    with open_workers(2, progress=lambda text, *_: told.append(text)) as crew:
+        limits = [one["memory_limit"] for one in crew._client.scheduler_info()["workers"].values()]
+        out = {
+            "count": crew.count,
+            "squares": collected(crew, square, list(range(25))),
+            "told": told,
+            "memory_share": sum(limits) / MEMORY_LIMIT,
+            "good": message(lambda: check_workers(crew._client, [folder], str(folder))),
+            "unseen": message(lambda: check_workers(crew._client, [folder / "nowhere"])),
+        }
+        real, workers.code_digest = workers.code_digest, lambda: "another"
+        out["other"] = message(lambda: check_workers(crew._client, []))
+        workers.code_digest = real
+        out["killed"] = collected(crew, dies, [(i, str(folder)) for i in range(8)])
+    return out
+
+
+def _port() -> int:
+    with socket.socket() as one:
+        one.bind(("127.0.0.1", 0))
+        return int(one.getsockname()[1])
+
+
+def _scheduler(port: int) -> Any:
+    """A scheduler and one worker in threads of this process."""
+    return distributed.LocalCluster(
+        n_workers=1, threads_per_worker=1, processes=False, scheduler_port=port, dashboard_address=None, silence_logs=50
+    )
+
+
+def restarted() -> dict[str, Any]:
+    """The scheduler ends after five of twenty tasks, and another one stands up at its address."""
+    port = _port()
+    told: list[str] = []
+    clusters = [_scheduler(port)]
+    found: dict[int, int] = {}
+
+    def restart() -> None:
+        clusters[0].close()
+        clusters.append(_scheduler(port))
+
+    def done(number: int, result: Any) -> None:
+        assert number not in found, "no task comes twice"
+        found[number] = result
+        if len(found) == 5:
+            threading.Thread(target=restart).start()
+
+    with open_workers(1, f"tcp://127.0.0.1:{port}", progress=lambda text, *_: told.append(text)) as crew:
+        crew.run(slow, range(20), done)
+    clusters[1].close()
+    return {"squares": [found[i] for i in range(20)], "told": told}
+
+
+def gone() -> str:
+    """The scheduler ends and stays away."""
+    workers.RECONNECT_S = 1.0
+    port = _port()
+    cluster = _scheduler(port)
+    found: dict[int, int] = {}
+
+    def done(number: int, result: Any) -> None:
+        found[number] = result
+        if len(found) == 3:
+            threading.Thread(target=cluster.close).start()
+
+    def whole() -> None:
+        with open_workers(1, f"tcp://127.0.0.1:{port}") as crew:
+            crew.run(slow, range(200), done)
+
+    return message(whole)
+
+
+def none_there() -> str:
+    workers.CONNECT_S = 0.5
+
+    def whole() -> None:
+        with open_workers(1, f"tcp://127.0.0.1:{_port()}"):
+            pass
+
+    return message(whole)
+
+
+if __name__ == "__main__":
+    with tempfile.TemporaryDirectory() as name:
+        result = {"local": on_this_machine(Path(name)), "restarted": restarted(), "gone": gone(), "none": none_there()}
+    sys.stdout.write(json.dumps(result))

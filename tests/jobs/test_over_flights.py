@@ -1,0 +1,73 @@
+"""What is said of several flights, computed by workers: the same numbers, from series that lie in a file."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.jobs import over_flights
+from aerpaw_cmp.jobs.over_flights import PairsOrder, RepeatSettings, pairs_of, rank_repeats, repeats
+from aerpaw_cmp.report.campaign_data import FlownRank, RssRow
+from tests.jobs.sent_by_pickle import SentByPickle
+
+
+def rows(flights: int = 6, links: int = 2, samples: int = 120) -> list[RssRow]:
+    rng = np.random.default_rng(0)
+    share = np.linspace(0.0, 1.0, samples)
+    out = []
+    for flight in range(flights):
+        place = np.column_stack([share * 200.0, 5.0 * np.sin(9.0 * share), np.full(samples, 30.0)])
+        place = place + rng.normal(0.0, 0.7, place.shape)
+        for link in range(links):
+            simulated = -60.0 - 0.05 * place[:, 0]
+            out.append(
+                RssRow(
+                    flight=f"f{flight}", setting="s", tower="LW1", channel=f"USRP{link}", unit="dBm", offset_db=0.0,
+                    rmse_db=2.0, correlation=1.0, n=samples, n_out_of_coverage=0, at_search_edge=False,
+                    rmse_ci95_db=None, offset_ci95_db=None, correlation_ci95=None, n_effective=1.0, lag_s=0.0,
+                    lag_verdict="", fitted=(), baselines={}, step_db=0.1, span_db=(-50.0, 50.0), time_s=share,
+                    distance_m=np.zeros(samples), position_m=place, simulated_dbm=simulated,
+                    measured_db=np.where(rng.random(samples) < 0.1, np.nan, simulated + rng.normal(0, 2, samples)),
+                    heading_deg=None if flight == 2 else rng.normal(90.0, 5.0, samples),
+                )
+            )  # fmt: skip
+    return out
+
+
+@pytest.mark.parametrize("shared", [False, True])
+def test_workers_find_the_pairs_of_one_process(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, shared: bool) -> None:
+    monkeypatch.setattr(over_flights, "WORTH_WORKERS", 0)
+    series, settings, crew = rows(), RepeatSettings(), SentByPickle()
+    alone = repeats(series, settings)
+    spread = repeats(series, settings, crew, str(tmp_path) if shared else None)
+    assert len(alone) == 30
+    assert any(pair.n > 50 for pair in alone)
+    assert repr(spread) == repr(alone)
+    assert len(crew.sizes) > 1
+    assert max(crew.sizes) < 2000, "orders carry names, not series"
+    assert not list(tmp_path.iterdir()), "what was written for the workers is gone"
+
+
+def test_series_that_were_damaged_are_not_used(tmp_path: Path) -> None:
+    (tmp_path / "x").write_bytes(b"no series")
+    order = PairsOrder(place=str(tmp_path), name="x", settings=RepeatSettings(), first_flights=("f0",))
+    with pytest.raises(ValueError, match="seal"):
+        pairs_of(order)
+
+
+def test_flights_of_ranks_that_lie_apart_are_not_searched(monkeypatch: pytest.MonkeyPatch) -> None:
+    asked = []
+    real = over_flights.repeat_rank
+    monkeypatch.setattr(over_flights, "repeat_rank", lambda *a, **k: asked.append(1) or real(*a, **k))
+    rng = np.random.default_rng(1)
+    place = np.column_stack([np.linspace(0.0, 300.0, 300), np.zeros(300), np.full(300, 30.0)])
+    rank = rng.integers(1, 5, 300).astype(float)
+    flown = [
+        FlownRank(flight=f"f{i}", tower="LW1", position_m=place + np.array([0.0, away, 0.0]), rank=rank)
+        for i, away in enumerate((0.0, 1.0, 500.0))
+    ]
+    (pair,) = rank_repeats(flown, 3.0)
+    assert (pair.first, pair.second, pair.n, pair.kappa) == ("f0", "f1", 300, 1.0)
+    assert len(asked) == 1

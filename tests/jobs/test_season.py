@@ -1,0 +1,106 @@
+"""A season from the rows of a campaign: held-out errors against brute force, planted drift and hill found again."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.jobs.season import find_reports, rank_settings, with_season
+from benchmarks import fabricated
+
+
+@pytest.fixture(scope="module")
+def data():
+    return fabricated.season(24, 4, 2, 2)
+
+
+def test_held_out_errors_are_those_of_the_offset_of_the_others(data):
+    rows = [r for r in data.rss if (r.setting, r.link) == ("setting 01", "LW2 USRP1")]
+    for row in rows[:4]:
+        others = [r for r in rows if r.flight != row.flight]
+        difference = np.concatenate([r.simulated_dbm - r.measured_db for r in others])
+        assert row.held_out_offset_db == pytest.approx(difference.mean(), abs=0.05 + 1e-9)
+        left = row.measured_db + row.held_out_offset_db - row.simulated_dbm
+        assert row.held_out_rmse_db == pytest.approx(np.sqrt((left**2).mean()), rel=1e-9)
+        assert row.held_out_rmse_db >= row.rmse_db - 1e-9
+
+
+def test_the_best_setting_stands_first_and_the_rest_by_flights_of_both(data):
+    ranking = data.season.over_all()
+    assert ranking[0].setting == "setting 02"
+    assert ranking[-1].setting == "setting 00"
+    first = {(r.flight, r.link): r.held_out_rmse_db for r in data.rss if r.setting == "setting 02"}
+    last = {(r.flight, r.link): r.held_out_rmse_db for r in data.rss if r.setting == "setting 00"}
+    by_flight = {}
+    for flight, link in set(first) & set(last):
+        by_flight.setdefault(flight, []).append(last[flight, link] - first[flight, link])
+    assert ranking[-1].n_paired == len(by_flight)
+    assert ranking[-1].difference_db == pytest.approx(np.mean([np.mean(v) for v in by_flight.values()]))
+    low, high = ranking[-1].difference_ci95_db
+    assert 0 < low < ranking[-1].difference_db < high
+    assert ranking[-1].verdict == "worse"
+    assert {r.link for r in data.season.ranking} == {"", "LW1 USRP1", "LW1 USRP2", "LW2 USRP1", "LW2 USRP2"}
+
+
+def test_settings_that_share_no_flight_have_no_difference(data):
+    early = [r for r in data.rss if r.setting == "setting 01" and r.flight < "flight_012"]
+    rows = early + [r for r in data.rss if r.setting == "setting 02" and r.flight >= "flight_012"]
+    ranking = rank_settings(rows, ["setting 01", "setting 02"], data.flights, "")
+    assert np.isnan(ranking[1].difference_db)
+    assert ranking[1].verdict == "none given"
+
+
+def test_the_planted_drift_is_found(data):
+    drift = [d for d in data.season.drift if d.setting == "setting 02"]
+    assert len(drift) == 4
+    assert all(d.slope_ci95_db[0] - 1 < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] + 1 for d in drift)
+    assert sum(d.slope_ci95_db[0] < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] for d in drift) >= 3
+
+
+def test_the_planted_hill_lies_where_it_was_put(data):
+    """Mean residual of all links by place: highest near (200 m, 300 m), north not flipped, east not exchanged."""
+    everything = next(p for p in data.season.places if not p.tower)
+    near = np.hypot(everything.east_m - 200, everything.north_m - 300) < 100
+    mirror = np.hypot(everything.east_m - 200, everything.north_m + 100) < 100
+    assert near.any()
+    assert everything.mean_db[near].mean() > everything.mean_db[~near].mean() + 1.0
+    if mirror.any():
+        assert everything.mean_db[near].mean() > everything.mean_db[mirror].mean() + 1.0
+
+
+def test_one_flight_has_its_own_errors_only(data):
+    alone = with_season(
+        dataclasses.replace(
+            data, flights=data.flights[:1], rss=tuple(r for r in data.rss if r.flight == data.flights[0])
+        )
+    )
+    assert not alone.season.held_out
+    assert all(np.isnan(r.held_out_rmse_db) for r in alone.rss)
+    assert alone.season.over_all()[0].mean_db > 0
+
+
+def test_relative_clocks_have_no_date(data):
+    bare = with_season(dataclasses.replace(data, rss=tuple(dataclasses.replace(r, start_ns=0) for r in data.rss)))
+    assert bare.season.started == {}
+    assert np.isnan(bare.season.drift[0].slope_db_per_30_days)
+    assert bare.season.drift[0].spread_db > 0
+
+
+def test_a_campaign_without_levels(data):
+    assert with_season(dataclasses.replace(data, rss=())).season.ranking == ()
+
+
+def test_reports_are_found_by_their_flight(tmp_path: Path):
+    for name, flight in (("first", "first"), ("second", "another"), ("third one", "third one"), ("bad", None)):
+        folder = tmp_path / "reports" / name
+        folder.mkdir(parents=True)
+        (folder / "report.html").write_text("")
+        (folder / "metrics.json").write_text(json.dumps({"flight": flight}) if flight else "[")
+    found = find_reports(
+        ["first", "second", "third one", "bad", "absent"], tmp_path / "reports" / "season", [tmp_path / "reports"]
+    )
+    assert found == {"first": "../first/report.html", "third one": "../third%20one/report.html"}

@@ -1,0 +1,116 @@
+"""campaign.html at the size of a season: what stands on it, what is left to the files, and how large it gets."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import json
+import re
+import sys
+import zlib
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.report import campaign_explorer, campaign_figures, campaign_html, canvas
+from aerpaw_cmp.report.explorer import as_json
+from aerpaw_cmp.report.packed import NONE
+from benchmarks import fabricated
+
+
+@pytest.fixture(scope="module")
+def data():
+    return fabricated.season(30, 6, 2, 2)
+
+
+def columns(content):
+    block = zlib.decompress(base64.b64decode(content["packed"]["data"]))
+    arrays = [np.frombuffer(block, f"<{k}", count=n, offset=o) for k, o, n in content["packed"]["arrays"]]
+    return {name: arrays[number] for name, number in content["rows"].items()}
+
+
+def test_every_row_is_in_the_page_within_half_a_step(data):
+    content = json.loads(as_json(campaign_explorer.payload(data)))
+    rows = columns(content)
+    assert len(rows["flight"]) == len(data.rss)
+    for i in range(0, len(data.rss), 41):
+        row = data.rss[i]
+        assert content["flights"][rows["flight"][i]]["name"] == row.flight
+        assert content["settings"][rows["setting"][i]] == row.setting
+        assert content["links"][rows["link"][i]]["name"] == row.link
+        for name, value in (("own", row.rmse_db), ("held", row.held_out_rmse_db), ("offset", row.offset_db)):
+            assert rows[name][i] * content["step"] == pytest.approx(value, abs=content["step"] / 2 + 1e-9)
+
+
+def test_a_row_without_a_held_out_error_has_none(data):
+    rows = tuple(dataclasses.replace(r, held_out_rmse_db=float("nan")) for r in data.rss)
+    content = campaign_explorer.payload(dataclasses.replace(data, rss=rows))
+    assert (columns(content)["held"] == NONE["i2"]).all()
+
+
+def test_too_many_rows_cost_the_last_settings_and_the_page_says_so(data):
+    content = campaign_explorer.payload(data, most_rows=len(data.rss) // 2)
+    assert data.reference in content["settings"]
+    assert data.season.over_all()[0].setting in content["settings"]
+    assert len(content["settings"]) < 6
+    assert content["left_out"] == f"the {6 - len(content['settings'])} settings that stand last, of 6"
+    assert len(columns(content)["flight"]) <= len(data.rss) // 2
+
+
+def test_the_page_stays_small_and_tells_what_it_does_not_show(data):
+    text = campaign_html.campaign_page(data, [], ["campaign.csv"])
+    assert text.count("<tr") < 1500
+    assert f"the {campaign_html.ROWS_SHOWN} rows of largest error of {len(data.rss)}" in text
+    assert "campaign.csv" in text
+    assert not re.search(r"<(script|link|img)[^>]+(src|href)=\"(?!data:)", text)
+
+
+def test_the_best_setting_is_named_in_words(data):
+    words = " ".join(campaign_html.headline(data))
+    assert "setting 02 errs least" in words
+    assert words.count("dB;") < 4  # not all settings in one sentence
+
+
+def test_hostile_names_stay_text(data):
+    bad = '</script><img src=x onerror="alert(1)">'
+    row = dataclasses.replace(data.rss[0], flight=bad, setting=bad, tower=bad, channel=bad)
+    from aerpaw_cmp.jobs.season import with_season
+
+    hostile = with_season(
+        dataclasses.replace(data, rss=(row,), flights=(bad,), settings={bad: {bad: bad}}, tracks=(), failures=()),
+        {bad: "../a%22b/report.html"},
+    )
+    text = campaign_html.campaign_page(hostile, [], [])
+    assert "<img" not in text
+    assert text.count("</script>") == 2
+
+
+def test_tables_as_csv_and_parquet_are_the_same(data, tmp_path):
+    pytest.importorskip("pyarrow")
+    table = campaign_html.campaign_frame(data)
+    (path,) = campaign_html.write_parquet(table, tmp_path / "campaign.parquet")
+    back = pd.read_parquet(path)
+    assert list(back.columns) == campaign_html.CSV_COLUMNS
+    assert len(back) == len(data.rss) + len(data.failures)
+    assert back["rmse_db"].to_numpy() == pytest.approx(table["rmse_db"].to_numpy(float), nan_ok=True)
+    assert back["held_out_rmse_db"].iloc[0] == data.rss[0].held_out_rmse_db
+
+
+def test_without_pyarrow_a_line_says_what_is_missing(data, tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pyarrow", None)
+    told = []
+    written = campaign_html.write_parquet(
+        campaign_html.campaign_frame(data), tmp_path / "campaign.parquet", lambda text, *_: told.append(text)
+    )
+    assert written == []
+    assert "aerpaw-cmp[geo]" in told[0]
+
+
+def test_figures_of_a_season_are_few_and_can_be_drawn(data):
+    plates = campaign_figures.plates(data)
+    assert {p.name for p in plates} >= {"season_errors", "season_drift", "season_places"}
+    assert len(plates) < 8
+    for plate in plates:
+        if plate.section == "season":
+            assert canvas.render(plate, ("png",)).formats["png"][:4] == b"\x89PNG"

@@ -1,0 +1,76 @@
+"""Figures by several processes are the figures of one."""
+
+from __future__ import annotations
+
+import os
+import signal
+import sys
+import threading
+import types
+from functools import partial
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.report import canvas, drawing
+
+linux = pytest.mark.skipif(
+    not sys.platform.startswith("linux"), reason="figures are shared by forked processes on Linux only"
+)
+
+
+def plate(number: int) -> canvas.Plate:
+    def draw():
+        fig = canvas.figure((3.0, 2.0))
+        fig.subplots().plot(np.arange(5) * number)
+        return fig
+
+    return canvas.Plate(name=f"p{number}", section="s", title="t", caption="c", alt="a", draw=draw)
+
+
+@linux
+def test_bytes_and_order_are_those_of_one_process() -> None:
+    draws = [partial(canvas.render, plate(n), ("svg", "png")) for n in range(5)]
+    alone = list(drawing.in_order(draws, 1))
+    shared = list(drawing.in_order(draws, 2))
+    assert [p.name for p in shared] == [f"p{n}" for n in range(5)]
+    for one, other in zip(alone, shared, strict=True):
+        assert one.formats["png"] == other.formats["png"]
+        assert one.formats["svg"] == other.formats["svg"]
+
+
+@linux
+def test_they_run_elsewhere_and_one_that_dies_is_made_up_for() -> None:
+    here = os.getpid()
+    assert here not in list(drawing.in_order([os.getpid] * 4, 2))
+
+    def dies(number: int) -> int:
+        if number == 2 and os.getpid() != here:
+            os.kill(os.getpid(), signal.SIGKILL)
+        return number
+
+    assert list(drawing.in_order([partial(dies, n) for n in range(5)], 2)) == list(range(5))
+
+
+def test_a_fault_in_a_figure_comes_through() -> None:
+    with pytest.raises(ZeroDivisionError):
+        list(drawing.in_order([lambda: 1 / 0] * 3, 2 if sys.platform.startswith("linux") else 1))
+
+
+def test_no_fork_where_it_is_unsafe_or_pays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(drawing.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+    monkeypatch.setattr(drawing.sys, "platform", "linux")
+    for name in ("drjit", "mitsuba"):
+        monkeypatch.delitem(sys.modules, name, raising=False)
+    monkeypatch.setattr(drawing.threading, "active_count", lambda: 1)
+    assert drawing.usable_processes(drawing.FEWEST) == 4
+    assert drawing.usable_processes(drawing.FEWEST - 1) == 1
+    monkeypatch.setitem(sys.modules, "drjit", types.ModuleType("drjit"))
+    assert drawing.usable_processes(100) == 1
+    monkeypatch.delitem(sys.modules, "drjit")
+    monkeypatch.setattr(drawing.threading, "active_count", lambda: 2)
+    assert drawing.usable_processes(100) == 1
+    monkeypatch.undo()
+    assert threading.active_count() >= 1
+    monkeypatch.setattr(drawing.sys, "platform", "darwin")
+    assert drawing.usable_processes(100) == 1

@@ -1,0 +1,67 @@
+"""The matrix of serving cells as a figure: its cells, its words, and that it reaches the page."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.serving import compare_serving
+from aerpaw_cmp.report import canvas, figures, html
+from aerpaw_cmp.report.serving_figures import confusion, serving_plate, shown_confusion
+
+
+@pytest.fixture
+def serving():
+    """Three cells of which the third never serves; the prediction takes it for the second at times."""
+    level = [[-70, -80, -99], [-70, -80, -99], [-90, -75, -99], [-90, -85, -80], [np.nan] * 3]
+    return compare_serving([0, 1, 1, 1, 0], level, ["LW1 PCI 1", "LW2 PCI 2", "LW3 PCI 3"])
+
+
+def test_counts_stand_in_the_row_that_served_and_the_column_predicted(serving):
+    with canvas.style():
+        fig = confusion(serving)
+    ax = fig.axes[0]
+    texts = {(round(t.get_position()[1]), round(t.get_position()[0])): t.get_text() for t in ax.texts}
+    assert texts[0, 0] == "1"  # LW1 served, LW1 predicted
+    assert texts[0, 3] == "1"  # LW1 served, nothing predicted
+    assert (texts[1, 0], texts[1, 1], texts[1, 2]) == ("1", "1", "1")
+    assert [t.get_text() for t in ax.get_yticklabels()] == ["LW1 PCI 1", "LW2 PCI 2", "LW3 PCI 3"]
+    assert ax.get_xlabel() == "Cell predicted strongest"
+    assert ax.get_ylabel() == "Cell that served"
+    assert len(ax.patches) == 3
+
+
+def test_words_are_those_of_the_numbers(serving):
+    plate = serving_plate(serving)
+    assert "5 samples" in plate.caption
+    assert "40 % of all" in plate.caption  # 2 of 5
+    assert "most hits 60 %" in plate.caption  # LW2 served 3 of 5
+
+
+def test_many_cells_are_gathered_without_losing_a_sample():
+    rng = np.random.default_rng(0)
+    n, cells = 4000, 60
+    served = np.minimum(rng.geometric(0.1, n) - 1, cells - 1)
+    whole = compare_serving(served, rng.normal(-80, 5, (n, cells)), [f"c{i}" for i in range(cells)])
+    names, table = shown_confusion(whole)
+    assert len(names) == 17
+    assert names[-1] == "others"
+    assert table.shape == (17, 18)
+    assert table.sum() == n
+    kept = [int(name[1:]) for name in names[:-1]]
+    assert np.trace(table[:16, :16]) == sum(whole.confusion[i, i] for i in kept)
+    with canvas.style():
+        assert len(confusion(whole).axes[0].patches) == 16  # "others" has no frame
+
+
+def test_it_stands_in_the_report(report_data, serving):
+    data = dataclasses.replace(report_data, serving=serving)
+    plates = [p for p in figures.plates(data) if p.section == "serving"]
+    assert [p.name for p in plates] == ["serving_confusion"]
+    pictures = [canvas.render(p, ("png",)) for p in plates]
+    page = html.page(data, pictures, [])
+    assert 'id="serving_confusion"' in page
+    assert "The prediction is no better than that." in page
+    assert 'id="serving"' not in html.page(report_data, [], [])

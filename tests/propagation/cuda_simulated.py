@@ -1,4 +1,4 @@
-# ruff: noqa: E402 (the simulator is chosen before numba is imported)
+# ruff: noqa: T201
 """Run by test_compiled.py in a process of its own: the CUDA field in numba's simulator against NumPy; prints the error."""
 
 import dataclasses

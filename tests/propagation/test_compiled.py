@@ -316,7 +316,7 @@ def test_cuda_without_a_device_is_one_message(monkeypatch, case):
 
     monkeypatch.setattr(cuda_field, "available", lambda: "numba finds no CUDA device")
     site, link, poses, _ = case
-    with pytest.raises(UsageError, match="rt.device: cuda, but numba finds no CUDA device"):
+    with pytest.raises(UsageError, match=r"rt\.device: cuda, but numba finds no CUDA device"):
         replay(site, link, poses, device="cuda")
 
 

@@ -56,9 +56,10 @@ $(READY_DOCS): $(READY)
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs
 	@touch $@
 
-# strict: a dead link or anchor, or a script of the gallery that fails, ends it
+# strict: a dead link or anchor, a page without a place in the menu, a failing script of the gallery end it; with --quiet
+# warnings would be hidden from --strict, too
 docs: $(READY_DOCS)
-	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict --quiet
+	NO_MKDOCS_2_WARNING=1 $(BIN)/python -m mkdocs build --strict
 	@echo "The documentation: $(CURDIR)/build/site/index.html"
 
 bench: $(READY_DEV) $(LLVM)

@@ -200,7 +200,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     """
     template = environment().get_template("report.html.jinja")
     linked = bool(data.rss or data.rank)
-    code = script("uplot.min.js", "explorer.js") if linked else ""
+    code = script("uplot.min.js", "common.js", "explorer.js") if linked else ""
     sections = by_section(pictures)
     text: str = template.render(
         data=data,

@@ -14,8 +14,12 @@ from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import draft
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.compare_flight import serving_of
+from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.report import figures
+from aerpaw_cmp.report.build import report_data
+from aerpaw_cmp.report.serving_figures import shown_confusion
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = "America/New_York"
@@ -83,3 +87,18 @@ def test_serving_cells_are_compared_with_the_strongest_predicted(phone: Path, ex
     assert found is not None
     assert (found.n, found.hit_share, found.majority_share) == (100, hits, 0.5)
     assert serving_of(data.rss[:1], results[:1]) is None, "one cell is no choice"  # type: ignore[arg-type]
+
+
+def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> None:
+    path = flight(phone, "cells: {1: LW1, 2: LW2}")
+    settings = load_flight(path)
+    found = run_flight(gather(settings, phone, read_logs(settings, phone)), audit=False)
+    record = report_data(found.data, found.result)
+    assert record.serving is not None
+    entry = record.extra_metrics["serving"]
+    (plate,) = (p for p in figures.plates(record) if p.section == "serving")
+    assert plate.page
+    names, table = shown_confusion(record.serving)
+    assert names == entry["cells"]
+    assert [list(entry["confusion"][name].values()) for name in names] == table.tolist()
+    assert f"{100 * entry['hit_share']:.0f} % of all" in plate.caption

@@ -278,14 +278,12 @@ def test_dark_and_light(driver):
     assert papers == [[255, 255, 255, 255], [23, 23, 23, 255]]
 
 
-def test_with_scripts_off_the_tables_and_figures_stand(data, tmp_path):
-    path = tmp_path / "map.html"
-    path.write_text(maps_html.maps_page(data, [], []), encoding="utf-8")
-    found = start(scripts=False)
+def test_with_scripts_off_the_tables_and_figures_stand(driver):
+    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
-        found.get(path.as_uri())
-        assert not found.find_element("id", "explorer").is_displayed()
-        assert found.find_element("css selector", "#result table").is_displayed()
-        assert found.find_element("css selector", "#rss summary").is_displayed()
+        driver.refresh()
+        assert not driver.find_element("id", "explorer").is_displayed()
+        assert driver.find_element("css selector", "#result table").is_displayed()
+        assert driver.find_element("css selector", "#rss summary").is_displayed()
     finally:
-        found.quit()
+        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})

@@ -4,7 +4,7 @@
 (() => {
   const data = JSON.parse(document.getElementById("explorer-data").textContent);
   const root = document.getElementById("explorer");
-  const at = id => document.getElementById(id);
+  const { at, css, number, cells, fill, ticks, later } = common;
 
   const arrays = data.arrays.map(a => {
     const raw = atob(a.data), bytes = new Uint8Array(raw.length);
@@ -12,7 +12,6 @@
     return a.type === "f8" ? new Float64Array(bytes.buffer) : new Float32Array(bytes.buffer);
   });
   const get = i => i === undefined || i === null ? null : arrays[i];
-  const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
 
   const state = { series: 0, model: 0, k: 0, span: null, pose: null, colour: "residual", against: 0, turn: 0, tilt: Math.PI / 2, zoom: 1, east: 0, north: 0 };
   const rss = () => data.rss[state.series] || null;
@@ -79,17 +78,9 @@
 
   // --- words --------------------------------------------------------------------------------------------------------
 
-  const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? v.toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
   function clock(t) {
     if (!data.start) return number(t, 2, "s");
     return new Date(Date.parse(data.start + "Z") + t * 1000).toISOString().slice(11, 21) + " UTC";
-  }
-  function cells(target, rows) {
-    target.replaceChildren(...rows.map(([name, value]) => {
-      const row = document.createElement("div"), dt = document.createElement("dt"), dd = document.createElement("dd");
-      dt.textContent = name; dd.textContent = value; row.append(dt, dd);
-      return row;
-    }));
   }
   function nearest(time, t) {
     let low = 0, high = time.length - 1;
@@ -377,16 +368,9 @@
   // --- residual against a quantity, and histograms ----------------------------------------------------------------------
 
   function frame(id) {
-    const c = at(id), p = c.getContext("2d"), ratio = devicePixelRatio || 1, w = c.clientWidth, h = c.clientHeight;
-    c.width = Math.round(w * ratio); c.height = Math.round(h * ratio);
-    p.setTransform(ratio, 0, 0, ratio, 0, 0); p.fillStyle = css("--paper"); p.fillRect(0, 0, w, h); p.font = "11px system-ui, sans-serif";
-    return [p, w, h];
-  }
-
-  function ticks(low, high, most = 5) {
-    const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw), out = [];
-    for (let v = Math.ceil(low / step) * step; v <= high + 1e-9; v += step) out.push(Math.abs(v) < 1e-9 ? 0 : v);
-    return out;
+    const found = common.frame(at(id));
+    found[0].font = "11px system-ui, sans-serif";
+    return found;
   }
 
   function drawScatter() {
@@ -446,23 +430,12 @@
 
   // --- linking ---------------------------------------------------------------------------------------------------------
 
-  let waiting = new Set();
-  function later(...jobs) {
-    if (!waiting.size) requestAnimationFrame(() => { const now = [...waiting]; waiting = new Set(); for (const job of now) job(); });
-    jobs.forEach(job => waiting.add(job));
-  }
   const lines = () => { linking = true; for (const c of charts) c.chart.redraw(false); linking = false; };
 
   function choose(t) { if (t === state.pose) return; state.pose = t; later(lines, drawMap, describe); }
   function span(s) { state.span = s && s[1] > s[0] ? s : null; later(lines, drawMap, drawScatter, drawHistogram, summarise); }
   function zoomTo(s) { range = s || fullRange(); linking = true; for (const c of charts) c.chart.setScale("x", { min: range[0], max: range[1] }); linking = false; }
   function everything() { drawCharts(); drawMap(); drawScatter(); drawHistogram(); summarise(); describe(); }
-
-  function fill(select, names, chosen) {
-    select.replaceChildren(...names.map((name, i) => { const o = document.createElement("option"); o.value = i; o.textContent = name; return o; }));
-    select.value = chosen;
-    select.closest("label").hidden = names.length < 2;
-  }
 
   function controls() {
     const s = rss(), r = rank();

@@ -276,13 +276,13 @@ def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[t
     there = {tuple(row[row >= 0].tolist()) for row in found.paths.faces}
     for words, sequence in simple_paths(found):
         if tuple(sequence.tolist()) not in there:
-            yield words, why_not(found.faces, source, target, sequence) or _elsewhere(found)
+            yield words, why_not(found.faces, source, target, sequence, found.surfaces) or _elsewhere(found)
 
 
 def _elsewhere(found: Replay) -> str:
     if found.engine == "sionna":
         return f"nothing is in its way: not found with {found.samples} samples per tower"
-    return "geometry allows it: left out by terrain, by another tower's ground, or by rt.relevance_db"
+    return "geometry allows it: left out by terrain or by another tower's ground"
 
 
 def _differences(
@@ -304,23 +304,18 @@ def _differences(
         more = set(_by_plane(ours, replay_poses(data.site, wide, link, pose, engine="sionna", progress=progress))[1])
     for key in missing:
         path = explained[mine[key]]
-        if near_an_edge(ours.faces, source, target, path):
+        if near_an_edge(ours.faces, source, target, path, ours.surfaces):
             reason = "within 1 mm of an edge: float32 decides otherwise"
         elif key in more:
             reason = f"sample budget: found with {MORE_SAMPLES * theirs.samples} samples, not with {theirs.samples}"
         else:
             reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
         yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    full = None
     levels = {p.planes: p for p in _paths(data, rt, theirs, link, pose, source)}
     for key, sequence in others.items():
         if key in mine:
             continue
-        if rt.relevance_db is not None and full is None:
-            full = replay_poses(data.site, rt.model_copy(update={"relevance_db": None}), link, pose, engine="image")
-        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64))
-        if not reason and full is not None and key in _by_plane(full, theirs)[0]:
-            reason = f"below the bound: left out by rt.relevance_db: {rt.relevance_db:g}"
+        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64), theirs.surfaces)
         path = levels[sequence]
         yield OtherEngine(
             found_by="sionna", path=path.words, level_dbm=_level(path.level_dbm), reason=reason or "no reason found"

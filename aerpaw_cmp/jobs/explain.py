@@ -282,7 +282,7 @@ def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[t
 def _elsewhere(found: Replay) -> str:
     if found.engine == "sionna":
         return f"nothing is in its way: not found with {found.samples} samples per tower"
-    return "geometry allows it: left out by terrain or by another tower's ground"
+    return "geometry allows it: stopped by the terrain, or the ground of another tower"
 
 
 def _differences(

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..compare.report_difference import Changed, LevelDifference, RankDifference
+from ..compare.report_difference import Changed, LevelDifference, Overlap, RankDifference
 from ..compare.statistics import PairedDifference
 from .words import count
 
@@ -120,9 +120,20 @@ def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
     if abs(one.rmse.difference_db) > tolerance_db:
         yield f"RMSE by {one.rmse.difference_db:+.3g} dB"
     if one.samples.only_first or one.samples.only_second:
-        yield f"{one.samples.only_first} samples only in the first, {one.samples.only_second} only in the second"
+        yield _alone(one.samples)
     elif one.scored.first != one.scored.second or one.scored.common != one.scored.first:
         yield f"{one.scored.first} scored samples against {one.scored.second}"
+
+
+def _alone(samples: Overlap) -> str:
+    """How many samples are in one report alone, and when."""
+    sides = ((samples.only_first, samples.first_span, "first"), (samples.only_second, samples.second_span, "second"))
+    told = [
+        f"{n} samples only in the {name}" + (f" ({span[0]} to {span[1]})" if span else "")
+        for n, span, name in sides
+        if n
+    ]
+    return ", ".join(told)
 
 
 def _rank_clauses(one: RankDifference) -> Iterator[str]:
@@ -131,7 +142,7 @@ def _rank_clauses(one: RankDifference) -> Iterator[str]:
     if one.n_reported_changed:
         yield f"{one.n_reported_changed} of {one.samples.common} reported ranks"
     if one.samples.only_first or one.samples.only_second:
-        yield f"{one.samples.only_first} samples only in the first, {one.samples.only_second} only in the second"
+        yield _alone(one.samples)
 
 
 # --- words ----------------------------------------------------------------------------------------------------------
@@ -164,7 +175,9 @@ def _level_verdict(diff: ReportDiff) -> str:
     if not scored or diff.pooled is None:
         return ""
     if all(abs(one.rmse.difference_db) <= diff.tolerance_db for one in scored):
-        return "RSS errors agree on the common samples."
+        moved = max((one.simulated_max_db for one in scored if math.isfinite(one.simulated_max_db)), default=0.0)
+        though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
+        return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
     text = f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second"
     text += {

@@ -17,8 +17,8 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -120,12 +120,12 @@ def run_one(name: str, command: list[str]) -> dict[str, Any]:
         return {**found, "failed": "no JSON on standard output"}
 
 
-def run_axes(command: list[str]) -> dict[str, Any]:
+def run_axes(command: list[str], axes: Sequence[str] = AXES) -> dict[str, Any]:
     """The scaling, one axis after the other: one that is not done in time costs no other."""
-    parts = {axis: run_one(f"scaling of {axis}", [*command, axis]) for axis in AXES}
+    parts = {axis: run_one(f"scaling of {axis}", [*command, axis]) for axis in axes}
     found: dict[str, Any] = {
         "seconds": round(sum(one["seconds"] for one in parts.values()), 1),
-        "load_before": parts[AXES[0]]["load_before"],
+        "load_before": parts[axes[0]]["load_before"],
         "result": {axis: one["result"][axis] for axis, one in parts.items() if "result" in one},
     }
     if missing := [f"{axis}: {one['failed']}" for axis, one in parts.items() if "failed" in one]:
@@ -137,6 +137,7 @@ def main() -> int:
     """Run, tell, remember."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--axes", nargs="+", choices=AXES, default=AXES, help="of the scaling")
     parser.add_argument("--history", type=Path, default=HISTORY)
     parser.add_argument("--no-history", action="store_true", help="print only")
     arguments = parser.parse_args()
@@ -148,7 +149,9 @@ def main() -> int:
         "machine": machine(),
         "load_before": round(os.getloadavg()[0], 2),
         "benchmarks": {
-            name: (run_axes if name == "scaling" else partial(run_one, name))(COMMANDS[name]) for name in arguments.only
+            name: run_axes(command, arguments.axes) if name == "scaling" else run_one(name, command)
+            for name, command in COMMANDS.items()
+            if name in arguments.only
         },
     }
     entry["seconds"] = round(time.perf_counter() - start, 1)

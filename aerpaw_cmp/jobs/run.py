@@ -198,7 +198,7 @@ def run_report(
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
-    formats = chosen_formats([*settings.report.export, *export])
+    formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -799,7 +799,7 @@ def run_campaign(
 
     stages = Stages(progress)
     campaign = load_campaign(path)
-    formats = chosen_formats([*campaign.export, *export])
+    formats = chosen_formats(campaign.export, export)
     inputs = input_files(campaign, path)
     for entry in campaign.flights:
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result

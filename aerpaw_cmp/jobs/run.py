@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import AerpawCmpError, UsageError
+from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
@@ -805,14 +805,16 @@ def run_campaign(
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
             inputs += input_files(load_flight(path.parent / entry), path.parent / entry, logs_root)
     folder = out or Path("reports") / campaign.campaign
-    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output:
+    kept = None if fresh else campaign_keep(campaign, path, keep)
+    left = f"finished tasks are kept in {kept}, and the same command computes the rest" if kept else "nothing is kept"
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output, noting_interrupts(left):
         data = run_all(
             campaign,
             path.parent,
             logs_root=logs_root,
             workers=workers,
             scheduler=scheduler,
-            keep=None if fresh else campaign_keep(campaign, path, keep),
+            keep=kept,
             stage=stages,
             progress=progress,
         )

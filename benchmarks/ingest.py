@@ -135,30 +135,38 @@ def _blocks(lines: int) -> Iterator[tuple[int, int]]:
         yield first, min(STEP, lines - first)
 
 
+def _wall(first: int, count: int, step_ns: int) -> np.ndarray:  # type: ignore[type-arg]
+    """Local times of some lines as bytes, to the microsecond."""
+    times = START - np.timedelta64(5, "h") + (first + np.arange(count)) * np.timedelta64(step_ns, "ns")
+    text = np.datetime_as_string(times, unit="us").astype("S26")
+    text.view(np.uint8).reshape(count, 26)[:, 10] = 32
+    return text
+
+
 def write_sounder(place: Path, lines: int) -> None:
     """A power log; its octal offsets run through."""
-    rng = np.random.default_rng(5)
+    values = [b"%16.6f" % value for value in np.random.default_rng(5).normal(-40, 9, STEP)]
     with place.open("wb") as file:
         for first, count in _blocks(lines):
-            times = START + (first + np.arange(count)) * np.timedelta64(3_276_000, "ns")
-            block = format_power_log(times, rng.normal(-40, 9, count), ZONE).split(b"\n")[:-1]
-            block = [line for line in block if len(line) > 40]  # no foot lines in the middle
-            for i, line in enumerate(block):
-                file.write(b"%s%07o%s\n" % (line[:29], 4 * (first + i), line[36:]))
+            times = _wall(first, count, 3_276_000).tolist()
+            rows = zip(times, range(first, first + count), values, strict=False)
+            file.writelines(b"[%s] %07o%s\n" % (time, 4 * i, value) for time, i, value in rows)
 
 
 def write_vehicle(place: Path, lines: int) -> None:
     """Telemetry of ten fields; its index runs through."""
     rng = np.random.default_rng(6)
     names = ("altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "velocity_north_mps", "velocity_east_mps")
+    track = pd.DataFrame({name: rng.uniform(-9, 9, STEP) for name in names}).assign(time=START)
+    track = track.assign(latitude_deg=35.73 + track["roll_deg"] / 1e3, longitude_deg=-78.7)
+    track = track.assign(velocity_down_mps=0.5, fix=4, satellites=20)
+    made = format_vehicle_out(track, ZONE).splitlines(keepends=True)
+    stamp = b"2025-03-02 10:00:00.000000"
+    parts = [line.partition(b",")[2].partition(stamp)[::2] for line in made]
     with place.open("wb") as file:
         for first, count in _blocks(lines):
-            times = START + (first + np.arange(count)) * np.timedelta64(10_000_000, "ns")
-            track = pd.DataFrame({name: rng.uniform(-9, 9, count) for name in names})
-            track = track.assign(time=times, latitude_deg=35.73 + track["roll_deg"] / 1e3, longitude_deg=-78.7)
-            track = track.assign(velocity_down_mps=0.5, fix=4, satellites=20)
-            for i, line in enumerate(format_vehicle_out(track, ZONE).splitlines(keepends=True)):
-                file.write(b"%d,%s" % (first + i, line.partition(b",")[2]))
+            rows = zip(_wall(first, count, 5_000_000).tolist(), range(first, first + count), parts, strict=False)
+            file.writelines(b"%d,%s%s%s" % (i, before, time, after) for time, i, (before, after) in rows)
 
 
 def write_quectel(place: Path, lines: int) -> None:

@@ -173,6 +173,26 @@ def test_a_completion_script_for_each_shell(name: str) -> None:
     assert "_AERPAW_CMP_COMPLETE" in done.stdout
 
 
+def test_an_interrupted_campaign_says_where_its_outcomes_are(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def stop(*_: Any, **__: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("aerpaw_cmp.jobs.campaign.run", stop)
+    file = tmp_path / "campaign.yaml"
+    file.write_text(f"campaign: c\nflights: [{SAMPLE / 'flight.yaml'}]\n")
+    line = ["campaign", str(file), "-o", str(tmp_path / "out")]
+    for more, said in (
+        (["--keep", str(tmp_path / "k")], f"finished tasks are kept in {tmp_path / 'k'}"),
+        (["--fresh"], "nothing is kept"),
+    ):
+        assert main([*line, *more]) == 130
+        err = capsys.readouterr().err
+        assert said in err
+        assert f"{tmp_path / 'out'} was not written" in err
+
+
 def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
     before = tmp_path / "r" / "note.txt"
     before.parent.mkdir()

@@ -8,11 +8,11 @@ from __future__ import annotations
 import typer
 
 from ..common.errors import UsageError
-from . import campaign, diff, flight, live, logs, machine, site
+from . import campaign, diff, explain, flight, live, logs, machine, site
 from .app import Interrupted, app
 from .shown import say
 
-GROUPS = (logs, flight, campaign, diff, live, site, machine)
+GROUPS = (logs, flight, explain, campaign, diff, live, site, machine)
 """The modules whose commands there are: importing them registers these."""
 
 

@@ -8,6 +8,7 @@ COMMANDS: dict[str, str] = {
     "report": "Replay a flight, calibrate, compare with the measurement, write the report.",
     "audit": "Fill the audit and the table of speed into a report that was written without them.",
     "campaign": "Many flights and settings: pooled offsets, held-out flights, repeatability.",
+    "explain": "Every path of a link at an instant: faces, angles, each loss, the sum.",
     "diff": "What changed between two reports of a flight: settings, inputs, numbers with intervals.",
     "calibrate": "Learn antennas from several flights; score them on what was left out.",
     "tap": "Log the rank indicator live from the modem's serial port.",

@@ -15,6 +15,8 @@ Any other exception that reaches a user is a bug of ours.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -48,6 +50,16 @@ def add_note(error: BaseException, text: str) -> None:
     What ``BaseException.add_note`` of Python 3.11 does.
     """
     error.__notes__ = [*getattr(error, "__notes__", ()), text]  # type: ignore[attr-defined]
+
+
+@contextmanager
+def noting_interrupts(text: str) -> Iterator[None]:
+    """An interrupt inside says ``text`` when it is told."""
+    try:
+        yield
+    except KeyboardInterrupt as error:
+        add_note(error, text)
+        raise
 
 
 class AerpawCmpError(Exception):

@@ -108,7 +108,6 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 ks=ks,
                 expected=expected,
                 reference_links=int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS)),
-                complete=rt.relevance_db is None,
             )
         )
     if not parts:

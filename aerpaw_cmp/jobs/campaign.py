@@ -24,9 +24,10 @@ from ..common.yamlfile import load_yaml, nearest
 from ..compare.heldout import rmse
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
-from ..report.campaign_data import CampaignData, Failure, RssRow
+from ..report.campaign_data import CampaignData, Failure, RankHeldOutFold, RssRow
 from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
 from .campaign_plan import compute, kept_outcomes
+from .campaign_rank_fit import K_KEY, fit_rank_all
 from .campaign_tasks import Task, fitted_to, flight_data
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 from .place import check_place, open_place
@@ -44,8 +45,11 @@ AS_WRITTEN = "as written"
 class HeldOutSettings(Settings):
     """Parameters that are fitted on some flights and scored on all."""
 
-    fit: Annotated[dict[str, list[float]], Field(min_length=1)]
-    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``."""
+    fit: Annotated[dict[str, list[float] | list[list[float]]], Field(min_length=1)]
+    """Dotted flight key -> values to try, increasing. Keys below ``link``, ``rt`` or ``site``, or ``rss.lag``; for rank
+    also ``rank.k``, and lists as values (slants)."""
+    criterion: Literal["rmse", "kappa", "log_score", "total_variation"] = "rmse"
+    """What the fit lowers or raises: the RMSE of RSS, or a number of the reported rank."""
     fit_on: list[str] | None = None
     """Names of the flights to fit on; without it each flight is left out once."""
     setting: str | None = None
@@ -84,16 +88,30 @@ def load_campaign(path: Path) -> CampaignFile:
     campaign = load_yaml(path, CampaignFile)
     fit = campaign.held_out
     for key, values in (fit.fit if fit else {}).items():
-        if not values or np.any(np.diff(values) <= 0):
+        lists = bool(values) and isinstance(values[0], list)
+        if not values or (not lists and np.any(np.diff(values) <= 0)):
             raise UsageError(f"held_out.fit.{key}: {values}", expected="increasing values", path=path)
-        if key.split(".")[0] not in ("link", "rt", "site") and key != "rss.lag":
-            raise UsageError(f"held_out.fit.{key}", expected="a key below link, rt or site, or rss.lag", path=path)
+        _check_key(key, lists, of_rank=fit is not None and fit.criterion != "rmse", path=path)
     labels = list(campaign.settings) or [AS_WRITTEN]
     if fit and fit.setting is not None and fit.setting not in labels:
         near = nearest(fit.setting, labels)
         cause = f"did you mean {near!r}?" if near else None
         raise UsageError(f"held_out.setting {fit.setting!r}", expected="one of settings", cause=cause, path=path)
     return campaign
+
+
+def _check_key(key: str, lists: bool, *, of_rank: bool, path: Path) -> None:
+    """A key of the fit that its criterion can be fitted over."""
+    own = K_KEY if of_rank else "rss.lag"
+    if key.split(".")[0] not in ("link", "rt", "site") and key != own:
+        raise UsageError(
+            f"held_out.fit.{key}",
+            expected=f"a key below link, rt or site, or {own}",
+            cause=None if key != K_KEY else "criterion: kappa, log_score or total_variation fits rank",
+            path=path,
+        )
+    if lists and not of_rank:
+        raise UsageError(f"held_out.fit.{key}: lists", expected="numbers; lists are tried for rank alone", path=path)
 
 
 # --- all of it --------------------------------------------------------------------------------------------------------
@@ -160,11 +178,16 @@ def run(
             flown = [f for o in results for f in o.flown]
             ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
         folds: list[Any] = []
+        rank_folds: list[RankHeldOutFold] = []
         trouble = ""
         if campaign.held_out is not None:
             with stage("held-out"):
                 try:
-                    folds = _held_out(campaign.held_out, tasks, rows, crew, progress)
+                    if campaign.held_out.criterion == "rmse":
+                        folds = _held_out(campaign.held_out, tasks, rows, crew, progress)
+                    else:
+                        ranked = {row.flight for o in results for row in o.rank}
+                        rank_folds = _held_out_rank(campaign.held_out, tasks, ranked, progress)
                 except AerpawCmpError as error:
                     trouble = str(error)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
@@ -188,6 +211,7 @@ def run(
         repeats=tuple(found),
         rank_repeats=tuple(ranks_again),
         held_out=tuple(folds),
+        held_out_rank=tuple(rank_folds),
         held_out_failure=trouble,
         radius_m=campaign.repeatability.radius_m,
         heading_within_deg=campaign.repeatability.heading_within_deg,
@@ -235,13 +259,31 @@ def _held_out(
     of = {task.flight: task for task in tasks if task.setting == label and task.flight in with_rss}
     return fit_all(
         {flight: flight_data(task) for flight, task in of.items()},
-        settings.fit,
+        {key: [float(v) for v in values if not isinstance(v, list)] for key, values in settings.fit.items()},
         settings.fit_on,
         setting=label,
         samples=settings.samples,
         refine=settings.refine,
         progress=progress,
         spread=spread_over(workers, of, settings),
+    )
+
+
+def _held_out_rank(
+    settings: HeldOutSettings, tasks: Sequence[Task], ranked: set[str], progress: Progress
+) -> list[RankHeldOutFold]:
+    """Fit rank parameters under one setting on the flights that gave rank."""
+    assert settings.criterion != "rmse"
+    label = settings.setting or tasks[0].setting if tasks else ""
+    flights = {t.flight: flight_data(t) for t in tasks if t.setting == label and t.flight in ranked}
+    return fit_rank_all(
+        flights,
+        settings.fit,
+        settings.fit_on,
+        criterion=settings.criterion,
+        setting=label,
+        samples=settings.samples,
+        progress=progress,
     )
 
 
@@ -289,7 +331,8 @@ def _check_names(
     for path, flight in files.values():
         for key, values in campaign.held_out.fit.items():
             try:
-                overridden(flight, {key: values[0]})
+                if key != K_KEY:
+                    overridden(flight, {key: values[0]})
             except UsageError as error:
                 raise UsageError(
                     f"held_out.fit for {path}: {error.found}", expected=error.expected, cause=error.cause

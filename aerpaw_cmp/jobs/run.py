@@ -11,7 +11,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ..common.errors import AerpawCmpError, UsageError
+from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
@@ -198,7 +198,7 @@ def run_report(
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
     settings = _overridden(load_flight(flight), engine, audit)
-    formats = chosen_formats([*settings.report.export, *export])
+    formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -799,20 +799,22 @@ def run_campaign(
 
     stages = Stages(progress)
     campaign = load_campaign(path)
-    formats = chosen_formats([*campaign.export, *export])
+    formats = chosen_formats(campaign.export, export)
     inputs = input_files(campaign, path)
     for entry in campaign.flights:
         with suppress(AerpawCmpError):  # a flight file that cannot be read is a row of the result
             inputs += input_files(load_flight(path.parent / entry), path.parent / entry, logs_root)
     folder = out or Path("reports") / campaign.campaign
-    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output:
+    kept = None if fresh else campaign_keep(campaign, path, keep)
+    left = f"finished tasks are kept in {kept}, and the same command computes the rest" if kept else "nothing is kept"
+    with OutputFolder(folder, job="campaign", inputs=inputs, force=force) as output, noting_interrupts(left):
         data = run_all(
             campaign,
             path.parent,
             logs_root=logs_root,
             workers=workers,
             scheduler=scheduler,
-            keep=None if fresh else campaign_keep(campaign, path, keep),
+            keep=kept,
             stage=stages,
             progress=progress,
         )

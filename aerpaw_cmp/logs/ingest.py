@@ -20,7 +20,7 @@ from . import archives, blocks
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
-from .records import has_wall_clock
+from .records import ReadResult, has_wall_clock
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -358,7 +358,7 @@ def _read(
 
     given = _options(path, options, beside or _beside(path))
     try:
-        result = limits.check(reader.read(data, given))
+        result = limits.check(_parsed(reader, data, given))
     except (InputError, UsageError) as error:
         if error.path is None:  # readers know bytes only
             raise type(error)(
@@ -374,6 +374,16 @@ def _read(
             path=path,
         )
     return IngestedFile(str(path), digest, result)
+
+
+def _parsed(reader: Reader, data: bytes, options: ReadOptions) -> ReadResult:
+    """What a reader says of content in memory; of a large one (a member of an archive) block by block."""
+    if reader.in_blocks is not None and len(data) >= blocks.FROM_BYTES:
+        try:
+            return reader.in_blocks((data[i : i + 2**22] for i in range(0, len(data), 2**22)), options)
+        except blocks.Whole:
+            pass
+    return reader.read(data, options)
 
 
 def _folder(

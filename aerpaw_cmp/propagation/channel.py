@@ -15,7 +15,7 @@ than was sent.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -174,8 +174,13 @@ def _chunk_field(
     array: Array,
     poses: Poses,
     link: Link,
+    record: Callable[[str, AnyArray], None] | None = None,
 ) -> ComplexArray:
-    """Complex amplitude (rows, uav elements, tower elements) of some paths of one tower."""
+    """Complex amplitude (rows, uav elements, tower elements) of some paths of one tower.
+
+    ``record`` is told what it is made of: "wave" (3, rows, uav elements, tower elements) after the tower and after each
+    reflection, "spreading", and "uav", the field vectors of the UAV's elements.
+    """
     depth = int(paths.depth[rows].max(initial=0))
     wavelength = wavelength_m(link.carrier_hz)
     sequence = paths.faces[rows, :depth]
@@ -195,11 +200,17 @@ def _chunk_field(
         directions.insert(0, _mirror(normal[:, :, None, None], directions[0]))
     wave = _radiate(array, np.broadcast_to(array.mount, (len(rows), 3, 3)), directions[0], 3)
     for step, normal in enumerate(normals):
+        if record is not None:
+            record("wave", wave)
         wave = _reflect(wave, directions[step], normal[:, :, None, None], sequence[:, step], tables, wavelength)
-    received = (_radiate(link.uav_array, turn, -toward, 2) * wave).sum(axis=0)
+    uav_field = _radiate(link.uav_array, turn, -toward, 2)
+    received = (uav_field * wave).sum(axis=0)
     cycles = length / wavelength
     with np.errstate(divide="ignore"):
         amplitude = np.minimum(1.0, 1.0 / (4.0 * np.pi * cycles))
+    if record is not None:
+        for name, value in (("wave", wave), ("spreading", amplitude), ("uav", uav_field)):
+            record(name, value)
     return np.asarray(received * amplitude * np.exp(-2j * np.pi * (cycles - np.round(cycles))))
 
 

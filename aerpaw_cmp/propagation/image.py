@@ -46,7 +46,6 @@ CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
 
 Progress = Callable[[float], None]
-Select = Callable[[int, "list[Sequences]"], "list[Sequences]"]
 
 
 def find_paths(
@@ -58,7 +57,6 @@ def find_paths(
     usable: BoolArray | None = None,
     excluded: BoolArray | None = None,
     budget: int = SEQUENCE_BUDGET,
-    select: Select | None = None,
     extent_m: FloatArray | None = None,
     work: int = 0,
     threads: int | None = None,
@@ -81,8 +79,6 @@ def find_paths(
         Links without any path, e.g. poses inside buildings.
     budget : int
         Largest number of sequences followed per tower.
-    select : callable, optional
-        ``select(tower, levels)`` gives the sequences to follow of those that geometry allows.
     extent_m : (points, 3), optional
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     work : int
@@ -118,8 +114,7 @@ def find_paths(
         targets = targets_m[alive[tower]]
         if not len(targets):
             return []
-        tree = Sequences.of(faces, box, facing, sources_m[tower], targets, usable_faces, max_depth, budget, tolerance_m)
-        return select(tower, tree) if select else tree
+        return Sequences.of(faces, box, facing, sources_m[tower], targets, usable_faces, max_depth, budget, tolerance_m)
 
     found: list[PathSet] = []
     for group, levels in _groups(sequences, len(sources_m)):

@@ -34,6 +34,7 @@ def find_paths(
     max_depth: int = 2,
     usable: BoolArray | None = None,
     excluded: BoolArray | None = None,
+    extent_m: FloatArray | None = None,
     threads: int | None = None,
     progress: Progress | None = None,
 ) -> tuple[PathSet, Effort]:
@@ -50,6 +51,8 @@ def find_paths(
         0 to 3.
     usable : (towers, faces) bool, optional
     excluded : (towers, poses) bool, optional
+    extent_m : (points, 3), optional
+        Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     threads : int, optional
         Default: the cores that this process may use.
     progress : callable, optional
@@ -60,7 +63,7 @@ def find_paths(
         Sorted by pose, tower, depth, faces.
     Effort
     """
-    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
+    tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
     found, effort = grow_paths(
         solid_surfaces(faces, sources_m, targets_m),
         sources_m,

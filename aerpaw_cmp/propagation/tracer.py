@@ -23,7 +23,7 @@ from .compiled import ENOUGH_WORK
 from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .paths import Faces, PathSet
-from .relevance import Relevance
+from .relevance import idle_objects, in_words
 from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
 
@@ -171,8 +171,7 @@ def replay(
         Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
     relevance_db : float, optional
-        ``image`` only: leave out face sequences that cannot change the RSS of any link by more than this
-        (:mod:`aerpaw_cmp.propagation.relevance`).
+        Say in ``left_out`` which buildings move no RSS by more than this (:mod:`aerpaw_cmp.propagation.relevance`).
     drop_small_faces : bool
         Leave out faces smaller than the first Fresnel zone of every link.
     visibility : {"centre", "pairs"}
@@ -194,16 +193,18 @@ def replay(
     Raises
     ------
     UsageError
-        Unknown tower or engine, a scene too large for ``image``, ``relevance_db`` with ``sionna``.
+        Unknown tower or engine, a scene too large for ``image``, a ``relevance_db`` that is not positive.
     """
     if engine not in ("image", "sionna"):
         raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
-    if visibility == "pairs" and (engine != "image" or relevance_db is not None):
+    if visibility == "pairs" and engine != "image":
         raise UsageError(
-            "visibility 'pairs' with " + ("engine 'sionna'" if engine != "image" else "relevance_db"),
-            expected="engine 'image' with every sequence, or visibility 'centre'",
+            "visibility 'pairs' with engine 'sionna'",
+            expected="engine 'image', or visibility 'centre'",
             cause="each element pair is searched for its own paths",
         )
+    if relevance_db is not None and not relevance_db > 0.0:
+        raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
     started = time.perf_counter()
     poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
@@ -213,17 +214,12 @@ def replay(
     left_out += [*refused, *_buried_towers(site, link)]
     settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
     choice = None
-    if relevance_db is not None:
-        paths, idle = _search_relevant(scene, link, poses, settings, relevance_db, progress)
-        left_out += idle
-        search_seconds, from_cache = time.perf_counter() - started, False
-    else:
-        cache = _cache(engine, cache_dir)
-        if engine == "sionna" and samples == "auto":
-            choice = _choose_samples(scene, link, poses, settings, cache)
-            settings = replace(settings, samples=choice.samples)
-        paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
-        left_out += cache.told if cache else []
+    cache = _cache(engine, cache_dir)
+    if engine == "sionna" and samples == "auto":
+        choice = _choose_samples(scene, link, poses, settings, cache)
+        settings = replace(settings, samples=choice.samples)
+    paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+    left_out += cache.told if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
     if crowns is not None and scene.surfaces is not None:
@@ -232,7 +228,8 @@ def replay(
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
-    result = _evaluate(scene, link, poses, paths, engine, loss, threads)
+    result, idle = _evaluate(scene, link, poses, paths, engine, loss, threads, relevance_db)
+    left_out += idle
     if visibility == "pairs":
         small = drop_small_faces
         result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
@@ -454,53 +451,6 @@ def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene,
     return replace(scene, usable=scene.usable & ~small), left_out
 
 
-def _search_relevant(
-    scene: Scene,
-    link: Link,
-    poses: Poses,
-    settings: Settings,
-    relevance_db: float,
-    progress: Callable[[float], None] | None,
-) -> tuple[PathSet, list[str]]:
-    """Paths without the sequences that cannot matter; poses at which they might are searched with all."""
-    if settings.engine != "image":
-        raise UsageError(
-            "relevance_db with the sionna engine",
-            expected="engine 'image'",
-            cause="PathSolver samples all faces of its scene: there is no sequence to leave out",
-        )
-    if not relevance_db > 0.0:
-        raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
-
-    def field_of(paths: PathSet) -> FloatArray:
-        return np.sqrt(mean_pair_power(channel_matrices(paths, scene.faces, scene.sources_m, poses, link).h))
-
-    ground = replace(scene, usable=scene.usable & (scene.faces.solid < 0))
-    kept = field_of(_search(ground, link, poses, settings, None))
-    known = np.flatnonzero(np.isfinite(poses.position_m).all(axis=1))
-    chooser = Relevance(scene.faces, poses.position_m[known], link, relevance_db, kept[known])
-    paths = image.find_paths(
-        scene.faces,
-        scene.sources_m,
-        poses.position_m,
-        max_depth=settings.max_depth,
-        usable=scene.usable,
-        excluded=scene.excluded,
-        select=chooser,
-        extent_m=scene.extent_m,
-        work=scene.pairs or _pairs(link, poses),
-        threads=settings.threads,
-        progress=progress,
-    )
-    again = np.zeros(len(poses), dtype=np.bool_)
-    again[known] = chooser.failing(field_of(paths)[known])
-    if again.any():
-        all_of_them = replace(scene, excluded=scene.excluded | ~again)
-        full = _search(all_of_them, link, poses, settings, None)
-        paths = image.merge([paths.select(~again[paths.pose]), full], settings.max_depth, None)
-    return paths, chooser.report(tuple(link.tower_arrays), int(again.sum()), len(known))
-
-
 def _search_or_read(
     scene: Scene,
     link: Link,
@@ -540,6 +490,7 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
+            threads=settings.threads,
             progress=progress,
         )[0]
     if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
@@ -552,6 +503,8 @@ def _search(
             max_depth=settings.max_depth,
             usable=scene.usable,
             excluded=scene.excluded,
+            extent_m=scene.extent_m,
+            threads=settings.threads,
             progress=progress,
         )[0]
     if settings.engine == "image":
@@ -627,9 +580,16 @@ def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tu
 
 
 def _evaluate(
-    scene: Scene, link: Link, poses: Poses, paths: PathSet, engine: str, loss: Loss | None, threads: int | None
-) -> Replay:
-    """Fields of the paths; times are the caller's."""
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    paths: PathSet,
+    engine: str,
+    loss: Loss | None,
+    threads: int | None,
+    relevance_db: float | None,
+) -> tuple[Replay, list[str]]:
+    """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
     work = scene.pairs or None
     fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads, work=work)
@@ -638,6 +598,10 @@ def _evaluate(
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
     level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
     above_floor = np.isfinite(level_dbm)
+    idle: list[str] = []
+    if relevance_db is not None:
+        labels, _ = idle_objects(paths, scene.faces, fields.path_power, mean_pair_power(fields.h), relevance_db)
+        idle = in_words(labels, relevance_db)
     h = fields.h
     h[~above_floor] = 0.0
     return Replay(
@@ -651,4 +615,4 @@ def _evaluate(
         search_seconds=0.0,
         engine=engine,
         towers=tuple(link.tower_arrays),
-    )
+    ), idle

@@ -252,6 +252,47 @@ class HeldOutFold:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class RankHeldOutRow:
+    """Rank of one flight as written (``start_``) and with the fitted parameters (``fit_``).
+
+    The log score [nats] takes the shares of reported ranks per simulated rank from the flights of the fit, the constant
+    one their shares alone; ``majority_agreement`` is that of always saying their commonest rank.
+    """
+
+    flight: str
+    fitted_here: bool
+    n: int
+    majority_agreement: float
+    constant_log_score: float
+    start_kappa: float
+    start_agreement: float
+    start_total_variation: float
+    start_log_score: float
+    fit_kappa: float
+    fit_agreement: float
+    fit_total_variation: float
+    fit_log_score: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class RankHeldOutFold:
+    """Parameters of the rank comparison, fitted on some flights and scored on all.
+
+    ``ties``: other values that the flights of the fit cannot tell from the fitted ones.
+    """
+
+    setting: str
+    criterion: str
+    fitted_on: tuple[str, ...]
+    applied_to: tuple[str, ...]
+    parameters: Mapping[str, Any]
+    evaluations: int
+    method: str
+    ties: tuple[Mapping[str, Any], ...]
+    rows: tuple[RankHeldOutRow, ...]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class RankTransfer:
     """Total variation of one flight at the K that the other flights would have chosen.
 
@@ -397,6 +438,7 @@ class CampaignData:
     repeats: tuple[Repeat, ...] = ()
     rank_repeats: tuple[RankPairing, ...] = ()
     held_out: tuple[HeldOutFold, ...] = ()
+    held_out_rank: tuple[RankHeldOutFold, ...] = ()
     held_out_failure: str = ""
     rank_transfers: tuple[RankTransfer, ...] = ()
     tracks: tuple[FlownTrack, ...] = ()

@@ -16,7 +16,7 @@ from ..common.jsonable import json_safe
 from ..common.stages import Progress, silent
 from ..compare.result import Repeated
 from . import campaign_figures, canvas
-from .campaign_data import CampaignData, RankRow, RssRow
+from .campaign_data import CampaignData, RankHeldOutFold, RankRow, RssRow
 from .campaign_explorer import payload
 from .canvas import Picture
 from .explorer import as_json
@@ -103,6 +103,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "folds": [
                 {**_entries([fold], ("rows", "curves"))[0], "scores": _entries(fold.rows)} for fold in data.held_out
             ],
+            "rank": [{**_entries([fold], ("rows",))[0], "scores": _entries(fold.rows)} for fold in data.held_out_rank],
         },
         "season": {
             "held_out": data.season.held_out,
@@ -239,7 +240,20 @@ def headline(data: CampaignData) -> list[str]:
                 f"Fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} the mean RMSE goes from "
                 f"{np.mean([r.start_rmse_db for r in held]):.2f} to {np.mean([r.rmse_db for r in held]):.2f} dB."
             )
-    return out
+    return out + [_rank_fold_words(fold) for fold in data.held_out_rank if fold.applied_to]
+
+
+def _rank_fold_words(fold: RankHeldOutFold) -> str:
+    """What a fit of rank is worth on flights that had no say."""
+    held = [r for r in fold.rows if not r.fitted_here]
+    kappa = [np.mean([getattr(r, f"{label}_kappa") for r in held]) for label in ("start", "fit")]
+    agree = [np.mean([getattr(r, name) for r in held]) for name in ("fit_agreement", "majority_agreement")]
+    ties = f"; {len(fold.ties)} other values fit as well" if fold.ties else ""
+    return (
+        f"Rank fitted on {', '.join(fold.fitted_on)}: on {', '.join(fold.applied_to)} kappa goes from {kappa[0]:.2f} "
+        f"to {kappa[1]:.2f}, {100 * agree[0]:.0f} % of the reports agree (always the commonest rank: "
+        f"{100 * agree[1]:.0f} %){ties}."
+    )
 
 
 def _ranked_words(data: CampaignData) -> list[str]:

@@ -20,6 +20,7 @@ import numpy as np
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
+from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
 from .drawing import in_order
@@ -515,7 +516,7 @@ def draw_site(ax: Axes, site: Site, *, towers: Sequence[str] | None = None, name
         )  # fmt: skip
     if len(site.trees):
         _draw_crowns(ax, site.trees, f"tree{invented}")
-    for number, building in enumerate(site.buildings):
+    for number, building in enumerate(drawn_buildings(site)):
         patch(
             building.footprint, facecolor=BUILDING, edgecolor="black", linewidth=0.7, zorder=0.6,
             label=f"building{invented}" if number == 0 else None,

@@ -164,7 +164,9 @@ def _level_verdict(diff: ReportDiff) -> str:
     if not scored or diff.pooled is None:
         return ""
     if all(abs(one.rmse.difference_db) <= diff.tolerance_db for one in scored):
-        return "RSS errors agree on the common samples."
+        moved = max((one.simulated_max_db for one in scored if math.isfinite(one.simulated_max_db)), default=0.0)
+        though = f", though the replay moved by up to {moved:.2g} dB" if moved > diff.tolerance_db else ""
+        return f"RSS errors agree on the common samples{though}."
     pooled = diff.pooled
     text = f"RSS over all links: RMSE {pooled.other_rmse_db:.2f} dB in the first, {pooled.rmse_db:.2f} dB in the second"
     text += {

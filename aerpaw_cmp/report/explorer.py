@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..logs.records import has_wall_clock
+from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import seconds_since, spread_out, start_of
 from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel
@@ -218,7 +219,7 @@ def scene(site: Site) -> dict[str, Any]:
             {"name": t.name, "at": listed([t.east_m, t.north_m, t.ground_m]), "top": round(float(t.position_m[2]), 2)}
             for t in site.towers.values()
         ],
-        "buildings": [[listed(face) for face in walls(b)] for b in site.buildings],
+        "buildings": [[listed(face) for face in walls(b)] for b in drawn_buildings(site)],
         "forests": [listed(outline(f.area)) for f in site.forests],
         "trees": listed(np.column_stack([getattr(trees, c)[pick] for c in columns])) if len(pick) else [],
     }

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 
 from ..common.units import FloatArray
+from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .data import RANKS
@@ -87,7 +88,7 @@ def draw_overlay(ax: Axes, site: Site, highlight: str | None) -> None:
         outline = np.asarray(forest.area.exterior.coords)
         ax.plot(outline[:, 0], outline[:, 1], color="white", linewidth=1.4, zorder=2)
         ax.plot(outline[:, 0], outline[:, 1], color="#2F5D28", linewidth=0.8, linestyle=(0, (2, 1)), zorder=2.1)
-    for building in site.buildings:
+    for building in drawn_buildings(site):
         outline = np.asarray(building.footprint.exterior.coords)
         ax.fill(outline[:, 0], outline[:, 1], facecolor="white", edgecolor="black", linewidth=0.7, zorder=2.2)
     for name, tower in site.towers.items():
@@ -106,7 +107,7 @@ def overlay_legend(data: MapsData, *, borders: bool) -> list[Any]:
     invented = " (illustrative)" if data.site.illustrative else ""
     entries: list[Any] = [Patch(**MISSING, label="Z: out of coverage")]
     entries.append(Line2D([], [], marker="^", color=TOWER, markeredgecolor="white", linestyle="none", label="tower"))
-    if data.site.buildings:
+    if drawn_buildings(data.site):
         entries.append(Patch(facecolor="white", edgecolor="black", label=f"building{invented}"))
     if data.site.forests:
         entries.append(Line2D([], [], color="#2F5D28", linestyle=(0, (2, 1)), label=f"forest{invented}"))

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from ..common.units import FloatArray
+from ..site.scenes import drawn_buildings
 from ..site.site import Building, Site, Trees
 from . import canvas
 from .data import Track
@@ -53,7 +54,7 @@ class PathLine:
 def view_limits(site: Site, track: Track | None, paths: Sequence[PathLine] = ()) -> FloatArray:
     """(3, 2) lowest and highest east, north, up of everything that stands or flies, with a margin [m]."""
     points = [tower.position_m for tower in site.towers.values()]
-    for building in site.buildings:
+    for building in drawn_buildings(site):
         for corner in np.asarray(building.footprint.exterior.coords)[:, :2]:
             points.append(np.array([*corner, building.base_m + building.height_m]))
     for forest in site.forests:
@@ -130,7 +131,7 @@ def solid(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
     ax: Any = fig.add_subplot(projection="3d", computed_zorder=False)
     invented = " (illustrative)" if site.illustrative else ""
     _solid_ground(ax, site, invented)
-    _solid_buildings(ax, site.buildings, invented)
+    _solid_buildings(ax, drawn_buildings(site), invented)
     _solid_trees(ax, site.trees, invented)
     for number, tower in enumerate(site.towers.values()):
         ax.plot(
@@ -233,7 +234,8 @@ def scene(site: Site, track: Track | None = None, paths: Sequence[PathLine] = ()
     return {
         "limits": listed(view_limits(site, track, paths)),
         "buildings": [
-            {"name": b.name, "height": b.height_m, "faces": [listed(face) for face in walls(b)]} for b in site.buildings
+            {"name": b.name, "height": b.height_m, "faces": [listed(face) for face in walls(b)]}
+            for b in drawn_buildings(site)
         ],
         "forests": [listed(outline(f.area)) for f in site.forests],
         "fences": [listed(g.area.exterior.coords) for g in site.geofences],

@@ -5,13 +5,17 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
+import shapely
+from shapely.geometry import Polygon
 
 from ..common.errors import UsageError
 from .materials import material
 from .mitsuba import TriangleScene, read_scene
+from .site import Building, Site
 
 PLANE_MARGIN = 10.0
 """A ground plane that is added reaches this many times the size of the scene beyond it."""
@@ -122,3 +126,51 @@ def ground_share(scene: TriangleScene) -> float:
             signs.append((c - a) * (y - b) - (d - b) * (x - a))
         covered[columns, rows] |= ((np.stack(signs) >= 0).all(axis=0)) | ((np.stack(signs) <= 0).all(axis=0))
     return float(covered.mean())
+
+
+DRAWN_SIMPLER_M = 0.5
+DRAWN_M2 = 10.0
+DRAWN_TALLER_M = 1.0
+DRAWN_MOST = 3000
+"""Of the prisms that stand for a scene in pictures: how much simpler, from which area and height
+on, and how many at most."""
+
+GROUND_PART = 0.25
+"""A part of a shape that covers more of the plan than this is ground, however hilly."""
+
+
+def drawn_buildings(site: Site) -> tuple[Building, ...]:
+    """What pictures show as buildings: those of the site, and for a scene of triangles the outlines of its shapes.
+
+    Prisms from the lowest to the highest corner of each part; level shapes and those under most of the plan are ground.
+    Only pictures use them.
+    """
+    return site.buildings if site.scene is None else (*site.buildings, *_outlines(site.scene))
+
+
+@lru_cache(maxsize=2)
+def _outlines(scene: TriangleScene) -> tuple[Building, ...]:
+    corners = scene.vertices_m[scene.triangles]
+    plan = shapely.polygons(corners[:, :, :2])
+    area = shapely.area(plan)
+    low, high = bounds(scene)
+    whole = float((high[0] - low[0]) * (high[1] - low[1]))
+    found: list[tuple[str, Polygon, float]] = []
+    seen = area > 1e-3  # walls are lines from above
+    for shape in np.unique(scene.shape[seen]).tolist():
+        rows = np.flatnonzero(seen & (scene.shape == shape))
+        parts = shapely.get_parts(shapely.union_all(shapely.buffer(plan[rows], 0.01, join_style="mitre")))
+        part, row = shapely.STRtree(shapely.centroid(plan[rows])).query(parts, predicate="contains")
+        for number, outline in enumerate(parts):
+            mine = corners[rows[row[part == number]]][:, :, 2]
+            simple = outline.simplify(DRAWN_SIMPLER_M)
+            if mine.size and simple.geom_type == "Polygon" and DRAWN_M2 < simple.area < GROUND_PART * whole:
+                found.append((scene.shapes[shape], simple, float(mine.max())))
+    found = sorted(found, key=lambda one: -one[1].area)[:DRAWN_MOST]
+    # down to the lowest corner of anything under it: roofs are often shapes of their own
+    feet = np.array([top for *_, top in found])
+    boxes = shapely.buffer([outline for _, outline, _ in found], 0.5)
+    here, corner = shapely.STRtree(shapely.points(scene.vertices_m[:, :2])).query(boxes, predicate="contains")
+    np.minimum.at(feet, here, scene.vertices_m[corner, 2])
+    tall = [(one, float(foot)) for one, foot in zip(found, feet, strict=True) if one[2] - foot > DRAWN_TALLER_M]
+    return tuple(Building(name, outline, top - foot, foot) for (name, outline, top), foot in tall)

@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 
-from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _lines, _rows
@@ -46,51 +46,93 @@ class Reading:
     beside: tuple[float, ...] = (np.nan,) * len(BESIDE)
 
 
-def streams(rows: _rows.Rows, readings: Iterable[Reading], *, source: str) -> list[Stream]:
+@dataclass(frozen=True)
+class Table:
+    """Readings as columns; meanings as of :class:`Reading`.
+
+    Parameters
+    ----------
+    row : int array, shape (n,)
+    rat : object array, shape (n,)
+    pci, arfcn, rsrp_dbm : float array, shape (n,)
+    serving : bool array, shape (n,)
+    beside : float array, shape (4, n)
+    """
+
+    row: IntArray
+    rat: AnyArray
+    pci: FloatArray
+    arfcn: FloatArray
+    rsrp_dbm: FloatArray
+    serving: BoolArray
+    beside: FloatArray
+
+    def take(self, pick: AnyArray) -> Table:
+        """Some of them, by index or mask."""
+        return Table(
+            self.row[pick], self.rat[pick], self.pci[pick], self.arfcn[pick], self.rsrp_dbm[pick], self.serving[pick],
+            self.beside[:, pick],
+        )  # fmt: skip
+
+
+def table(readings: Iterable[Reading]) -> Table:
+    """Readings, one by one, as columns."""
+    found = list(readings)
+    pci, arfcn, rsrp = (np.array([getattr(one, name) for one in found], dtype=np.float64) for name in _NUMBERS)
+    return Table(
+        row=np.array([one.row for one in found], dtype=np.int64),
+        rat=np.array([one.rat for one in found], dtype=object),
+        pci=pci,
+        arfcn=arfcn,
+        rsrp_dbm=rsrp,
+        serving=np.array([bool(one.serving) for one in found], dtype=bool),
+        beside=np.array([one.beside for one in found], dtype=np.float64).reshape(len(found), len(BESIDE)).T,
+    )
+
+
+_NUMBERS = ("pci", "arfcn", "rsrp_dbm")
+
+
+def joined(tables: Sequence[Table]) -> Table:
+    """Several tables, one behind the other."""
+    if not tables:
+        return table(())
+    columns = {part.name: [getattr(one, part.name) for one in tables] for part in fields(Table)}
+    return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
+
+
+def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str) -> list[Stream]:
     """A stream per radio access and PCI; a cell that is told twice at one time is kept once, as serving.
 
     A cell is serving from the moment that the log says so until it names another of the same radio access.
     """
-    found = [one for one in readings if np.isfinite(one.rsrp_dbm)]
-    if not found:
-        return []
-    order = np.argsort([one.row for one in found], kind="stable")
-    found = [found[i] for i in order]
+    found = readings if isinstance(readings, Table) else table(readings)
+    found = found.take(np.isfinite(found.rsrp_dbm))
+    found = found.take(np.argsort(found.row, kind="stable"))
     served = _serving(found)
     made: list[Stream] = []
-    names = {(one.rat, one.pci if np.isfinite(one.pci) else -1.0) for one in found}
-    for rat, pci in sorted(names):
-        none = pci < 0
-        same = [one.rat == rat and (one.pci == pci or (none and not np.isfinite(one.pci))) for one in found]
-        mine = np.flatnonzero(same).tolist()
-        stream = _stream(rows, [found[i] for i in mine], served[mine], rat, pci, source)
-        if stream is not None:
-            made.append(stream)
+    for rat in sorted(set(found.rat.tolist())):
+        of_rat = np.flatnonzero(found.rat == rat)
+        pci = found.pci[of_rat]
+        key = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
+        for one in np.unique(key).tolist():
+            pick = of_rat[key == one]
+            made.append(_stream(rows, found.take(pick), served[pick], rat, one, source))
     return made
 
 
-def _serving(found: list[Reading]) -> FloatArray:
+def _serving(found: Table) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
-    known = any(one.serving for one in found)
-    now: dict[str, float] = {}
-    served = np.full(len(found), np.nan)
-    for one in found:
-        if one.serving:
-            now[one.rat] = one.pci
-    if not known:
-        return served
-    now = {}
-    begin = 0
-    while begin < len(found):  # all readings of a row at once: the serving one may stand behind its neighbours
-        end = begin
-        while end < len(found) and found[end].row == found[begin].row:
-            if found[end].serving:
-                now[found[end].rat] = found[end].pci
-            end += 1
-        for i in range(begin, end):
-            if found[i].rat in now:
-                served[i] = float(bool(found[i].serving) or found[i].pci == now[found[i].rat])
-        begin = end
+    served = np.full(len(found.row), np.nan)
+    for rat in set(found.rat.tolist()):
+        mine = np.flatnonzero(found.rat == rat)
+        told = mine[found.serving[mine]]
+        # all readings of a row at once: the serving one may stand behind its neighbours
+        last = np.searchsorted(found.row[told], found.row[mine], side="right") - 1
+        known = last >= 0
+        now = found.pci[told][last[known]] if len(told) else np.zeros(0)
+        mine = mine[known]
+        served[mine] = (found.serving[mine] | (found.pci[mine] == now)).astype(np.float64)
     return served
 
 
@@ -112,28 +154,22 @@ def settled(result: ReadResult) -> ReadResult:
     return replace(result, streams=tuple(streams))
 
 
-def _stream(
-    rows: _rows.Rows, mine: list[Reading], served: FloatArray, rat: str, pci: float, source: str
-) -> Stream | None:
-    if not mine:
-        return None  # a cell whose number is none
-    pick: IntArray = np.array([one.row for one in mine], dtype=np.int64)
-    keep = _once(rows.time[pick], served)
-    pick, mine, served = pick[keep], [mine[i] for i in keep], served[keep]
-    level = np.array([one.rsrp_dbm for one in mine])
-    flag = rows.flag[pick].copy()
-    outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
+def _stream(rows: _rows.Rows, mine: Table, served: FloatArray, rat: str, pci: float, source: str) -> Stream:
+    keep = _once(rows.time[mine.row], served)
+    mine, served = mine.take(keep), served[keep]
+    flag = rows.flag[mine.row].copy()
+    outside = ~((mine.rsrp_dbm >= RANGE_DBM[0]) & (mine.rsrp_dbm <= RANGE_DBM[1]))
     _lines.add_flag(flag, outside, "out_of_coverage")
-    values: dict[str, FloatArray] = {"rss_db": np.where(outside, np.nan, level), "serving": served}
-    for i, name in enumerate(BESIDE):
-        column = np.array([one.beside[i] for one in mine])
+    values: dict[str, FloatArray] = {"rss_db": np.where(outside, np.nan, mine.rsrp_dbm), "serving": served}
+    for name, column in zip(BESIDE, mine.beside, strict=True):
         if np.isfinite(column).any():
             values[name] = column
-    arfcn = np.array([one.arfcn for one in mine])
-    numbers = np.unique(arfcn[np.isfinite(arfcn)])
+    numbers = np.unique(mine.arfcn[np.isfinite(mine.arfcn)])
     name = "_".join(part for part in (rat, f"pci{int(pci)}" if pci >= 0 else "rsrp") if part)
-    return rows.stream(
-        "rss", name, values, pick=pick, flag=flag, channel=rows.options.channel or name,
+    made = rows.stream(
+        "rss", name, values, pick=mine.row, flag=flag, channel=rows.options.channel or name,
         unit=rows.options.unit or "dBm", quantity="RSRP", rat=rat or None, pci=int(pci) if pci >= 0 else None,
         arfcn=int(numbers[0]) if len(numbers) == 1 else None, source=source,
     )  # fmt: skip
+    assert made is not None
+    return made

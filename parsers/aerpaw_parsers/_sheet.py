@@ -24,6 +24,7 @@ from ._quantities import plain
 SEPARATORS = (",", ";", "\t", "|")
 TITLES = 60
 """Lines in front of a header, at most."""
+_MOST_TEXTS = 200_000
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
 _FACTORS = {
@@ -74,6 +75,15 @@ def starts(head: bytes, is_header: IsHeader) -> bool:
     at, separator, names = found
     below = [line for line in lines[at + 1 :] if line.strip()][:5]
     return not below or any(abs(len(_split(line, separator)) - len(names)) <= 1 for line in below)
+
+
+def _number(text: str) -> float:
+    if not text or not _NUMBER.fullmatch(text):
+        return np.nan
+    try:
+        return float(text.replace(",", "."))
+    except ValueError:
+        return np.nan
 
 
 @dataclass
@@ -129,14 +139,14 @@ class Sheet:
     def numbers(self, column: int) -> FloatArray:
         """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN."""
         factor = _FACTORS.get(self.unit(column), 1.0)
-        out = np.full(len(self.cells), np.nan)
+        known: dict[str, float] = {}  # few distinct texts in most columns
+        out = np.empty(len(self.cells))
         for i, cells in enumerate(self.cells):
-            text = cells[column].strip()
-            if text and _NUMBER.fullmatch(text):
-                try:
-                    out[i] = float(text.replace(",", "."))
-                except ValueError:
-                    continue
+            text = cells[column]
+            value = known.get(text)
+            if value is None:
+                value = known[text] = _number(text.strip())
+            out[i] = value
         return out * factor
 
 
@@ -152,6 +162,7 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     rejected: list[RejectedLine] = []
     repeats: list[int] = []
     width = len(names)
+    same: dict[str, str] = {}  # one text object for equal cells: tables repeat themselves
     for i in np.flatnonzero(~lines.blank).tolist():
         if i <= at:
             continue
@@ -164,7 +175,9 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
             repeats.append(i)  # files joined by hand
         elif len(one) == width:
             number.append(i)
-            cells.append(one)
+            cells.append([same.setdefault(text, text) for text in one])
+            if len(same) > _MOST_TEXTS:
+                same.clear()
         else:
             rejected.append(lines.reject(i, f"{len(one)} fields where the header has {width} (torn line?)"))
     last = number[-1] if number else at

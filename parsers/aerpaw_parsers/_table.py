@@ -18,6 +18,17 @@ from ._lines import Lines
 _PLAIN = b"0123456789+-.eE,\r\n"
 
 
+def cells_at(lines: Lines, starts: IntArray, width: int) -> AnyArray:
+    """Bytes of equally long fields, uint8 of shape (n, width); all lie within the data."""
+    return np.asarray(np.lib.stride_tricks.sliding_window_view(lines.buffer, width)[starts])
+
+
+def rows_of(lines: Lines, count: int) -> IntArray:
+    """0-based numbers of the lines that have exactly ``count`` fields, shape (n,)."""
+    commas = np.flatnonzero(lines.buffer == 44)
+    return np.flatnonzero(np.diff(np.searchsorted(commas, lines.ends), prepend=0) == count - 1)
+
+
 def fields(lines: Lines, count: int) -> tuple[IntArray, IntArray, IntArray]:
     """Byte ranges of the fields of all lines that have exactly ``count`` of them.
 

@@ -10,7 +10,6 @@ quantities become streams of kind ``kpi``, RI a rank stream (from one). Position
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -140,16 +139,17 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
     return [cell for cell in cells.values() if cell.rsrp is not None]
 
 
-def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> Iterator[_cells.Reading]:
+def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
+    tables = []
     for cell in cells:
         assert cell.rsrp is not None
         level = sheet.numbers(cell.rsrp)
-        pci = _or_nan(sheet, cell.pci, len(level))
-        arfcn = _or_nan(sheet, cell.arfcn, len(level))
-        beside = [_or_nan(sheet, cell.beside.get(name), len(level)) for name in _cells.BESIDE]
-        for i in np.flatnonzero(np.isfinite(level)).tolist():
-            values = tuple(float(column[i]) for column in beside)
-            yield _cells.Reading(i, cell.rat, float(pci[i]), float(arfcn[i]), float(level[i]), cell.serving, values)
+        row = np.flatnonzero(np.isfinite(level))
+        pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
+        beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
+        rat, serving = np.full(len(row), cell.rat, dtype=object), np.full(len(row), cell.serving)
+        tables.append(_cells.Table(row, rat, pci, arfcn, level[row], serving, beside))
+    return _cells.joined(tables)
 
 
 def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:

@@ -42,7 +42,7 @@ def _reason(line: bytes) -> str | None:
 
 def _plain(lines: _lines.Lines) -> tuple[IntArray, FloatArray]:
     """Rows of plain numbers and their nine columns, at once."""
-    rows, _, _ = _table.fields(lines, 9)
+    rows = _table.rows_of(lines, 9)
     rows = rows[rows > 0]  # the header
     value = _table.numbers(lines, rows, 9)
     if value is None:

@@ -130,6 +130,8 @@ class _Rows:
 def _rows(
     lines: _lines.Lines, pattern: re.Pattern[bytes], options: ReadOptions, rejected: list[RejectedLine]
 ) -> _Rows | None:
+    if b"servingcell" not in lines.data:
+        return None  # a search of a whole log of CSI would find nothing, slowly
     number, groups = _lines.match(lines, pattern)
     if not len(number):
         return None
@@ -172,13 +174,15 @@ def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, FloatArray]:
         mine &= ends[:, place] - starts[:, place] == len(token)
     rows, starts = rows[mine], starts[mine]
     for place, token in _LAUNCHED:
-        cells = lines.buffer[starts[:, place][:, None] + np.arange(len(token))]
-        if (cells != np.frombuffer(token, dtype=np.uint8)).any():
+        if (
+            not len(rows)
+            or (_table.cells_at(lines, starts[:, place], len(token)) != np.frombuffer(token, dtype=np.uint8)).any()
+        ):
             return none, none, np.empty((8, 0))
     value = _table.numbers(lines, rows, 11, (2, 3, 4, 5, 7, 8, 9, 10), also=b'" :/QNWCFGlte_csinr5g')
     if value is None:
         return none, none, np.empty((8, 0))
-    wall, valid = _time.parse_digits(lines.buffer[starts[:, 0][:, None] + np.arange(23)], 3)
+    wall, valid = _time.parse_digits(_table.cells_at(lines, starts[:, 0], 23), 3)
     keep = valid & np.isfinite(value).all(axis=0)
     return rows[keep], wall[keep], value[:, keep]
 

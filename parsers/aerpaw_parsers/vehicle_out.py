@@ -133,7 +133,7 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         number[:4], number[-2:] = value[:4], value[-2:]
         if count == 14:
             number[4:10] = value[4:10]
-        wall, valid = _time.parse_digits(lines.buffer[starts[:, time][:, None] + np.arange(26)], 6)
+        wall, valid = _time.parse_digits(_table.cells_at(lines, starts[:, time], 26), 6)
         whole = np.all(
             (number[[0, 10, 11]] == np.floor(number[[0, 10, 11]])) & (np.abs(number[[0, 10, 11]]) < 1e12), axis=0
         )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import gzip
 import hashlib
+import zipfile
 from dataclasses import replace
 from pathlib import Path
 
@@ -144,3 +145,18 @@ def test_an_hour_that_came_twice_is_read_in_one_piece(tmp_path: Path, monkeypatc
     monkeypatch.setattr(blocks, "_CHUNK", 1000)
     (file,) = ingest(place, options=OPTIONS)
     assert file.result.streams[0].frame["time"].tolist() == [pd.Timestamp(t) for t in times]
+
+
+def test_a_large_member_of_an_archive_goes_through_blocks(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    data = sounder(odd=True)
+    with zipfile.ZipFile(tmp_path / "a.zip", "w", zipfile.ZIP_DEFLATED) as book:
+        book.writestr("a_power_log.txt", data)
+    (whole,) = ingest(tmp_path / "a.zip", options=OPTIONS)
+    seen: list[int] = []
+    gathered = blocks.Gathered.add
+    monkeypatch.setattr(blocks.Gathered, "add", lambda *a: seen.append(a[1].lines) or gathered(*a))
+    monkeypatch.setattr(blocks, "FROM_BYTES", 1000)
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 3000)
+    (file,) = ingest(tmp_path / "a.zip", options=OPTIONS)
+    same(file.result, whole.result)
+    assert seen

@@ -161,6 +161,29 @@ def test_the_tolerance_decides_what_counts(noisy, capsys):
     assert "tolerance" in capsys.readouterr().err
 
 
+def test_a_replay_that_moved_without_harm_is_said_to_have_moved(two):
+    """Measurement and replay of a link shifted together: the residual is the same."""
+    change_table(
+        two[1],
+        "rss",
+        lambda t: t.assign(
+            **{name: t[name] + 3.0 * on(t) for name in ("simulated_dbm", "calibrated_db", "measured_db")}
+        ),
+    )
+    found = run_diff(*two)
+    assert "errors agree on the common samples, though the replay moved by up to 3 dB" in verdict(found)
+    assert any("measured level by up to 3 dB" in text for text in found.differences)
+
+
+def test_a_long_flight_has_fewer_replicates_and_nearly_the_same_interval(noisy, monkeypatch):
+    from aerpaw_cmp.jobs import diff_reports
+
+    (first, second), _ = noisy
+    usual = run_diff(first, second).levels[0].rmse.difference_ci95_db
+    monkeypatch.setattr(diff_reports, "_LONG", 10)
+    assert run_diff(first, second).levels[0].rmse.difference_ci95_db == pytest.approx(usual, rel=0.25)
+
+
 def test_links_are_pooled_by_what_each_adds_at_an_instant():
     """Two links with a change of opposite sign: the means of links are no memory of the flight."""
     rng = np.random.default_rng(8)

@@ -266,7 +266,7 @@ def legend_png(title: str, colours: Sequence[str], labels: Sequence[str]) -> byt
     from matplotlib.figure import Figure
     from matplotlib.patches import Patch
 
-    figure = Figure(figsize=(2.6, 0.4 + 0.18 * len(colours)), dpi=110)
+    figure = Figure(figsize=(2.6, 0.38 + 0.155 * len(colours)), dpi=110)
     FigureCanvasAgg(figure)
     figure.patch.set_alpha(0.9)
     figure.suptitle(title, fontsize=9, y=0.98, va="top")

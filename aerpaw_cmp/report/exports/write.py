@@ -33,8 +33,8 @@ ALL = "all"
 FOLDER = "exports"
 
 
-def chosen_formats(names: Iterable[str]) -> tuple[str, ...]:
-    """The formats of a list as a user writes it: names, also joined by commas; ``all`` for every one.
+def chosen_formats(*lists: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats of lists as a user writes them: names, also joined by commas; ``all`` for every one.
 
     Raises
     ------
@@ -43,9 +43,10 @@ def chosen_formats(names: Iterable[str]) -> tuple[str, ...]:
 
     Examples
     --------
-    >>> chosen_formats(["gpx,kmz", "gpx"])
-    ('kmz', 'gpx')
+    >>> chosen_formats(["gpx,kmz", "gpx"], "geojson")
+    ('geojson', 'kmz', 'gpx')
     """
+    names = [name for some in lists for name in ([some] if isinstance(some, str) else some)]
     wanted = [part.strip().lower() for name in names for part in name.split(",") if part.strip()]
     unknown = [name for name in wanted if name not in (*FORMATS, ALL)]
     if unknown:

@@ -1,0 +1,315 @@
+"""Parameters of the rank comparison (mount, slants, ground, K), fitted on some flights and scored on others."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from itertools import product
+from typing import Any, Literal
+
+import numpy as np
+
+from ..common.errors import InputError, UsageError
+from ..common.stages import Progress, silent
+from ..common.units import FloatArray, IntArray
+from ..compare import rank as ranks
+from ..compare.forecast import constant_forecast, log_losses
+from ..compare.statistics import paired_difference
+from ..flight.data import FlightData, choose_site
+from ..flight.overrides import overridden
+from ..report.campaign_data import RankHeldOutFold, RankHeldOutRow
+from .replay import replay_rank
+
+Criterion = Literal["kappa", "log_score", "total_variation"]
+Point = Mapping[str, Any]
+
+K_KEY = "rank.k"
+"""The one key of the fit that is no key of a replay: a single singular-value ratio."""
+
+LARGEST_PRODUCT = 500
+"""Combinations that are all tried; of more, one parameter after the other is searched."""
+
+SWEEPS = 4
+"""Rounds over all parameters, at most."""
+
+FINALISTS = 40
+"""Combinations that are compared with the best one by one: what cannot be told from it is listed."""
+
+REPLICATES = 300
+MAX_RANK = ranks.MAX_RANK
+
+
+@dataclass(slots=True)
+class RankBench:
+    """One flight, ready to be replayed with other parameters; singular values once computed are kept."""
+
+    data: FlightData
+    kept: dict[str, list[FloatArray]] = field(default_factory=dict)
+
+    def singular_values(self, point: Point) -> list[FloatArray]:
+        """Of every rank series (n, min(n_rx, n_tx)); NaN without a pose or below ``rank.minimum_height_m``."""
+        changes = {key: value for key, value in point.items() if key != K_KEY}
+        name = json.dumps(changes, sort_keys=True)
+        if name not in self.kept:
+            settings = overridden(self.data.settings, changes)
+            site = self.data.site
+            if settings.site != self.data.settings.site:
+                site = choose_site(settings.site, self.data.folder)
+            data = dataclasses.replace(self.data, settings=settings, site=site)
+            low = settings.rank.minimum_height_m
+            self.kept[name] = []
+            for replayed in replay_rank(data, silent):
+                sigma = ranks.singular_values(replayed.replay.h[:, 0])
+                if low is not None:
+                    sigma = np.where(replayed.poses.position_m[:, 2:] >= low, sigma, np.nan)
+                whole = np.full((len(replayed.valid), sigma.shape[1]), np.nan)
+                whole[replayed.valid] = sigma
+                self.kept[name].append(whole)
+        return self.kept[name]
+
+    def pairs(self, point: Point) -> tuple[IntArray, IntArray]:
+        """Reported and simulated ranks of all series where both are known (n,), one to :data:`MAX_RANK`."""
+        k = float(point.get(K_KEY, min(self.data.settings.rank.k)))
+        reported, simulated = [], []
+        for series, sigma in zip(self.data.rank, self.singular_values(point), strict=True):
+            known = np.isfinite(sigma).all(axis=1) & (series.rank >= 1)
+            said = ranks.rank_from_singular_values(sigma[known], k)
+            reported.append(series.rank[known][said >= 1])
+            simulated.append(said[said >= 1])
+        found = (np.concatenate(part) if part else np.zeros(0) for part in (reported, simulated))
+        one, two = (np.minimum(part, MAX_RANK).astype(np.int64) for part in found)
+        return one, two
+
+    def thinned(self, samples: int) -> RankBench:
+        """Evenly spread reports of every series."""
+        series = []
+        for one in self.data.rank:
+            rows = np.unique(np.linspace(0, len(one.time) - 1, min(samples, len(one.time))).astype(int))
+            position = None if one.position_m is None else one.position_m[rows]
+            series.append(
+                dataclasses.replace(
+                    one, time=one.time[rows], rank=one.rank[rows], sinr_db=one.sinr_db[rows], position_m=position
+                )
+            )
+        return RankBench(dataclasses.replace(self.data, rank=tuple(series)))
+
+
+def shares_by_rank(reported: IntArray, simulated: IntArray) -> FloatArray:
+    """Probability (4, 4) of each reported rank, by the simulated one: counts plus the overall shares as one report."""
+    table = np.zeros((MAX_RANK, MAX_RANK))
+    np.add.at(table, (simulated - 1, reported - 1), 1.0)
+    table += constant_forecast(reported)
+    return np.asarray(table / table.sum(axis=1, keepdims=True))
+
+
+def loss(benches: Sequence[RankBench], point: Point, criterion: Criterion) -> float:
+    """What the search lowers, mean over flights: 1 - kappa, total variation, or the log score [nats]."""
+    pairs = [bench.pairs(point) for bench in benches]
+    pairs = [(one, two) for one, two in pairs if len(one)]
+    if not pairs:
+        return float("nan")
+    if criterion == "kappa":
+        each = [1.0 - np.nan_to_num(ranks.cohen_kappa(one, two)) for one, two in pairs]
+    elif criterion == "total_variation":
+        each = [ranks.total_variation(ranks.histogram(one), ranks.histogram(two)) for one, two in pairs]
+    else:
+        each = [float(np.mean(_log_losses(pairs, i))) for i in range(len(pairs))]
+    return float(np.mean(each))
+
+
+def _log_losses(pairs: Sequence[tuple[IntArray, IntArray]], scored: int) -> FloatArray:
+    """Of one flight, by the table of the others; of a flight alone by its own."""
+    others = [pair for i, pair in enumerate(pairs) if i != scored] or [pairs[scored]]
+    table = shares_by_rank(*_joined(others))
+    reported, simulated = pairs[scored]
+    return log_losses(table[simulated - 1], reported)
+
+
+def fit_rank_all(
+    flights: Mapping[str, FlightData],
+    grids: Mapping[str, Sequence[Any]],
+    fit_on: Sequence[str] | None,
+    *,
+    criterion: Criterion,
+    setting: str = "",
+    samples: int = 1000,
+    progress: Progress = silent,
+) -> list[RankHeldOutFold]:
+    """Fit on the named flights, or leave each flight out once.
+
+    Parameters
+    ----------
+    flights : mapping of str to FlightData
+        Flights with rank, by name.
+    grids : mapping of str to sequence
+        Values to try, by dotted flight key; ``rank.k`` is the singular-value ratio. A value may be a list (slants).
+    fit_on : sequence of str, optional
+        Names; those that are not in ``flights`` are passed over.
+    criterion : {"kappa", "log_score", "total_variation"}
+        The log score takes the shares of reported ranks per simulated rank from the other flights of the fit.
+    setting : str
+        Label, for the record.
+    samples : int
+        Evenly spread reports per series that the search looks at; all are scored.
+    progress : Progress
+
+    Raises
+    ------
+    UsageError
+        No flight to fit on, or too few to leave one out.
+    InputError
+        No report could be compared under any of the values.
+    """
+    names = list(flights)
+    chosen = None if fit_on is None else [name for name in fit_on if name in names]
+    if chosen == []:
+        raise UsageError("no flight of held_out.fit_on gave rank", expected=", ".join(names) or "a flight with rank")
+    if chosen is None and len(names) < 2:
+        raise UsageError(f"{len(names)} flights with rank", expected="two or more, to leave one out at a time")
+    full = {name: RankBench(data) for name, data in flights.items()}
+    few = {name: bench.thinned(samples) for name, bench in full.items()}
+    folds = []
+    for train in [chosen] if chosen is not None else [[n for n in names if n != left] for left in names]:
+        progress("held-out rank: fit on " + ", ".join(train))
+        found = search([few[name] for name in train], grids, criterion)
+        if not np.isfinite(found.loss):
+            raise InputError(
+                f"nothing can be fitted on {', '.join(train)}",
+                expected="reports with a rank where the replay has a channel",
+                cause="no coverage, no positions, or rank.minimum_height_m above the flight",
+            )
+        folds.append(_fold(full, few, train, found, criterion, setting))
+    return folds
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What a search found: the point, its loss, every point that was tried with its loss, and how."""
+
+    point: dict[str, Any]
+    loss: float
+    tried: tuple[tuple[dict[str, Any], float], ...]
+    method: str
+
+
+def search(benches: Sequence[RankBench], grids: Mapping[str, Sequence[Any]], criterion: Criterion) -> Search:
+    """Least loss over all combinations, or, of more than :data:`LARGEST_PRODUCT`, key by key from three starts."""
+    known: dict[str, tuple[dict[str, Any], float]] = {}
+
+    def tried(point: dict[str, Any]) -> float:
+        name = json.dumps(point, sort_keys=True)
+        if name not in known:
+            known[name] = (dict(point), loss(benches, point, criterion))
+        return known[name][1]
+
+    if np.prod([len(values) for values in grids.values()], dtype=np.float64) <= LARGEST_PRODUCT:
+        for combination in product(*grids.values()):
+            tried(dict(zip(grids, combination, strict=True)))
+        method = "every combination"
+    else:
+        for share in (0.25, 0.5, 0.75):
+            point = {name: values[int(share * (len(values) - 1))] for name, values in grids.items()}
+            for _ in range(SWEEPS):
+                before = dict(point)
+                for name, values in grids.items():
+                    point[name] = min(values, key=lambda v: np.nan_to_num(tried({**point, name: v}), nan=np.inf))
+                if point == before:
+                    break
+        method = "one parameter after the other, three starts"
+    in_order = sorted(known.values(), key=lambda row: np.nan_to_num(row[1], nan=np.inf))
+    return Search(in_order[0][0], in_order[0][1], tuple(in_order), method)
+
+
+def _fold(
+    full: Mapping[str, RankBench],
+    few: Mapping[str, RankBench],
+    train: Sequence[str],
+    found: Search,
+    criterion: Criterion,
+    setting: str,
+) -> RankHeldOutFold:
+    test = [name for name in full if name not in train]
+    ties = _ties([few[name] for name in train], found)
+    return RankHeldOutFold(
+        setting=setting,
+        criterion=criterion,
+        fitted_on=tuple(train),
+        applied_to=tuple(test),
+        parameters=found.point,
+        evaluations=len(found.tried),
+        method=found.method,
+        ties=tuple(ties),
+        rows=tuple(_rows(full, train, test, found.point)),
+    )
+
+
+def _ties(benches: Sequence[RankBench], found: Search) -> list[dict[str, Any]]:
+    """Other points whose misses cannot be told from those of the best one, on the flights of the fit."""
+
+    def misses(point: Point) -> list[FloatArray]:
+        out = []
+        for bench in benches:
+            k = float(point.get(K_KEY, min(bench.data.settings.rank.k)))
+            for series, sigma in zip(bench.data.rank, bench.singular_values(point), strict=True):
+                known = np.isfinite(sigma).all(axis=1) & (series.rank >= 1)
+                said = ranks.rank_from_singular_values(np.nan_to_num(sigma), k)
+                out.append(np.where(known, (said != series.rank).astype(np.float64), np.nan))
+        return out
+
+    best = np.concatenate(misses(found.point))
+    same = []
+    for point, _ in found.tried[1:FINALISTS]:
+        difference = paired_difference(np.concatenate(misses(point)), best, replicates=REPLICATES)
+        if difference.verdict != "worse":
+            same.append(point)
+    return same
+
+
+def _rows(
+    full: Mapping[str, RankBench], train: Sequence[str], test: Sequence[str], point: Point
+) -> list[RankHeldOutRow]:
+    """Each flight as written and as fitted; shares and commonest rank always of the flights of the fit."""
+    points: dict[str, Point] = {"start": {}, "fit": point}
+    tables = {label: shares_by_rank(*_joined([full[name].pairs(at) for name in train])) for label, at in points.items()}
+    fitted, _ = _joined([full[name].pairs(point) for name in train])
+    constant, commonest = constant_forecast(fitted), int(np.bincount(fitted).argmax())
+    rows = []
+    for name in (*train, *test):
+        reported, _ = full[name].pairs(point)
+        flat = np.tile(constant, (len(reported), 1))
+        scores: dict[str, Any] = {}
+        for label, at in points.items():
+            scores |= _scores(label, *full[name].pairs(at), tables[label])
+        rows.append(
+            RankHeldOutRow(
+                flight=name,
+                fitted_here=name in train,
+                n=len(reported),
+                majority_agreement=_mean(reported == commonest),
+                constant_log_score=_mean(log_losses(flat, reported)),
+                **scores,
+            )
+        )
+    return rows
+
+
+def _joined(pairs: Sequence[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]:
+    one, two = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return one, two
+
+
+def _mean(values: Any) -> float:
+    return float(np.mean(values)) if len(values) else float("nan")
+
+
+def _scores(label: str, reported: IntArray, simulated: IntArray, table: FloatArray) -> dict[str, float]:
+    """Numbers of one flight at one point, by the names of the row."""
+    shares = (ranks.histogram(part) for part in (reported, simulated))
+    return {
+        f"{label}_kappa": ranks.cohen_kappa(reported, simulated),
+        f"{label}_agreement": ranks.agreement(reported, simulated),
+        f"{label}_total_variation": ranks.total_variation(*shares),
+        f"{label}_log_score": _mean(log_losses(table[simulated - 1], reported)),
+    }

@@ -1,0 +1,292 @@
+"""What the paths of one link are made of, term by term, and why others are not there.
+
+The level of a path is the mean over element pairs of the power it brings. Each term is the ratio [dB] of that mean
+after and before a step (tower's antenna, reflections, spreading, UAV's antenna, polarisation), so the terms add up to
+the level whatever the arrays are; with one element at both ends they are the gains and losses of the textbook.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from ..common.units import (
+    SPEED_OF_LIGHT_MPS,
+    AnyArray,
+    FloatArray,
+    IntArray,
+    db_from_amplitude,
+    db_from_power,
+    power_from_db,
+    wavelength_m,
+)
+from .arrays import Link, Poses
+from .channel import _chunk_field, _Materials, reflection_coefficients
+from .image import images_of, scene_tolerance_m, trace_back
+from .paths import Faces, PathSet
+from .solids import Occlusion
+from .tracer import Replay
+
+EDGE_M = 1e-3
+"""A point this near the edge of its face, or a segment this near a building, is beyond what float32 can decide."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Bounce:
+    """One reflection of a path.
+
+    ``te_db`` and ``tm_db`` are the magnitudes of its coefficients, ``loss_db`` is what it took; ``incidence_deg`` is
+    counted from the normal.
+    """
+
+    face: str
+    material: str
+    east_m: float
+    north_m: float
+    up_m: float
+    incidence_deg: float
+    te_db: float
+    tm_db: float
+    loss_db: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class ExplainedPath:
+    """One path. Azimuths clockwise from north; ``arrival`` looks from the UAV towards where the wave comes from.
+
+    ``level_dbm`` is the sum of ``terms_db`` and the transmit power; ``phase_deg`` that of the first element pair.
+    """
+
+    depth: int
+    bounces: tuple[Bounce, ...]
+    segments_m: tuple[float, ...]
+    length_m: float
+    delay_ns: float
+    departure_azimuth_deg: float
+    departure_elevation_deg: float
+    arrival_azimuth_deg: float
+    arrival_elevation_deg: float
+    terms_db: dict[str, float]
+    level_dbm: float
+    phase_deg: float
+    planes: tuple[int, ...] = ()
+
+    @property
+    def words(self) -> str:
+        """The faces it meets, from tower to UAV."""
+        return ", ".join(bounce.face for bounce in self.bounces) or "line of sight"
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain values for JSON; what is infinite (no field at all) becomes None."""
+        return {"path": self.words, **_finite({k: v for k, v in asdict(self).items() if k != "planes"})}
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(one) for key, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(one) for one in value]
+    return None if isinstance(value, float) and not np.isfinite(value) else value
+
+
+def explain_paths(
+    paths: PathSet,
+    faces: Faces,
+    source_m: FloatArray,
+    poses: Poses,
+    link: Link,
+    further_db: dict[str, FloatArray],
+) -> tuple[ExplainedPath, ...]:
+    """The paths of one link, strongest first.
+
+    Parameters
+    ----------
+    paths : PathSet
+        Of one pose and one tower.
+    faces : Faces
+    source_m : (3,)
+    poses : Poses
+        The pose.
+    link : Link
+        With that tower alone.
+    further_db : dict of str to (paths,)
+        Losses besides the field's own, by name; positive.
+    """
+    seen: list[tuple[str, AnyArray]] = []
+    rows = np.arange(len(paths))
+    array = next(iter(link.tower_arrays.values()))
+    found = []
+    for row in rows:
+        seen.clear()
+        one = paths.select(np.array([row]))
+        tables = _Materials.of(faces, link.carrier_hz)
+        field = _chunk_field(
+            one, np.zeros(1, np.int64), faces, tables, source_m, array, poses, link, lambda *step: seen.append(step)
+        )
+        further = {name: float(loss[row]) for name, loss in further_db.items()}
+        found.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field, further))
+    return tuple(sorted(found, key=lambda path: -path.level_dbm))
+
+
+def _explained(
+    path: PathSet,
+    faces: Faces,
+    source_m: FloatArray,
+    target_m: FloatArray,
+    link: Link,
+    seen: list[tuple[str, AnyArray]],
+    field: AnyArray,
+    further_db: dict[str, float],
+) -> ExplainedPath:
+    waves = [(np.abs(value) ** 2).sum(axis=0) for name, value in seen if name == "wave"]
+    spreading = next(value for name, value in seen if name == "spreading") ** 2
+    uav = (np.abs(next(value for name, value in seen if name == "uav")) ** 2).sum(axis=0)
+    powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, np.abs(field) ** 2]
+    mean = np.array([1.0, *(float(power.mean()) for power in powers)])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
+    steps = np.where(mean[1:] > 0.0, steps, np.where(mean[:-1] > 0.0, -np.inf, 0.0))
+    depth = int(path.depth[0])
+    names = [
+        "tower antenna",
+        *(f"reflection {i + 1}" for i in range(depth)),
+        "spreading",
+        "UAV antenna",
+        "polarisation",
+    ]
+    terms = {name: float(step) + 0.0 for name, step in zip(names, np.round(steps, 12), strict=True)}  # no minus zero
+    terms |= {name: 0.0 - loss for name, loss in further_db.items()}
+    corners = np.concatenate([source_m[None], path.vertices_m[0, :depth], target_m[None]])
+    legs = np.diff(corners, axis=0)
+    lengths = np.linalg.norm(legs, axis=1)
+    away, back = legs[0], -legs[-1]
+    bounces = tuple(
+        _bounce(faces, int(path.faces[0, i]), corners[i + 1], legs[i], link, terms[f"reflection {i + 1}"])
+        for i in range(depth)
+    )
+    return ExplainedPath(
+        depth=depth,
+        bounces=bounces,
+        segments_m=tuple(lengths.tolist()),
+        length_m=float(lengths.sum()),
+        delay_ns=1e9 * float(lengths.sum()) / SPEED_OF_LIGHT_MPS,
+        departure_azimuth_deg=_azimuth_deg(away),
+        departure_elevation_deg=_elevation_deg(away),
+        arrival_azimuth_deg=_azimuth_deg(back),
+        arrival_elevation_deg=_elevation_deg(back),
+        terms_db=terms,
+        level_dbm=link.transmit_power_dbm + sum(terms.values()),
+        phase_deg=float(np.degrees(np.angle(field[0, 0, 0]))),
+        planes=tuple(path.faces[0, :depth].tolist()),
+    )
+
+
+def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: Link, loss_db: float) -> Bounce:
+    cosine = float(abs(faces.normal[face] @ leg) / np.linalg.norm(leg))
+    tables = _Materials.of(faces, link.carrier_hz)
+    te, tm = reflection_coefficients(
+        np.array(cosine), tables.permittivity[face], tables.thickness_m[face], wavelength_m(link.carrier_hz)
+    )
+    return Bounce(
+        face=faces.label[face],
+        material=faces.material[face],
+        east_m=float(point[0]),
+        north_m=float(point[1]),
+        up_m=float(point[2]),
+        incidence_deg=float(np.degrees(np.arccos(min(cosine, 1.0)))),
+        te_db=float(db_from_amplitude(abs(te))),
+        tm_db=float(db_from_amplitude(abs(tm))),
+        loss_db=-loss_db,
+    )
+
+
+def _azimuth_deg(leg: FloatArray) -> float:
+    return float(np.degrees(np.arctan2(leg[0], leg[1])) % 360.0)
+
+
+def _elevation_deg(leg: FloatArray) -> float:
+    return float(np.degrees(np.arctan2(leg[2], np.hypot(leg[0], leg[1]))))
+
+
+def power_sum_dbm(found: tuple[ExplainedPath, ...]) -> float:
+    """Level of the paths' powers added [dBm]."""
+    return float(db_from_power(sum(float(power_from_db(path.level_dbm)) for path in found)))
+
+
+# ---------------------------------------------------------------- why not
+
+
+def why_not(faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
+    """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one."""
+    sequence = sequence[sequence >= 0]
+    tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
+    images = images_of(faces, sequence[None], source_m[None])
+    whole = Faces(faces.normal, faces.offset_m, faces.material, faces.label)  # every face a whole plane
+    points, ahead = trace_back(whole, sequence[None], images, target_m[None], tolerance)
+    if not ahead[0]:
+        return "an end or an image lies behind a face: it has no reflection point"
+    for step, face in enumerate(sequence):
+        far = _outside_m(faces, int(face), points[0, step])
+        if far > tolerance:
+            return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
+    corners = np.concatenate([source_m[None], points[0], target_m[None]])
+    for solid in np.unique(faces.solid[faces.solid >= 0]):
+        members = np.flatnonzero(faces.solid == solid)
+        if Occlusion(_chosen(faces, members), tolerance).segments(corners[:-1], corners[1:]).any():
+            return f"occluded by {faces.label[members[0]].rsplit(' wall', 1)[0].rsplit(' roof', 1)[0]}"
+    if Occlusion(faces, tolerance).segments(corners[:-1], corners[1:]).any():
+        return "occluded by buildings that touch"
+    return ""
+
+
+def _metres(length: float) -> str:
+    return f"{length:.2f} m" if length >= 0.01 else f"{length:.1e} m"
+
+
+def _outside_m(faces: Faces, face: int, point: FloatArray) -> float:
+    """Distance in its plane from a face to a point; negative inside: to its nearest edge."""
+    import shapely
+
+    place = np.array([faces.along[face] @ point, faces.across[face] @ point])
+    polygon = faces.polygon[face]
+    if polygon is not None:
+        spot = shapely.Point(*place)
+        return float(polygon.distance(spot)) or -float(polygon.exterior.distance(spot))
+    over = np.maximum(faces.lower[face] - place, place - faces.upper[face])
+    return float(np.linalg.norm(np.maximum(over, 0.0))) if (over > 0.0).any() else float(over.max())
+
+
+def _chosen(faces: Faces, members: IntArray) -> Faces:
+    """Some of the faces."""
+    columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+    return Faces(
+        material=tuple(faces.material[i] for i in members),
+        label=tuple(faces.label[i] for i in members),
+        polygon=tuple(faces.polygon[i] for i in members),
+        **{name: getattr(faces, name)[members] for name in columns},
+    )
+
+
+def near_an_edge(faces: Faces, source_m: FloatArray, target_m: FloatArray, path: ExplainedPath) -> bool:
+    """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face."""
+    points = np.array([[b.east_m, b.north_m, b.up_m] for b in path.bounces]).reshape(-1, 3)
+    if any(_outside_m(faces, face, point) > -EDGE_M for face, point in zip(path.planes, points, strict=True)):
+        return True
+    corners = np.concatenate([source_m[None], points, target_m[None]])
+    tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
+    # moved by that much in any direction it meets a building, other than those it reflects at
+    own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
+    wide = Occlusion(_chosen(faces, np.flatnonzero(~own)), tolerance)
+    moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
+    return any(wide.segments(corners[:-1] + move, corners[1:] + move).any() for move in moves)
+
+
+def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
+    """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
+    grounds = np.flatnonzero(replay.faces.solid < 0)
+    return [
+        ("line of sight", np.zeros(0, dtype=np.int64)),
+        *((f"reflection at the {replay.faces.label[g]}", np.array([g])) for g in grounds),
+    ]

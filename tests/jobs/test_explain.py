@@ -1,0 +1,139 @@
+"""``aerpaw-cmp explain``: terms add up to what the report writes, and each reason is the true one."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pandas as pd
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.jobs import explain
+from aerpaw_cmp.jobs.explain import run_explain
+
+ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
+SETTINGS = {
+    "flight": {
+        "name": "small", "synthetic": True,
+        "plan": {
+            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 10.0, "rss_interval_s": 2.0, "fading_db": 0.0,
+            "waypoints": [{"east_m": e, "north_m": n, "height_m": h} for e, n, h in ((-40, 10, 30), (-250, 60, 20))],
+            "offsets_db": {"LW1": {"USRP1": 12.3}, "LW2": {"USRP1": 3.0}},
+        },
+    },
+    "site": {"file": "lake_wheeler"},
+    "timezone": "America/New_York",
+    "logs": [
+        {"path": "small/vehicle.txt", "reader": "vehicle_out"},
+        {"path": "small/USRP1.txt", "reader": "sounder_log", "node": "LW1", "channel": "USRP1"},
+        {"path": "small/USRP2.txt", "reader": "sounder_log", "node": "LW2", "channel": "USRP1"},
+    ],
+    "link": {"rss": {"carrier_hz": 3.3e9, "tower": {**ANTENNA, "slant_deg": [20.0]}, "uav": ANTENNA}},
+    "rt": {"audit_links": 0, "attitude": "logged", "foliage": "attenuating", "reflection_loss_db": 1.5},
+    "rss": {"bootstrap": 20, "lag": "off"},
+    "report": {"speed_table": False},
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def flown(tmp_path_factory):
+    """A small flight and its report."""
+    folder = tmp_path_factory.mktemp("explain")
+    path = folder / "flight.yaml"
+    path.write_text(yaml.safe_dump(SETTINGS), encoding="utf-8")
+    assert main(["simulate", str(path), "--quiet"]) == 0
+    assert main(["report", str(path), "-o", str(folder / "out"), "--figures", "none", "--quiet"]) == 0
+    return path, pd.read_csv(folder / "out" / "rss.csv")
+
+
+@pytest.mark.parametrize("tower", ["LW1", "LW2"])
+def test_terms_add_up_to_the_level_of_the_report(flown, tower):
+    path, table = flown
+    rows = table[table.tower == tower]
+    seen = set()
+    for row in rows.iloc[:: max(len(rows) // 5, 1)].itertuples():
+        found = run_explain(path, time=row.time_utc, tower=tower)
+        assert found.time_utc == row.time_utc
+        assert (found.position_m[0], found.position_m[2]) == pytest.approx((row.east_m, row.up_m), abs=1e-3)
+        assert found.measured_db == pytest.approx(row.measured_db, abs=1e-3)
+        assert found.level_dbm == pytest.approx(row.simulated_dbm, abs=1e-3)
+        field = 0.0
+        for one in found.paths:
+            assert one.level_dbm == pytest.approx(found.transmit_power_dbm + sum(one.terms_db.values()), abs=1e-9)
+            assert one.length_m == pytest.approx(sum(one.segments_m))
+            assert one.delay_ns == pytest.approx(one.length_m / 0.299792458)
+            spreading = 20 * np.log10(299792458 / 3.3e9 / (4 * np.pi * one.length_m))
+            assert one.terms_db["spreading"] == pytest.approx(spreading, abs=1e-9)
+            assert one.terms_db["rough surfaces"] == -1.5 * one.depth
+            field += 10 ** (one.level_dbm / 20) * np.exp(1j * np.radians(one.phase_deg))
+            seen |= set(one.terms_db)
+            for bounce in one.bounces:  # what a reflection takes lies between its two coefficients
+                least, most = sorted((-bounce.te_db, -bounce.tm_db))
+                assert least - 1e-9 <= bounce.loss_db <= most + 1e-9
+        assert 20 * np.log10(abs(field)) == pytest.approx(row.simulated_dbm, abs=1e-3)
+    assert {"foliage", "reflection 1", "polarisation", "UAV antenna"} <= seen
+
+
+def test_command_line_and_json(flown, capsys):
+    path, _ = flown
+    assert main(["explain", str(path), "--time", "4", "--tower", "LW1", "--json", "--quiet"]) == 0
+    found = json.loads(capsys.readouterr().out)
+    assert found["tower"] == "LW1"
+    assert found["time_s"] == 4.0
+    assert found["paths"][0]["path"] == "line of sight"
+    assert main(["explain", str(path), "--time", "2025-06-01T10:00:04", "--tower", "LW1", "--quiet"]) == 0  # local time
+    said = capsys.readouterr().out
+    assert "line of sight" in said
+    assert "coherent sum" in said
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"time": "9999"}, r"after the last sample.*|0 to"),
+        ({"time": "-20"}, "before the first"),
+        ({"time": "noon"}, "seconds after"),
+        ({"tower": "LW9"}, "LW1, LW2"),
+        ({"tower": "LW4"}, "not measured there"),
+        ({"channel": "USRP7"}, "USRP1"),
+    ],
+)
+def test_bad_input_is_one_message(flown, change, message):
+    with pytest.raises(UsageError, match=message):
+        run_explain(flown[0], **{"time": "4", "tower": "LW1", **change})
+
+
+def test_paths_that_one_engine_lacks_are_named_with_the_reason(flown, monkeypatch):
+    """Sionna stands for itself with samples missing and a path through a wall: what it says is made up here."""
+    path, _ = flown
+    true = explain.replay_poses
+
+    def replay_poses(site, rt, link, pose, *, engine=None, progress=None):
+        found = true(site, rt, link, pose, engine="image")
+        if engine != "sionna":
+            return found
+        few = rt.samples == "auto"
+        paths = found.paths.select(found.paths.depth < (1 if few else 2))
+        return dataclasses.replace(found, paths=paths, engine="sionna", samples=1000)
+
+    monkeypatch.setattr(explain, "replay_poses", replay_poses)
+    found = run_explain(path, time="4", tower="LW1", engine="both")
+    assert {one.found_by for one in found.differences} == {"image"}
+    budget = [one for one in found.differences if "sample budget: found with 10000" in one.reason]
+    assert "ground" in {one.path for one in budget}
+
+    def no_direct_path(site, rt, link, pose, *, engine=None, progress=None):
+        found = true(site, rt, link, pose, engine="image")
+        return (
+            found if engine == "sionna" else dataclasses.replace(found, paths=found.paths.select(found.paths.depth > 0))
+        )
+
+    monkeypatch.setattr(explain, "replay_poses", no_direct_path)
+    found = run_explain(path, time="4", tower="LW1", engine="both")
+    (one,) = found.differences
+    assert (one.found_by, one.path, one.reason) == ("sionna", "line of sight", "no reason found")
+    assert found.absent[0][0] == "line of sight"

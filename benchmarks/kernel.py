@@ -6,7 +6,8 @@
    and additions of this machine without fused ones, which the kernel must not use (both measured in this run);
 4. seconds and peak memory of a flight of ``--long`` poses, replayed in parts that are made as they are asked for
    (a process of its own per length);
-5. with ``--cold``: seconds of a first replay in a new process, NumPy and compiled, for growing sizes: where they cross.
+5. the field on a CUDA device, where there is one;
+6. with ``--cold``: seconds of a first replay in a new process, NumPy and compiled, for growing sizes: where they cross.
 
 Run: python benchmarks/kernel.py [--poses 10000] [--pairs 3] [--long 100000 1000000] [--cold] [--json]
 """
@@ -120,6 +121,24 @@ def arithmetic(poses: int) -> dict[str, float]:
     }
 
 
+def on_gpu(poses: int) -> dict[str, object]:
+    """Wall seconds of the field on a CUDA device, against the CPU's on all its threads; or why there is none."""
+    from aerpaw_cmp.propagation import cuda_field
+
+    if reason := cuda_field.available():
+        return {"run": False, "reason": reason}
+    site, link, some = random_scene(poses, towers=TOWERS)
+    os.environ[compiled.SWITCH] = "always"
+    found, scene = replay(site, link, some), Scene.of(site, link, some)
+    row: dict[str, object] = {"run": True}
+    for device in ("cpu", "cuda", "cuda"):  # the first run on the device compiles
+        start = time.perf_counter()
+        h = channel_matrices(found.paths, scene.faces, scene.sources_m, some, link, device=device).h
+        row[f"{device}_wall_s"] = time.perf_counter() - start
+        row[f"{device}_h_worst_relative"] = float(np.abs(h - found.h).max() / np.abs(found.h).max())
+    return row
+
+
 def peak_mib() -> float:
     """Largest resident memory of this process; what its parent had does not count, as it does for getrusage."""
     lines = Path("/proc/self/status").read_text().splitlines()
@@ -194,6 +213,7 @@ def main() -> None:
         "load": os.getloadavg()[0],
         "replay": pairs(options.poses, options.pairs),
         "arithmetic": arithmetic(options.poses),
+        "gpu": on_gpu(options.poses),
     }
     command = [sys.executable, __file__, "--only-long"]
     result["long"] = [

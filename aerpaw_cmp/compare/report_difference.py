@@ -39,11 +39,17 @@ class Changed:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Overlap:
-    """Samples of the first report, of the second, in both, and in one only."""
+    """Samples of the first report, of the second, in both, and in one only.
+
+    ``first_span`` and ``second_span`` are the first and the last instant of those in that report alone, as its table
+    writes them.
+    """
 
     first: int
     second: int
     common: int
+    first_span: tuple[str, str] | None = None
+    second_span: tuple[str, str] | None = None
 
     @property
     def only_first(self) -> int:

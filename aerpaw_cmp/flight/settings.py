@@ -360,6 +360,8 @@ class RtSettings(Settings):
     maximum_gap_s: Positive = 3.0
     """Telemetry gaps longer than this are not bridged."""
     cache: bool = True
+    device: Literal["auto", "cpu", "cuda"] = "auto"
+    """Of Sionna's search (auto: a GPU where there is one) and, with cuda, of the field."""
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     """Of compiled code; by default the cores this process may use. Results do not depend on it."""
 

@@ -376,8 +376,19 @@ def _matched(one: Any, two: Any) -> tuple[Overlap, Any, Any]:
     if first.index.equals(second.index):
         return Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
-    overlap = Overlap(first=len(first), second=len(second), common=len(common))
+    overlap = Overlap(
+        first=len(first),
+        second=len(second),
+        common=len(common),
+        first_span=_span(first.index.difference(common, sort=False)),
+        second_span=_span(second.index.difference(common, sort=False)),
+    )
     return overlap, first.loc[common], second.loc[common]
+
+
+def _span(alone: Any) -> tuple[str, str] | None:
+    """First and last instant of samples that one report alone has, in the order of its table."""
+    return (str(alone[0][0]), str(alone[-1][0])) if len(alone) else None
 
 
 def _values(table: Any, name: str) -> FloatArray:
@@ -396,7 +407,7 @@ def _instants(table: Any) -> FloatArray:
     """Seconds after one instant for all links; without times of day, after each link's first sample."""
     import pandas as pd
 
-    known = pd.to_datetime(table["time_utc"].replace("", None), utc=True, errors="coerce")
+    known = pd.to_datetime(table["time_utc"].where(table["time_utc"] != ""), utc=True, errors="coerce")
     seconds = (known - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 

@@ -282,7 +282,7 @@ def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[t
 def _elsewhere(found: Replay) -> str:
     if found.engine == "sionna":
         return f"nothing is in its way: not found with {found.samples} samples per tower"
-    return "geometry allows it: left out by terrain, by another tower's ground, or by rt.relevance_db"
+    return "geometry allows it: stopped by the terrain, or the ground of another tower"
 
 
 def _differences(
@@ -311,16 +311,11 @@ def _differences(
         else:
             reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
         yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    full = None
     levels = {p.planes: p for p in _paths(data, rt, theirs, link, pose, source)}
     for key, sequence in others.items():
         if key in mine:
             continue
-        if rt.relevance_db is not None and full is None:
-            full = replay_poses(data.site, rt.model_copy(update={"relevance_db": None}), link, pose, engine="image")
         reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64))
-        if not reason and full is not None and key in _by_plane(full, theirs)[0]:
-            reason = f"below the bound: left out by rt.relevance_db: {rt.relevance_db:g}"
         path = levels[sequence]
         yield OtherEngine(
             found_by="sionna", path=path.words, level_dbm=_level(path.level_dbm), reason=reason or "no reason found"

@@ -386,6 +386,7 @@ def replay_poses(
         relevance_db=rt.relevance_db,
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
+        device=rt.device,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
     )

@@ -65,7 +65,9 @@ class PathCache:
         if settings.engine == "sionna":
             versions += [metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
             versions += [str(carrier_hz), *scene.faces.material]
-        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()) if k != "threads")])
+        text = "\n".join(
+            [*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()) if k not in ("threads", "device"))]
+        )
         digest.update(text.encode())
         faces = scene.faces
         for polygon in faces.polygon:

@@ -32,6 +32,7 @@ class Settings:
     batch: int = 50
     variant: str | None = None
     threads: int | None = None
+    device: str = "auto"
 
 
 @dataclass(frozen=True, slots=True)

@@ -28,6 +28,7 @@ from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
 
 Engine = Literal["sionna", "image"]
+Device = Literal["auto", "cpu", "cuda"]
 Visibility = Literal["centre", "pairs"]
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 """``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
@@ -142,6 +143,7 @@ def replay(
     visibility: Visibility = "centre",
     variant: str | None = None,
     threads: int | None = None,
+    device: Device = "auto",
     whole: Whole | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
@@ -181,6 +183,9 @@ def replay(
         ``sionna`` only.
     threads : int, optional
         Of compiled code (default: the cores this process may use); results do not depend on it.
+    device : {"auto", "cpu", "cuda"}
+        Of Sionna's search, unless ``variant`` says it ("auto": a GPU where Dr.Jit finds one), and of the field ("cuda"
+        alone evaluates it on a GPU).
     whole : Whole, optional
         What the poses are a part of; see :func:`replay_parts`.
     progress : callable, optional
@@ -212,7 +217,8 @@ def replay(
         scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads)
+    variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
+    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads, device)
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":
@@ -228,7 +234,7 @@ def replay(
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
-    result, idle = _evaluate(scene, link, poses, paths, engine, loss, threads, relevance_db)
+    result, idle = _evaluate(scene, link, poses, paths, settings, loss, relevance_db)
     left_out += idle
     if visibility == "pairs":
         small = drop_small_faces
@@ -584,15 +590,24 @@ def _evaluate(
     link: Link,
     poses: Poses,
     paths: PathSet,
-    engine: str,
+    settings: Settings,
     loss: Loss | None,
-    threads: int | None,
     relevance_db: float | None,
 ) -> tuple[Replay, list[str]]:
     """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
     loss_db = None if loss is None else loss(paths, scene.sources_m, poses.position_m)
     work = scene.pairs or None
-    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=threads, work=work)
+    fields = channel_matrices(
+        paths,
+        scene.faces,
+        scene.sources_m,
+        poses,
+        link,
+        loss_db,
+        threads=settings.threads,
+        work=work,
+        device=settings.device,
+    )
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
     has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
@@ -613,6 +628,6 @@ def _evaluate(
         faces=scene.faces,
         seconds=0.0,
         search_seconds=0.0,
-        engine=engine,
+        engine=settings.engine,
         towers=tuple(link.tower_arrays),
     ), idle

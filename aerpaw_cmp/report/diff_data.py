@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
 
-from ..compare.report_difference import Changed, LevelDifference, RankDifference
+from ..compare.report_difference import Changed, LevelDifference, Overlap, RankDifference
 from ..compare.statistics import PairedDifference
 from .words import count
 
@@ -120,9 +120,20 @@ def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
     if abs(one.rmse.difference_db) > tolerance_db:
         yield f"RMSE by {one.rmse.difference_db:+.3g} dB"
     if one.samples.only_first or one.samples.only_second:
-        yield f"{one.samples.only_first} samples only in the first, {one.samples.only_second} only in the second"
+        yield _alone(one.samples)
     elif one.scored.first != one.scored.second or one.scored.common != one.scored.first:
         yield f"{one.scored.first} scored samples against {one.scored.second}"
+
+
+def _alone(samples: Overlap) -> str:
+    """How many samples are in one report alone, and when."""
+    sides = ((samples.only_first, samples.first_span, "first"), (samples.only_second, samples.second_span, "second"))
+    told = [
+        f"{n} samples only in the {name}" + (f" ({span[0]} to {span[1]})" if span else "")
+        for n, span, name in sides
+        if n
+    ]
+    return ", ".join(told)
 
 
 def _rank_clauses(one: RankDifference) -> Iterator[str]:
@@ -131,7 +142,7 @@ def _rank_clauses(one: RankDifference) -> Iterator[str]:
     if one.n_reported_changed:
         yield f"{one.n_reported_changed} of {one.samples.common} reported ranks"
     if one.samples.only_first or one.samples.only_second:
-        yield f"{one.samples.only_first} samples only in the first, {one.samples.only_second} only in the second"
+        yield _alone(one.samples)
 
 
 # --- words ----------------------------------------------------------------------------------------------------------

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import importlib.util
+import json
+import subprocess
 import sys
 import types
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -279,6 +282,42 @@ def test_parts_are_the_whole_bit_by_bit(monkeypatch, case, mode):
     np.testing.assert_allclose(np.concatenate([p.h for p in streamed]), whole.h, rtol=0, atol=1e-14)
     with pytest.raises(UsageError, match="without extent_m"):
         next(replay_parts(site, link, iter([poses])))
+
+
+# ---------------------------------------------------------------- CUDA
+
+
+@needs_numba
+def test_cuda_kernel_in_the_simulator_equals_numpy():
+    """Not a GPU: the same source, run thread by thread in Python."""
+    script = Path(__file__).with_name("cuda_simulated.py")
+    said = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
+    assert said.returncode == 0, said.stderr
+    found = json.loads(said.stdout)
+    assert found["depths"] == [0, 1, 2]
+    assert found["h"] < 1e-11
+    assert found["power"] < 1e-12
+
+
+@needs_numba
+def test_cuda_on_a_gpu(monkeypatch, case):
+    from aerpaw_cmp.propagation import cuda_field
+
+    if reason := cuda_field.available():
+        pytest.skip(reason)
+    link = with_patterns(case[1], PATTERNS["tr38901"])
+    numpy, ours, scene = both(monkeypatch, case, link, device="cuda")
+    assert np.abs(ours.h - numpy.h).max() < bound(case, link, scene, gain=10.0)
+
+
+@needs_numba
+def test_cuda_without_a_device_is_one_message(monkeypatch, case):
+    from aerpaw_cmp.propagation import cuda_field
+
+    monkeypatch.setattr(cuda_field, "available", lambda: "numba finds no CUDA device")
+    site, link, poses, _ = case
+    with pytest.raises(UsageError, match=r"rt\.device: cuda, but numba finds no CUDA device"):
+        replay(site, link, poses, device="cuda")
 
 
 # ---------------------------------------------------------------- choosing and doing without

@@ -210,6 +210,9 @@ def test_samples_of_one_report_alone_are_counted_and_left_out(two):
     assert (found.samples.only_first, found.samples.only_second) == (gone, 0)
     assert found.samples.common == found.samples.first - gone
     assert found.rmse.difference_db == 0.0
+    times = table.loc[on(table) & (table["time_s"] > 900), "time_utc"]
+    assert found.samples.first_span == (times.iloc[0], times.iloc[-1])
+    assert found.samples.second_span is None
     assert any(f"{gone} samples only in the first" in text for text in run_diff(*two).differences)
 
 

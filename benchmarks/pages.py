@@ -125,8 +125,10 @@ def real_campaign(folder: Path, interval_s: float = 2.0) -> Path:
 def opened(page: Path, repeats: int) -> dict[str, float]:
     """Medians of the seconds until the page is usable, and of the main thread's processor time."""
     sys.path.insert(0, str(ROOT))
-    from tests.report.browsing import complaints, start
+    from tests.report.browsing import BROWSER, DRIVER, complaints, start
 
+    if not (BROWSER and DRIVER):
+        raise SystemExit("no chromium with chromedriver on this machine: pages cannot be opened")
     ready, wall, thread = READY[page.name], [], []
     for _ in range(repeats):
         driver = start("--window-size=1440,1200")

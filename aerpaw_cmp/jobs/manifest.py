@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Iterator, Sequence
+from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -48,15 +49,14 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
 
 def _site_inputs(settings: FlightFile, folder: Path) -> Iterator[tuple[InputFile, Path]]:
     """The site file and what it names."""
-    from ..site.siteyaml import site_model
-
     name = settings.site.file
     path = folder / name
     if path.is_file():
         yield _entry(name, path, "site file"), path
-        model = site_model(path)
+        found = path.stat()
+        model = _site_model(path, found.st_size, found.st_mtime_ns)
     else:
-        model = site_model(name)
+        model = _site_model(name, 0, 0)
         packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
         with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / packaged) as file:
             if file.is_file():
@@ -64,6 +64,14 @@ def _site_inputs(settings: FlightFile, folder: Path) -> Iterator[tuple[InputFile
         return
     for key, text, place in named_files(model.model_dump(), [path.parent]):
         yield _entry(text, place, f"site: {key}"), place
+
+
+@lru_cache(maxsize=16)
+def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
+    """A site file as checked; a campaign asks for the same one with every task."""
+    from ..site.siteyaml import site_model
+
+    return site_model(site)
 
 
 def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:

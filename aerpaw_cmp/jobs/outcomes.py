@@ -7,7 +7,9 @@ import dataclasses
 import hashlib
 import io
 import json
+import math
 import os
+import zlib
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
@@ -23,7 +25,7 @@ from ..flight.settings import FlightFile
 from .manifest import other_inputs
 from .place import Place, open_place
 
-LAYOUT = 2
+LAYOUT = 3
 """Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
@@ -63,8 +65,8 @@ class OutcomeStore:
         except ValueError:
             self.told.append(f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz")
             return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-            return self._decode(json.loads(str(arrays["content"])), arrays)
+        with np.load(io.BytesIO(content), allow_pickle=False) as parts:
+            return self._decode(json.loads(str(parts["content"])), zlib.decompress(parts["arrays"].tobytes()))
 
     def _knows(self, value: Any) -> bool:
         """Whether :meth:`load` could give a record back."""
@@ -72,10 +74,11 @@ class OutcomeStore:
 
     def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> bool:
         """Write an entry whole or not at all, then its manifest; False where the place does not take it."""
-        arrays: dict[str, Any] = {}
+        arrays = io.BytesIO()
         content = json.dumps(self._encode(outcome, arrays))
+        packed = np.frombuffer(zlib.compress(arrays.getbuffer(), level=1), dtype=np.uint8)
         entry = io.BytesIO()
-        np.savez_compressed(entry, content=np.array(content), **arrays)
+        np.savez(entry, content=np.array(content), arrays=packed)
         sealed = seal(entry.getvalue(), _SEAL)
         try:
             self.place.write(f"{key}.npz", sealed)
@@ -117,16 +120,18 @@ class OutcomeStore:
             return True
         return False
 
-    def _encode(self, value: Any, arrays: dict[str, Any]) -> Any:
+    def _encode(self, value: Any, arrays: io.BytesIO) -> Any:
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             if not self._knows(value):
                 raise TypeError(f"{type(value).__name__} is no record that an outcome may hold")
             fields = {f.name: self._encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
             return {"is": type(value).__name__, "of": fields}
         if isinstance(value, np.ndarray):
-            name = f"a{len(arrays)}"
-            arrays[name] = value
-            return {"is": "array", "of": name}
+            if value.dtype.hasobject:
+                raise TypeError("an outcome holds no arrays of objects")
+            place = {"from": arrays.tell(), "kind": value.dtype.str, "shape": value.shape}
+            arrays.write(np.ascontiguousarray(value).tobytes())
+            return {"is": "array", "of": place}
         if isinstance(value, (tuple, list)):
             return {"is": type(value).__name__, "of": [self._encode(item, arrays) for item in value]}
         if isinstance(value, Mapping):
@@ -134,12 +139,16 @@ class OutcomeStore:
             return {"is": "dict", "of": pairs}
         return value.item() if isinstance(value, np.generic) else value
 
-    def _decode(self, value: Any, arrays: Any) -> Any:
+    def _decode(self, value: Any, arrays: bytes) -> Any:
         if not isinstance(value, dict):
             return value
         kind, content = value["is"], value["of"]
         if kind == "array":
-            return arrays[content]
+            count = math.prod(content["shape"])
+            if not count:
+                return np.zeros(content["shape"], dtype=content["kind"])
+            flat = np.frombuffer(arrays, dtype=content["kind"], count=count, offset=content["from"])
+            return flat.reshape(content["shape"]).copy()
         if kind in ("tuple", "list"):
             items = [self._decode(item, arrays) for item in content]
             return tuple(items) if kind == "tuple" else items

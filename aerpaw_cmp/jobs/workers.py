@@ -382,7 +382,8 @@ def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: 
     cluster = Cluster(client, address, progress)
     try:
         check_workers(client, paths, keep)
-        page = f"; dashboard {client.dashboard_link}" if _has_dashboard() else ""
+        there = client.scheduler_info().get("services", {}).get("dashboard")
+        page = f"; dashboard {client.dashboard_link}" if there else ""
         progress(f"{len(client.nthreads())} workers, {cluster.count} tasks at a time{page}")
         yield cluster
     finally:

@@ -50,6 +50,27 @@ def test_an_outcome_comes_back_as_it_was(tmp_path: Path) -> None:
     assert store.load("b") is None
 
 
+@pytest.mark.parametrize(
+    "array",
+    [
+        np.zeros((0, 3)),
+        np.array(["a", "längst"]),
+        np.array([], dtype="datetime64[ns]"),
+        np.arange(6).reshape(2, 3).T,
+        np.array([np.nan, -0.0, 5e-324]),
+        np.array([True, False]),
+    ],
+)
+def test_arrays_of_every_kind_come_back(tmp_path: Path, array: np.ndarray) -> None:
+    store = OutcomeStore(tmp_path, TYPES)
+    store.save("a", Outcome(track=FlownTrack(flight="f", time_s=array, position_m=np.zeros((0, 3)))))
+    found = store.load("a").track
+    assert found.time_s.dtype == array.dtype
+    assert found.time_s.shape == array.shape
+    assert found.time_s.tobytes() == np.ascontiguousarray(array).tobytes()
+    assert found.position_m.shape == (0, 3)
+
+
 @pytest.mark.parametrize("place", [0, 100, -1])
 def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> None:
     store = OutcomeStore(tmp_path, TYPES)

@@ -8,7 +8,7 @@ the links that foliage touches.
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -770,12 +770,17 @@ def export_maps(outcome: MapOutcome, folder: Path, summary: Mapping[str, Any], p
         export.write_json(folder / "maps.json", grid, site.frame, joint, summary),
         export.write_kmz(folder / "maps.kmz", grid, site.frame, shown, towers, borders, title=site.name),
     ]
-    try:
-        made = {name: str(summary.get(name, "")) for name in ("generated", "version")}
-        written.append(write_netcdf(folder / "maps.nc", dict(outcome.ordered()), site.frame, title=site.name, **made))
-        written.append(export.write_geotiff(folder / "maps.tif", grid, site.frame, joint))
-    except UsageError as missing:
-        progress(str(missing))
+    made = {name: str(summary.get(name, "")) for name in ("generated", "version")}
+    maps = dict(outcome.ordered())
+    writers: tuple[Callable[[], Path], ...] = (
+        lambda: write_netcdf(folder / "maps.nc", maps, site.frame, title=site.name, **made),
+        lambda: export.write_geotiff(folder / "maps.tif", grid, site.frame, joint),
+    )
+    for write in writers:
+        try:
+            written.append(write())
+        except UsageError as missing:
+            progress(str(missing))
     return written
 
 

@@ -407,7 +407,7 @@ def _instants(table: Any) -> FloatArray:
     """Seconds after one instant for all links; without times of day, after each link's first sample."""
     import pandas as pd
 
-    known = pd.to_datetime(table["time_utc"].replace("", None), utc=True, errors="coerce")
+    known = pd.to_datetime(table["time_utc"].where(table["time_utc"] != ""), utc=True, errors="coerce")
     seconds = (known - pd.Timestamp(0, tz="UTC")).dt.total_seconds()
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 

@@ -25,7 +25,7 @@ figure, panels = plt.subplots(1, 3, figsize=(9, 3), sharey=True, constrained_lay
 shown = {"Computed [dBm]": level, "Kriging [dBm]": estimate, "Standard deviation [dB]": np.sqrt(variance)}
 for number, (axes, (title, values)) in enumerate(zip(panels, shown.items(), strict=True)):
     limits = {} if number == 2 else {"vmin": np.nanmin(level), "vmax": np.nanmax(level)}
-    image = axes.pcolormesh(axis_m, axis_m, values.reshape(41, 41), **limits)
+    image = axes.pcolormesh(axis_m, axis_m, values.reshape(41, 41), rasterized=True, **limits)
     axes.plot(*plan_m[chosen].T, "k.", markersize=2)
     axes.set(title=title, xlabel="East [m]", aspect="equal")
     figure.colorbar(image, ax=axes, shrink=0.7)

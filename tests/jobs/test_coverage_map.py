@@ -305,6 +305,21 @@ def test_netcdf_is_written_where_its_library_is(made):
         assert "T" in data.attrs["history"].split()[0], "when it was made"
 
 
+@pytest.mark.parametrize(("module", "left"), [("netCDF4", "maps.tif"), ("rasterio", "maps.nc")])
+def test_one_missing_library_costs_its_own_file_alone(site, tmp_path, monkeypatch, module, left):
+    import sys
+
+    pytest.importorskip("netCDF4")
+    pytest.importorskip("rasterio")
+    chosen = settings(spacing_m=250.0, rank_altitudes_m=(30.0,), ks=(10.0,), foliage=("none",), study=False)
+    outcome = mapping.make_maps(site, chosen, Stages())
+    monkeypatch.setitem(sys.modules, module, None)
+    told = []
+    mapping.export_maps(outcome, tmp_path, {}, lambda text, *_: told.append(text))
+    assert {path.name for path in tmp_path.iterdir()} & {"maps.nc", "maps.tif"} == {left}
+    assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
+
+
 def test_geotiff_is_written_where_its_library_is(made):
     rasterio = pytest.importorskip("rasterio")
     with rasterio.open(made[0] / "maps.tif") as data:

@@ -249,6 +249,7 @@
     for (const e of ticks(project.east(50), project.east(w - 12), Math.floor(w / 110))) pen.fillText(number(e, 0), project.x(e), h - 17);
     pen.fillText("East [m]", w / 2, h - 3); pen.textAlign = "right";
     for (const v of ticks(project.north(h - 34), project.north(12), 5)) pen.fillText(number(v, 0), 42, project.y(v) + 4);
+    pen.textAlign = "center"; pen.save(); pen.translate(10, h / 2); pen.rotate(-Math.PI / 2); pen.fillText("North [m]", 0, 0); pen.restore();
     pen.textAlign = "left";
   }
   function drawLegend() {

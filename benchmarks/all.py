@@ -18,6 +18,7 @@ import subprocess
 import sys
 import time
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +45,7 @@ print(json.dumps(found))
 """How many times faster than its peer each part is, both sides in one process, by processor time."""
 
 COMMANDS: dict[str, list[str]] = {
-    "scaling": ["benchmarks/scaling.py", "--json"],
+    "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
     "peers": ["-c", PEERS],
     "report": ["benchmarks/report.py", "--quick", "--json"],
     "startup": ["benchmarks/startup.py", "--quick", "--json"],
@@ -56,7 +57,9 @@ COMMANDS: dict[str, list[str]] = {
     "map": ["benchmarks/map_job.py", "--quick", "--json"],
     "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],
 }
-"""What is run, each in a process of its own."""
+"""What is run, each in a process of its own; ``scaling`` an axis at a time."""
+
+AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 
 LIMIT_S = 600.0
 
@@ -118,6 +121,19 @@ def run_one(name: str, command: list[str]) -> dict[str, Any]:
         return {**found, "failed": "no JSON on standard output"}
 
 
+def run_axes(command: list[str]) -> dict[str, Any]:
+    """The scaling, one axis after the other: one that is not done in time costs no other."""
+    parts = {axis: run_one(f"scaling of {axis}", [*command, axis]) for axis in AXES}
+    found: dict[str, Any] = {
+        "seconds": round(sum(one["seconds"] for one in parts.values()), 1),
+        "load_before": parts[AXES[0]]["load_before"],
+        "result": {axis: one["result"][axis] for axis, one in parts.items() if "result" in one},
+    }
+    if missing := [f"{axis}: {one['failed']}" for axis, one in parts.items() if "failed" in one]:
+        found["failed"] = "; ".join(missing)
+    return found
+
+
 def main() -> int:
     """Run, tell, remember."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -132,7 +148,9 @@ def main() -> int:
         "version": version(),
         "machine": machine(),
         "load_before": round(os.getloadavg()[0], 2),
-        "benchmarks": {name: run_one(name, COMMANDS[name]) for name in arguments.only},
+        "benchmarks": {
+            name: (run_axes if name == "scaling" else partial(run_one, name))(COMMANDS[name]) for name in arguments.only
+        },
     }
     entry["seconds"] = round(time.perf_counter() - start, 1)
     failed = {name: one["failed"] for name, one in entry["benchmarks"].items() if "failed" in one}

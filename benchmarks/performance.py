@@ -40,14 +40,14 @@ def runs(history: Path) -> list[dict[str, Any]]:
 
 
 def last_whole(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """The last run that has the scaling.
+    """The last run that has the scaling of at least one axis.
 
     Raises
     ------
     SystemExit
         None has.
     """
-    whole = [run for run in found if "result" in run["benchmarks"].get("scaling", {})]
+    whole = [run for run in found if run["benchmarks"].get("scaling", {}).get("result")]
     if not whole:
         raise SystemExit("no run with scaling in the history: python benchmarks/all.py first")
     return whole[-1]

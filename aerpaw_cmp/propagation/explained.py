@@ -25,8 +25,10 @@ from ..common.units import (
 from .arrays import Link, Poses
 from .channel import _chunk_field, _Materials, reflection_coefficients
 from .image import images_of, scene_tolerance_m, trace_back
+from .obstacles import first_obstacle, why_not_there
 from .paths import Faces, PathSet
 from .solids import Occlusion
+from .surfaces import Surfaces
 from .tracer import Replay
 
 EDGE_M = 1e-3
@@ -218,8 +220,12 @@ def power_sum_dbm(found: tuple[ExplainedPath, ...]) -> float:
 # ---------------------------------------------------------------- why not
 
 
-def why_not(faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
+def why_not(
+    faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
+) -> str:
     """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one."""
+    if surfaces is not None:
+        return why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
@@ -269,9 +275,19 @@ def _chosen(faces: Faces, members: IntArray) -> Faces:
     )
 
 
-def near_an_edge(faces: Faces, source_m: FloatArray, target_m: FloatArray, path: ExplainedPath) -> bool:
+def near_an_edge(
+    faces: Faces,
+    source_m: FloatArray,
+    target_m: FloatArray,
+    path: ExplainedPath,
+    surfaces: Surfaces | None = None,
+) -> bool:
     """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face."""
     points = np.array([[b.east_m, b.north_m, b.up_m] for b in path.bounces]).reshape(-1, 3)
+    if surfaces is not None:  # moved by that much in any direction it meets a triangle
+        moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
+        line = np.concatenate([source_m[None], points, target_m[None]])
+        return any(first_obstacle(surfaces, line + move, np.array(path.planes, np.int64)) is not None for move in moves)
     if any(_outside_m(faces, face, point) > -EDGE_M for face, point in zip(path.planes, points, strict=True)):
         return True
     corners = np.concatenate([source_m[None], points, target_m[None]])

@@ -23,8 +23,8 @@ UNTERMINATED = "unterminated_line"
 """Flag of a record in a last line without line end: its last field may be cut short."""
 
 
-NUMBER = rb"[-+]?\d{1,20}(?:\.\d{0,20})?(?:[eE][-+]?\d{1,3})?"
-"""A decimal number of bounded length (bytes pattern, no group)."""
+NUMBER = rb"[-+]?\d{1,400}(?:\.\d{0,400})?(?:[eE][-+]?\d{1,400})?"
+"""A decimal number of bounded length (bytes pattern, no group): what pandas' parser takes, see ``_table``."""
 
 
 @dataclass(frozen=True)

@@ -15,6 +15,10 @@ from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 
 from ._lines import Lines
 
+_NO_NUMBERS = (b",.", b",-.", b",+.", b"(.", b"(-.", b"(+.")
+"""pandas reads '.5' as a number, the pattern of numbers does not."""
+_LONGEST = 400
+"""Longer lines hold numbers that the pattern of numbers does not take."""
 _PLAIN = b"0123456789+-.eE,\r\n"
 
 
@@ -88,11 +92,13 @@ def numbers(
     """
     import pandas as pd
 
-    if not len(rows):
+    if not len(rows) or int((lines.ends[rows] - lines.starts[rows]).max()) > _LONGEST:
         return None
     data = _bytes_of(lines, rows)
     if data.translate(None, _PLAIN + strip + also):
         return None  # some other character: words, NUL
+    if any(sign in data for sign in _NO_NUMBERS):
+        return None
     if np.any(lines.buffer[lines.ends[rows] - 1] == 13):
         return None  # a CR that belongs to no line end would start a row of its own
     columns = list(range(count)) if wanted is None else list(wanted)

@@ -35,8 +35,8 @@ _ROW = re.compile(
 )
 _LOG = re.compile(
     _STAMP + rb" +\[METRICS *\][^\n]{0,200}?\bpci=(?P<pci>\d{1,4})[^\n]{0,80}?\brnti=(?:0x)?(?P<rnti>[0-9a-fA-F]{1,6})"
-    rb"[^\n]{0,200}?\bcqi=(?P<cqi>[0-9.]{1,8}|n/a)[^\n]{0,80}? (?:dl_)?ri=(?P<ri>[0-9.]{1,8}|n/a)"
-    rb"[^\n]{0,80}? dl_mcs=(?P<mcs>[0-9.]{1,8}|n/a)"
+    rb"[^\n]{0,200}?\bcqi=(?P<cqi>\d{1,4}(?:\.\d{1,4})?|n/a)[^\n]{0,80}? (?:dl_)?ri=(?P<ri>\d{1,4}(?:\.\d{1,4})?|n/a)"
+    rb"[^\n]{0,80}? dl_mcs=(?P<mcs>\d{1,4}(?:\.\d{1,4})?|n/a)"
     rb"[^\n]{0,4000}$",
     re.MULTILINE,
 )

@@ -80,3 +80,16 @@ def test_a_mapped_table_has_any_separator() -> None:
         frame = by_name("generic_csv").read(data, options).streams[0].frame
         assert frame["rss_db"].tolist() == whole["rss_db"].tolist()
         assert frame["time"].tolist() == whole["time"].tolist()
+
+
+def test_what_fuzzing_found() -> None:
+    """A dot is no number; a number means the same whatever stands on other lines."""
+    log = b"2025-03-02T10:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=. dl_ri=. dl_mcs=27\n"
+    assert by_name("srsran_gnb").read(log, OPTIONS).accepted == 0
+    head = NEMO_CSV.split(b"\r\n")[0] + b"\n"
+    row = b"11,500.0,35.7300002,-78.7000003,3.916381539223372036854775808,2.0,,,\n"
+    odd = b"12,600.0,35.73-1e30,-78.7000003,3.9,2.0,,,\n"
+    assert by_name("nemo_csv").read(head + row, OPTIONS).accepted == 1
+    assert by_name("nemo_csv").read(head + row + odd, OPTIONS).accepted == 1
+    dotted = b"11,500.0,35.7300002,-78.7000003,.5,2.0,,,\n"
+    assert by_name("nemo_csv").read(head + dotted, OPTIONS).accepted == 0

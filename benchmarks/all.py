@@ -55,6 +55,7 @@ COMMANDS: dict[str, list[str]] = {
     "comparison": ["benchmarks/compare.py", "--quick", "--json"],
     "site": ["benchmarks/site.py", "--quick", "--json"],
     "map": ["benchmarks/map_job.py", "--quick", "--json"],
+    "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],
 }
 """What is run, each in a process of its own; ``scaling`` an axis at a time."""
 

@@ -158,7 +158,7 @@ def run_explain(
         unit=series.unit if isinstance(series, RssSeries) else "",
         absent=tuple(_absent(found, source, pose.position_m[0])),
         differences=differences,
-        notes=(*notes, *found.left_out),
+        notes=(*notes, *(f"left out: {what}" for what in found.left_out)),
     )
 
 

@@ -238,6 +238,8 @@ def why_not(
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
+    if not _prisms_only(faces):
+        return "hidden, or not found: crowns and scenes of triangles are not tested here"
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(_chosen(faces, members), tolerance).segments(corners[:-1], corners[1:]).any():
@@ -245,6 +247,13 @@ def why_not(
     if Occlusion(faces, tolerance).segments(corners[:-1], corners[1:]).any():
         return "occluded by buildings that touch"
     return ""
+
+
+def _prisms_only(faces: Faces) -> bool:
+    """Whether what hides is a set of prisms, each with a roof, and faces without a building are whole planes."""
+    roofed = np.unique(faces.solid[(faces.normal[:, 2] == 1.0) & (faces.solid >= 0)])
+    bare = faces.solid < 0
+    return bool(np.isin(faces.solid[~bare], roofed).all() and np.isinf(faces.lower[bare]).all())
 
 
 def _metres(length: float) -> str:
@@ -292,6 +301,8 @@ def near_an_edge(
         return True
     corners = np.concatenate([source_m[None], points, target_m[None]])
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
+    if not _prisms_only(faces):
+        return False
     # moved by that much in any direction it meets a building, other than those it reflects at
     own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
     wide = Occlusion(_chosen(faces, np.flatnonzero(~own)), tolerance)
@@ -301,7 +312,7 @@ def near_an_edge(
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
     """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
-    grounds = np.flatnonzero(replay.faces.solid < 0)
+    grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [
         ("line of sight", np.zeros(0, dtype=np.int64)),
         *((f"reflection at the {replay.faces.label[g]}", np.array([g])) for g in grounds),

@@ -17,6 +17,7 @@ import platform
 import subprocess
 import sys
 import time
+from collections.abc import Sequence
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
@@ -44,7 +45,7 @@ print(json.dumps(found))
 """How many times faster than its peer each part is, both sides in one process, by processor time."""
 
 COMMANDS: dict[str, list[str]] = {
-    "scaling": ["benchmarks/scaling.py", "--json"],
+    "scaling": ["benchmarks/scaling.py", "--json", "--axes"],
     "peers": ["-c", PEERS],
     "report": ["benchmarks/report.py", "--quick", "--json"],
     "startup": ["benchmarks/startup.py", "--quick", "--json"],
@@ -54,8 +55,11 @@ COMMANDS: dict[str, list[str]] = {
     "comparison": ["benchmarks/compare.py", "--quick", "--json"],
     "site": ["benchmarks/site.py", "--quick", "--json"],
     "map": ["benchmarks/map_job.py", "--quick", "--json"],
+    "pages": ["benchmarks/pages.py", "--only", "long,campaign", "--repeats", "1", "--json"],
 }
-"""What is run, each in a process of its own."""
+"""What is run, each in a process of its own; ``scaling`` an axis at a time."""
+
+AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 
 LIMIT_S = 600.0
 
@@ -117,10 +121,24 @@ def run_one(name: str, command: list[str]) -> dict[str, Any]:
         return {**found, "failed": "no JSON on standard output"}
 
 
+def run_axes(command: list[str], axes: Sequence[str] = AXES) -> dict[str, Any]:
+    """The scaling, one axis after the other: one that is not done in time costs no other."""
+    parts = {axis: run_one(f"scaling of {axis}", [*command, axis]) for axis in axes}
+    found: dict[str, Any] = {
+        "seconds": round(sum(one["seconds"] for one in parts.values()), 1),
+        "load_before": parts[axes[0]]["load_before"],
+        "result": {axis: one["result"][axis] for axis, one in parts.items() if "result" in one},
+    }
+    if missing := [f"{axis}: {one['failed']}" for axis, one in parts.items() if "failed" in one]:
+        found["failed"] = "; ".join(missing)
+    return found
+
+
 def main() -> int:
     """Run, tell, remember."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", choices=list(COMMANDS), default=list(COMMANDS))
+    parser.add_argument("--axes", nargs="+", choices=AXES, default=AXES, help="of the scaling")
     parser.add_argument("--history", type=Path, default=HISTORY)
     parser.add_argument("--no-history", action="store_true", help="print only")
     arguments = parser.parse_args()
@@ -131,7 +149,11 @@ def main() -> int:
         "version": version(),
         "machine": machine(),
         "load_before": round(os.getloadavg()[0], 2),
-        "benchmarks": {name: run_one(name, COMMANDS[name]) for name in arguments.only},
+        "benchmarks": {
+            name: run_axes(command, arguments.axes) if name == "scaling" else run_one(name, command)
+            for name, command in COMMANDS.items()
+            if name in arguments.only
+        },
     }
     entry["seconds"] = round(time.perf_counter() - start, 1)
     failed = {name: one["failed"] for name, one in entry["benchmarks"].items() if "failed" in one}

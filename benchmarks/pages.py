@@ -91,13 +91,18 @@ def campaign_page(folder: Path, flights: int, settings: int) -> tuple[Path, dict
     return page, {"rows": len(data.rss), "write_cpu_s": time.process_time() - begin}
 
 
-def real_campaign(folder: Path) -> Path:
-    """Three flights of the sample's plan on three days, two settings, one of them with its report."""
+def real_campaign(folder: Path, interval_s: float = 2.0) -> Path:
+    """Three flights of the sample's plan on three days, a sample every so often, two settings, one with its report."""
     content = yaml.safe_load((ROOT / "sample_logs" / "flight.yaml").read_text())
     content["rt"] = {**content.get("rt", {}), "audit_links": 0}
     for number in range(3):
         content["flight"]["name"] = f"day_{number + 1}"
-        content["flight"]["plan"] |= {"seed": 7 + number, "start": f"2025-06-0{number + 1} 10:00:00"}
+        content["flight"]["plan"] |= {
+            "seed": 7 + number,
+            "start": f"2025-06-0{number + 1} 10:00:00",
+            "rss_interval_s": interval_s,
+            "rank_interval_s": interval_s,
+        }
         place = folder / f"day_{number + 1}"
         place.mkdir()
         (place / "flight.yaml").write_text(yaml.safe_dump(content))
@@ -120,8 +125,10 @@ def real_campaign(folder: Path) -> Path:
 def opened(page: Path, repeats: int) -> dict[str, float]:
     """Medians of the seconds until the page is usable, and of the main thread's processor time."""
     sys.path.insert(0, str(ROOT))
-    from tests.report.browsing import complaints, start
+    from tests.report.browsing import BROWSER, DRIVER, complaints, start
 
+    if not (BROWSER and DRIVER):
+        raise SystemExit("no chromium with chromedriver on this machine: pages cannot be opened")
     ready, wall, thread = READY[page.name], [], []
     for _ in range(repeats):
         driver = start("--window-size=1440,1200")

@@ -40,14 +40,14 @@ def runs(history: Path) -> list[dict[str, Any]]:
 
 
 def last_whole(found: list[dict[str, Any]]) -> dict[str, Any]:
-    """The last run that has the scaling.
+    """The last run that has the scaling of at least one axis.
 
     Raises
     ------
     SystemExit
         None has.
     """
-    whole = [run for run in found if "result" in run["benchmarks"].get("scaling", {})]
+    whole = [run for run in found if run["benchmarks"].get("scaling", {}).get("result")]
     if not whole:
         raise SystemExit("no run with scaling in the history: python benchmarks/all.py first")
     return whole[-1]
@@ -97,7 +97,7 @@ def measured(scaling: dict[str, Any], axis: str) -> list[dict[str, Any]]:
 def extrapolated(scaling: dict[str, Any], axis: str, size: float) -> tuple[float, float] | None:
     """Processor seconds at a size, and how many times beyond the largest measured one it is."""
     rows, result = measured(scaling, axis), scaling.get(axis, {})
-    if not rows or result.get("power_cpu") is None:
+    if not rows or (result.get("power_cpu") or 0.0) <= 0.0:  # no growth was measured: nothing to extrapolate
         return None
     last = size_of(rows[-1])
     return rows[-1]["cpu_s"] * (size / last) ** result["power_cpu"], size / last

@@ -1,6 +1,7 @@
 """Repeatability of a whole season: every pair of flights on every link, on simulated tracks.
 
-    python benchmarks/repeats.py [--flights 200] [--towers 5] [--channels 2] [--samples 1000] [--heights 4]
+    python benchmarks/repeats.py [--flights 200] [--towers 5] [--channels 2]
+        [--samples 1000] [--heights 4] [--workers 1]
 
 Flights are lawnmower routes over one field, each a metre off and at one of ``--heights`` heights, all ten links
 sampled together. ``--heights 1`` is the worst case: every flight meets every other.
@@ -16,6 +17,7 @@ import time
 import numpy as np
 
 from aerpaw_cmp.jobs.over_flights import RepeatSettings, repeats
+from aerpaw_cmp.jobs.workers import open_workers
 from aerpaw_cmp.report.campaign_data import RssRow
 
 
@@ -51,12 +53,16 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     for name, default in (("flights", 200), ("towers", 5), ("channels", 2), ("samples", 1000), ("heights", 4)):
         parser.add_argument(f"--{name}", type=int, default=default)
+    parser.add_argument("--workers", type=int, default=1)
     asked = parser.parse_args()
-    made = rows(**vars(asked))
+    made = rows(asked.flights, asked.towers, asked.channels, asked.samples, asked.heights)
     before = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
-    wall, cpu = time.perf_counter(), time.process_time()
-    found = repeats(made, RepeatSettings())
-    wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    with open_workers(asked.workers, progress=lambda text, *_: print(text)) as crew:
+        wall, cpu = time.perf_counter(), time.process_time()
+        found = repeats(made, RepeatSettings(), crew)
+        wall, cpu = time.perf_counter() - wall, time.process_time() - cpu
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    cpu += used.ru_utime + used.ru_stime
     after = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
     meet = sum(pair.n > 0 for pair in found)
     print(f"{vars(asked)}, load {os.getloadavg()[0]:.1f}")

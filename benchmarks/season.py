@@ -6,7 +6,8 @@ Parts (all by default):
 
 chaos     a campaign process on a scheduler with two workers; a worker is killed twice, the scheduler is killed and
           started again, the campaign itself is killed (SIGKILL) and run again: all rows, equal to the serial run
-overhead  CPU of everything around a task (keys, store, scheduler, workers) against the CPU of a task
+overhead  CPU of everything around a task (keys, store, scheduler, workers) against the CPU of a task, also of a real
+          flight's size, which has to hold
 memory    the scheduler's memory while real orders with trivial work go through
 speed     two workers against one, 20 flights, taken in turn
 
@@ -277,7 +278,12 @@ def main() -> int:
             if part == "chaos":
                 good.append(chaos(campaign, folder))
             elif part == "overhead":
-                good.append(overhead(campaign, folder))
+                size = {"towers": 2, "samples": 3200, "bootstrap": 1000}  # of a real flight
+                real = write_season(folder / "real", 2, settings=3, **size)
+                print("of this season: ", end="", flush=True)
+                overhead(campaign, folder)
+                print(f"of a flight of a real size {size}: ", end="", flush=True)
+                good.append(overhead(real, folder / "real"))
             elif part == "memory":
                 good.append(memory(campaign, folder, asked.trivial))
             else:

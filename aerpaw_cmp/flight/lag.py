@@ -136,7 +136,6 @@ class _Prediction:
         self.first, self.step, self.level = first, step, columns[:, 0]
         self.slope = np.gradient(self.level, step)
         self.terms = columns[:, 1:]
-        self.term_slopes = np.gradient(self.terms, step, axis=0) if self.terms.shape[1] else self.terms
 
     def times(self) -> FloatArray:
         """Where it is sampled [s]."""
@@ -145,23 +144,29 @@ class _Prediction:
     def beside(self, terms: ArrayLike) -> _Prediction:
         """The same level with free terms (n, q) beside it."""
         columns = np.column_stack([self.level, np.asarray(terms, dtype=np.float64)])
-        good = np.isfinite(columns).all(axis=1, keepdims=True)
-        return _Prediction(self.first, self.step, np.where(good, columns, np.nan))
+        del terms  # on a long flight a copy is a good part of the memory
+        columns[~np.isfinite(columns).all(axis=1)] = np.nan
+        return _Prediction(self.first, self.step, columns)
 
-    def terms_at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
-        """The free terms at t, a constant first (n, 1 + terms); NaN as for :meth:`at`."""
-        source = self.terms if values is None else values
+    def terms_at(self, t: FloatArray, *, slopes: bool = False) -> FloatArray:
+        """The free terms at t, a constant first (n, 1 + terms), or their slopes [1/s]; NaN as for :meth:`at`."""
         place = (t - self.first) / self.step
         left = np.floor(place).astype(np.int64)
-        inside = (left >= 0) & (left < len(source) - 1)
+        inside = (left >= 0) & (left < len(self.terms) - 1)
         left = np.where(inside, left, 0)
-        result = np.empty((len(t), 1 + source.shape[1]))
-        result[:, 0] = 1.0 if values is None else 0.0
-        if source.shape[1]:
+        result = np.empty((len(t), 1 + self.terms.shape[1]))
+        result[:, 0] = 0.0 if slopes else 1.0
+        if self.terms.shape[1]:
             weight = (place - left)[:, None]
-            result[:, 1:] = source[left] * (1.0 - weight) + source[left + 1] * weight
+            read = self._slopes if slopes else self.terms.__getitem__
+            result[:, 1:] = read(left) * (1.0 - weight) + read(left + 1) * weight
             result[~inside, 1:] = np.nan
         return result
+
+    def _slopes(self, rows: AnyArray) -> FloatArray:
+        """Slopes of the terms at rows (n, terms), as :func:`numpy.gradient` has them for all."""
+        before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.terms) - 1)
+        return np.asarray((self.terms[after] - self.terms[before]) / ((after - before) * self.step)[:, None])
 
     def at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
         """Linear interpolation at t; NaN outside and next to NaN."""
@@ -404,6 +409,10 @@ def _on_terms(terms: FloatArray, rows: FloatArray) -> FloatArray:
     return np.asarray(np.linalg.lstsq(normal, right, rcond=1e-12)[0].T)
 
 
+DIRECTION_TERMS = 12
+"""Columns of :func:`direction_terms`."""
+
+
 def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_deg: ArrayLike) -> FloatArray:
     """Smooth terms that stand in for unknown antenna patterns when a lag is estimated.
 
@@ -549,7 +558,7 @@ def _refine(
         base, b = terms[1:] - phi * terms[:-1], y[1:] - phi * y[:-1]
         coefficients = _on_terms(base, b[None])[0]
         if terms.shape[1] > 1:  # the free terms move with the lag too
-            moved = prediction.terms_at(at, prediction.term_slopes)[ok]
+            moved = prediction.terms_at(at, slopes=True)[ok]
             slope = slope + np.einsum("ni,i->n", moved, coefficients)
         jacobian = slope * along
         columns = np.vstack([b, jacobian[:, 1:] - phi * jacobian[:, :-1]])

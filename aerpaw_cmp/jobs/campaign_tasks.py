@@ -10,7 +10,7 @@ import time
 import traceback
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -194,7 +194,7 @@ def carry_out(order: Order) -> Done:
         "flight": task.flight, "setting": task.setting, "flight_file": str(task.path),
         "logs_root": None if task.logs_root is None else str(task.logs_root), "overrides": dict(task.overrides),
         "seconds": seconds, "cpu_s": cpu_s, "links": links, "host": platform.node(), "process": os.getpid(),
-        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"), "versions": versions(),
+        "finished": datetime.now(timezone.utc).isoformat(timespec="seconds"), "versions": _versions(),
         "code": code_digest(), "inputs": [] if facts is None else facts.inputs,
         "settings": {} if facts is None else facts.settings.model_dump(mode="json"),
     }  # fmt: skip
@@ -214,6 +214,12 @@ def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
     except (AerpawCmpError, OSError) as error:
         return None, _failed(order.task, f"an input can no longer be read: {error}", error)
     return facts, None if facts.key == order.key else _not_the_same(order.task)
+
+
+@cache
+def _versions() -> dict[str, str]:
+    """Asked once: looking nine packages up costs more than keeping an outcome."""
+    return versions()
 
 
 def _not_the_same(task: Task) -> Outcome:

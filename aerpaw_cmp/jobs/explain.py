@@ -158,7 +158,7 @@ def run_explain(
         unit=series.unit if isinstance(series, RssSeries) else "",
         absent=tuple(_absent(found, source, pose.position_m[0])),
         differences=differences,
-        notes=(*notes, *found.left_out),
+        notes=(*notes, *(f"left out: {what}" for what in found.left_out)),
     )
 
 
@@ -276,7 +276,7 @@ def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[t
     there = {tuple(row[row >= 0].tolist()) for row in found.paths.faces}
     for words, sequence in simple_paths(found):
         if tuple(sequence.tolist()) not in there:
-            yield words, why_not(found.faces, source, target, sequence) or _elsewhere(found)
+            yield words, why_not(found.faces, source, target, sequence, found.surfaces) or _elsewhere(found)
 
 
 def _elsewhere(found: Replay) -> str:
@@ -304,7 +304,7 @@ def _differences(
         more = set(_by_plane(ours, replay_poses(data.site, wide, link, pose, engine="sionna", progress=progress))[1])
     for key in missing:
         path = explained[mine[key]]
-        if near_an_edge(ours.faces, source, target, path):
+        if near_an_edge(ours.faces, source, target, path, ours.surfaces):
             reason = "within 1 mm of an edge: float32 decides otherwise"
         elif key in more:
             reason = f"sample budget: found with {MORE_SAMPLES * theirs.samples} samples, not with {theirs.samples}"
@@ -315,7 +315,7 @@ def _differences(
     for key, sequence in others.items():
         if key in mine:
             continue
-        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64))
+        reason = why_not(theirs.faces, source, target, np.array(sequence, dtype=np.int64), theirs.surfaces)
         path = levels[sequence]
         yield OtherEngine(
             found_by="sionna", path=path.words, level_dbm=_level(path.level_dbm), reason=reason or "no reason found"

@@ -15,7 +15,7 @@ from ..common.units import BoolArray, FloatArray
 from ..compare.result import ClockResult
 from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.lag import direction_terms
+from ..flight.lag import DIRECTION_TERMS, direction_terms
 from ..flight.settings import RtSettings
 from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
@@ -189,14 +189,16 @@ class _Predictions:
 
     def terms_at(self, place_m: FloatArray, times: Any) -> FloatArray:
         """Terms of direction (n, 12) as seen from a tower, for antennas that are not known."""
-        found = []
+        found, start = np.empty((len(times), DIRECTION_TERMS)), 0
         for part in _in_blocks(times):
             track = self.track_at(part)
             line = track.position_m - place_m
             azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
             elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
-            found.append(direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg))
-        return np.concatenate(found)
+            some = direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
+            found[start : start + len(part)] = some
+            start += len(part)
+        return found
 
 
 _TRACKS_KEPT = 4

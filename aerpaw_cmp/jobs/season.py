@@ -153,7 +153,7 @@ def _paired(one: Mapping[str, Any], other: Mapping[str, Any], flights: Sequence[
 
 
 def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
-    """Own offset of every setting, tower and channel over the dates of the flights."""
+    """Own offset, before rounding, of every setting, tower and channel over the dates of the flights."""
     groups: dict[tuple[str, str, str], list[RssRow]] = {}
     for row in rows:
         if np.isfinite(row.offset_db):
@@ -161,8 +161,10 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
     found = []
     for (setting, tower, channel), members in groups.items():
         days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
+        # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
+        exact = np.array([mean_difference_db(row) for row in members])
         offsets = np.array([row.offset_db for row in members])
-        line = trend(days, offsets)
+        line = trend(days, exact)
         found.append(
             Drift(
                 setting=setting,

@@ -25,8 +25,10 @@ from ..common.units import (
 from .arrays import Link, Poses
 from .channel import _chunk_field, _Materials, reflection_coefficients
 from .image import images_of, scene_tolerance_m, trace_back
+from .obstacles import first_obstacle, why_not_there
 from .paths import Faces, PathSet
 from .solids import Occlusion
+from .surfaces import Surfaces
 from .tracer import Replay
 
 EDGE_M = 1e-3
@@ -218,8 +220,12 @@ def power_sum_dbm(found: tuple[ExplainedPath, ...]) -> float:
 # ---------------------------------------------------------------- why not
 
 
-def why_not(faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
+def why_not(
+    faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
+) -> str:
     """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one."""
+    if surfaces is not None:
+        return why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
     images = images_of(faces, sequence[None], source_m[None])
@@ -232,6 +238,8 @@ def why_not(faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: 
         if far > tolerance:
             return f"its reflection point lies {_metres(far)} outside {faces.label[face]}"
     corners = np.concatenate([source_m[None], points[0], target_m[None]])
+    if not _prisms_only(faces):
+        return "hidden, or not found: crowns and scenes of triangles are not tested here"
     for solid in np.unique(faces.solid[faces.solid >= 0]):
         members = np.flatnonzero(faces.solid == solid)
         if Occlusion(_chosen(faces, members), tolerance).segments(corners[:-1], corners[1:]).any():
@@ -239,6 +247,13 @@ def why_not(faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: 
     if Occlusion(faces, tolerance).segments(corners[:-1], corners[1:]).any():
         return "occluded by buildings that touch"
     return ""
+
+
+def _prisms_only(faces: Faces) -> bool:
+    """Whether what hides is a set of prisms, each with a roof, and faces without a building are whole planes."""
+    roofed = np.unique(faces.solid[(faces.normal[:, 2] == 1.0) & (faces.solid >= 0)])
+    bare = faces.solid < 0
+    return bool(np.isin(faces.solid[~bare], roofed).all() and np.isinf(faces.lower[bare]).all())
 
 
 def _metres(length: float) -> str:
@@ -269,13 +284,25 @@ def _chosen(faces: Faces, members: IntArray) -> Faces:
     )
 
 
-def near_an_edge(faces: Faces, source_m: FloatArray, target_m: FloatArray, path: ExplainedPath) -> bool:
+def near_an_edge(
+    faces: Faces,
+    source_m: FloatArray,
+    target_m: FloatArray,
+    path: ExplainedPath,
+    surfaces: Surfaces | None = None,
+) -> bool:
     """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face."""
     points = np.array([[b.east_m, b.north_m, b.up_m] for b in path.bounces]).reshape(-1, 3)
+    if surfaces is not None:  # moved by that much in any direction it meets a triangle
+        moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])
+        line = np.concatenate([source_m[None], points, target_m[None]])
+        return any(first_obstacle(surfaces, line + move, np.array(path.planes, np.int64)) is not None for move in moves)
     if any(_outside_m(faces, face, point) > -EDGE_M for face, point in zip(path.planes, points, strict=True)):
         return True
     corners = np.concatenate([source_m[None], points, target_m[None]])
     tolerance = scene_tolerance_m(faces, source_m[None], target_m[None])
+    if not _prisms_only(faces):
+        return False
     # moved by that much in any direction it meets a building, other than those it reflects at
     own = np.isin(faces.solid, faces.solid[list(path.planes)]) | (faces.solid < 0)
     wide = Occlusion(_chosen(faces, np.flatnonzero(~own)), tolerance)
@@ -285,7 +312,7 @@ def near_an_edge(faces: Faces, source_m: FloatArray, target_m: FloatArray, path:
 
 def simple_paths(replay: Replay) -> list[tuple[str, IntArray]]:
     """The paths one looks for first: line of sight and the reflection at each ground of the scene."""
-    grounds = np.flatnonzero(replay.faces.solid < 0)
+    grounds = np.flatnonzero((replay.faces.solid < 0) & np.isinf(replay.faces.lower).all(axis=1))
     return [
         ("line of sight", np.zeros(0, dtype=np.int64)),
         *((f"reflection at the {replay.faces.label[g]}", np.array([g])) for g in grounds),

@@ -119,7 +119,7 @@ def grow_paths(
     longest_m: float = np.inf,
     threads: int | None = None,
     progress: Progress | None = None,
-    told: Callable[[str], None] | None = None,
+    told: Callable[[str, float], None] | None = None,
     solids: bool = False,
 ) -> tuple[PathSet, Effort]:
     """All paths with at most ``max_depth`` reflections.
@@ -147,7 +147,7 @@ def grow_paths(
     progress : callable, optional
         Called with the share done.
     told : callable, optional
-        Called with the estimate of time and memory, after the first faces.
+        Called once, after the first faces, with the estimate of time and memory in words and its seconds.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
         all. What is found are candidates for :mod:`aerpaw_cmp.propagation.prisms`, coincident ones among them.
@@ -251,7 +251,7 @@ class _Search:
         return np.random.default_rng(0).permutation(np.flatnonzero(good)), int(hidden)
 
     def run(
-        self, first: IntArray, threads: int, share: Progress, told: Callable[[str], None] | None
+        self, first: IntArray, threads: int, share: Progress, told: Callable[[str, float], None] | None
     ) -> tuple[list[_Found], Effort]:
         """Follow all sequences that begin with the faces ``first``."""
         found: list[_Found] = []
@@ -286,7 +286,8 @@ class _Search:
                 if told:
                     told(
                         f"about {estimate:.0f} s for each source: {len(first)} first faces, some "
-                        f"{int(totals[0] * len(first) / size)} sequences, streamed in {memory_mib(self):.0f} MiB"
+                        f"{int(totals[0] * len(first) / size)} sequences, streamed in {memory_mib(self):.0f} MiB",
+                        estimate,
                     )
             share(done / len(first))
         spent = time.perf_counter() - begun

@@ -335,6 +335,8 @@ class _Finder:
         global LAST_CANDIDATES
         most = 0 if self.candidates is None else int(np.asarray(self.candidates.numpy()).max(initial=0))
         LAST_CANDIDATES = most
+        if not RAISE_LIMITS:
+            return False
         slots = self.slots
         while most > FULLEST_TABLE * slots:
             slots *= 2
@@ -358,7 +360,7 @@ class _Finder:
         """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
-        while max_depth and RAISE_LIMITS and self._more_room():
+        while max_depth and self._more_room():
             paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
         valid = paths.valid.numpy()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import time
+import warnings
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
@@ -26,6 +27,7 @@ from .paths import Faces, PathSet
 from .relevance import idle_objects, in_words
 from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
+from .surfaces import Surfaces
 
 Engine = Literal["sionna", "image"]
 Device = Literal["auto", "cpu", "cuda"]
@@ -66,6 +68,8 @@ class Replay:
         Why so many, where the number was found by pilots.
     pairs_differ : (poses, towers) bool, optional
         Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
+    surfaces : Surfaces, optional
+        What the faces are made of, where the site is a scene of triangles.
     """
 
     rss_dbm: FloatArray
@@ -83,6 +87,7 @@ class Replay:
     samples: int = 0
     samples_reason: str = ""
     pairs_differ: BoolArray | None = None
+    surfaces: Surfaces | None = None
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -321,6 +326,9 @@ def replay_parts(
         yield replay(site, link, part, engine, whole=whole, **options)
 
 
+LONG_SEARCH_S = 60.0
+"""A search that will take longer is announced."""
+
 MANY_FACES = 400
 """Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
 
@@ -489,6 +497,10 @@ def _search(
     if settings.engine == "image" and scene.surfaces is not None:
         from .growth import grow_paths  # compiled: loaded where there is a scene
 
+        def long_search(words: str, seconds: float) -> None:
+            if seconds > LONG_SEARCH_S:
+                warnings.warn(f"the path search takes {words}", RuntimeWarning, stacklevel=2)
+
         return grow_paths(
             scene.surfaces,
             scene.sources_m,
@@ -497,6 +509,7 @@ def _search(
             usable=scene.usable,
             excluded=scene.excluded,
             threads=settings.threads,
+            told=long_search,
             progress=progress,
         )[0]
     if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
@@ -630,4 +643,5 @@ def _evaluate(
         search_seconds=0.0,
         engine=settings.engine,
         towers=tuple(link.tower_arrays),
+        surfaces=scene.surfaces,
     ), idle

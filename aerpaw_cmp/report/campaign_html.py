@@ -261,15 +261,17 @@ def _ranked_words(data: CampaignData) -> list[str]:
     ranking = data.season.over_all()
     if len(ranking) < 2 or not data.season.held_out:
         return []
+    first = (
+        f"With the offset of the other flights, {ranking[0].setting} errs least ({ranking[0].mean_db:.2f} dB over "
+        f"{ranking[0].n_flights} flights); "
+    )
+    if all(entry.verdict == "none given" for entry in ranking[1:]):
+        return [first + "these are too few flights to show that another setting is worse."]
     like = [entry.setting for entry in ranking[1:] if entry.verdict != "worse"]
     named = ", ".join(like[:FEW_SETTINGS]) + (
         f" and {len(like) - FEW_SETTINGS} more" if len(like) > FEW_SETTINGS else ""
     )
-    return [
-        f"With the offset of the other flights, {ranking[0].setting} errs least ({ranking[0].mean_db:.2f} dB over "
-        f"{ranking[0].n_flights} flights); "
-        + (f"not shown to be worse: {named}." if like else "every other setting is shown to be worse.")
-    ]
+    return [first + (f"not shown to be worse: {named}." if like else "every other setting is shown to be worse.")]
 
 
 def warnings(data: CampaignData) -> list[str]:

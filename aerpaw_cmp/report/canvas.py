@@ -173,7 +173,7 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
     return {name: file.getvalue() for name, file in found.items()}
 
 
-def smaller(png: bytes, colours: int = 128) -> bytes:
+def smaller(png: bytes, colours: int = 256) -> bytes:
     """A picture with so many colours at most: a third of the bytes, and the same to the eye."""
     from PIL import Image
 

@@ -7,6 +7,7 @@ threads do not survive a fork).
 
 from __future__ import annotations
 
+import ctypes
 import os
 import signal
 import sys
@@ -21,6 +22,9 @@ _Item = TypeVar("_Item")
 
 FEWEST = 8
 """Figures below which a further process does not pay."""
+
+_PR_SET_PDEATHSIG = 1
+"""Of prctl(2) on Linux: the signal that the kernel sends when the parent ends."""
 
 _work: list[Callable[[], object]] = []
 """What forked processes find when they start: closures cannot be sent to them."""
@@ -66,7 +70,8 @@ def _forked(draws: Sequence[Callable[[], _Item]], processes: int) -> Iterator[_I
     import multiprocessing
 
     _work[:] = draws
-    pool = ProcessPoolExecutor(processes, multiprocessing.get_context("fork"), initializer=_leave_interrupts)
+    context = multiprocessing.get_context("fork")
+    pool = ProcessPoolExecutor(processes, context, initializer=_follow_parent, initargs=(os.getpid(),))
     try:
         with warnings.catch_warnings():
             # Python 3.12 warns of any thread, also the sleeping ones of BLAS, which know about forks
@@ -79,9 +84,12 @@ def _forked(draws: Sequence[Callable[[], _Item]], processes: int) -> Iterator[_I
         _work.clear()
 
 
-def _leave_interrupts() -> None:
-    """Ctrl-C is the parent's to answer."""
+def _follow_parent(parent: int) -> None:
+    """Leave Ctrl-C to the parent, and end with it: a process left behind would hold the lock of its output."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
+    if os.getppid() != parent:  # it ended before this was asked for
+        os._exit(1)
 
 
 def _draw(number: int) -> object:

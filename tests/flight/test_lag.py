@@ -263,3 +263,16 @@ def test_a_flight_searched_in_blocks_of_one_lag_gives_the_same_fit(monkeypatch):
     monkeypatch.setattr(lag, "_HELD", 1)
     assert estimate_lag(t, measured, level).as_dict() == whole.as_dict()
     assert abs(whole.radio_minus_telemetry_s - 1.3) < 0.1
+
+
+def test_slopes_of_free_terms_are_those_of_their_gradient():
+    """Read from the neighbours where they are asked for: no second table of a long flight."""
+    rng = np.random.default_rng(6)
+    table = rng.normal(0, 1, (50, 1 + lag.DIRECTION_TERMS))
+    prediction = lag._Prediction(3.0, 0.25, table)
+    at_nodes = prediction.times()[:-1]
+    slopes = prediction.terms_at(at_nodes, slopes=True)
+    np.testing.assert_array_equal(slopes[:, 1:], np.gradient(table[:, 1:], 0.25, axis=0)[:-1])
+    assert not slopes[:, 0].any()
+    assert np.isnan(prediction.terms_at(np.array([2.9, 99.0]))[:, 1:]).all()
+    assert direction_terms([1.0], [2.0], [3.0]).shape == (1, lag.DIRECTION_TERMS)

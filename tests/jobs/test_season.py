@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.jobs.season import find_reports, rank_settings, with_season
+from aerpaw_cmp.jobs.season import drifts, find_reports, rank_settings, with_season
 from benchmarks import fabricated
 
 
@@ -59,6 +59,18 @@ def test_the_planted_drift_is_found(data):
     assert len(drift) == 4
     assert all(d.slope_ci95_db[0] - 1 < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] + 1 for d in drift)
     assert sum(d.slope_ci95_db[0] < fabricated.DRIFT_DB_PER_30_DAYS < d.slope_ci95_db[1] for d in drift) >= 3
+
+
+def test_three_flights_whose_rounded_offsets_lie_on_a_line_are_not_certain():
+    rows = [
+        dataclasses.replace(r, simulated_dbm=r.simulated_dbm + shift, offset_db=0.1 * i)
+        for i, (r, shift) in enumerate(
+            zip(fabricated.season(8, 1, 1, 1, seed=1).rss[:3], (0.0, 0.02, -0.03), strict=True)
+        )
+    ]
+    started = {r.flight: r.start_ns for r in rows}
+    (drift,) = drifts(rows, started)
+    assert drift.slope_ci95_db[1] - drift.slope_ci95_db[0] > 0.1
 
 
 def test_the_planted_hill_lies_where_it_was_put(data):

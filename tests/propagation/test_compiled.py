@@ -135,6 +135,17 @@ def test_threads_and_chunks_change_no_bit(monkeypatch, case):
         assert np.array_equal(other.power, found[0].power)
 
 
+def test_no_pose_is_shared_by_two_threads(monkeypatch, case):
+    """Two threads adding to one link would lose what the other adds."""
+    pose = case[3].pose
+    for chunk in (1, 7, 64, 10_000):
+        monkeypatch.setattr(compiled_field, "PATHS_PER_CHUNK", chunk)
+        parts = compiled_field._parts(pose)
+        assert [start for start, _ in parts] == [0, *(stop for _, stop in parts[:-1])]
+        assert parts[-1][1] == len(pose)
+        assert all(pose[stop - 1] != pose[stop] for _, stop in parts[:-1])
+
+
 @needs_numba
 def test_more_pairs_than_lanes_and_paths_in_any_order(monkeypatch, case):
     site, link, poses, paths = case

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.explained import near_an_edge, why_not
+from aerpaw_cmp.propagation.explained import _chosen, near_an_edge, why_not
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.image import find_paths
 from aerpaw_cmp.site.site import Building
@@ -53,3 +53,10 @@ def test_a_point_near_an_edge_is_known_as_such(scenes):
         ends = np.array([[0.0, 0, 15 + above], [60.0, 0, 15 + above]])
         line = type("P", (), {"bounces": (), "planes": ()})()
         assert near_an_edge(faces, *ends, line) == near
+
+
+def test_a_scene_of_triangles_is_no_error(scenes):
+    """Faces without a roof, and finite ones without a building: nothing is said that was not tested."""
+    faces = site_faces(scenes.site((Building("barn", box(20, -10, 30, 10), 15.0),)))
+    walls = _chosen(faces, np.arange(5))  # the roof is left out
+    assert "triangles" in why_not(walls, np.array([0.0, 0, 10]), np.array([60.0, 0, 10]), np.zeros(0, int))

@@ -14,6 +14,7 @@ from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.propagation import image, prisms
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
+from aerpaw_cmp.propagation.obstacles import why_not_there
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.export import export_scene
@@ -81,7 +82,14 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     rng = np.random.default_rng(2)
     targets = np.column_stack([rng.uniform(-150, 150, (40, 2)), rng.uniform(1.5, 60, 40)])
     source = np.array([[0.0, 0.0, 30.0]])
-    found = [grow_paths(surfaces, source, targets, max_depth=2, shadows=on)[0] for on in (True, False)]
+    words: list[str] = []
+    found = [
+        grow_paths(surfaces, source, targets, max_depth=2, shadows=on, told=lambda text, _: words.append(text))[0]
+        for on in (True, False)
+    ]
+    assert len(words) == 2
+    assert "first faces" in words[0]
+    assert "MiB" in words[0]
     assert len(found[0]) == len(found[1]) > 50
     for column in ("pose", "faces"):
         assert np.array_equal(getattr(found[0], column), getattr(found[1], column))
@@ -157,6 +165,7 @@ def test_paths_can_be_recomputed_from_their_faces():
     source = np.array([[-20.0, 0.0, 20.0]])
     targets = np.column_stack([rng.uniform(-40, 40, 30), rng.uniform(-8, 8, 30), rng.uniform(1, 30, 30)])
     paths, effort = grow_paths(surfaces, source, targets, max_depth=2)
+    assert effort.estimate_s < 60.0
     rows = np.flatnonzero(paths.depth == 2)
     assert len(rows) > 10
     assert effort.sequences > 100
@@ -219,6 +228,25 @@ def test_a_thousand_buildings_are_searched_not_refused(scenes):
     site = scenes.site(buildings, ((0.0, 0.0, 30.0),))
     result = replay(site, scenes.link(site), scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3))))
     assert (result.paths.depth == 2).sum() > 10
+
+
+def test_what_hides_a_path_is_named_by_other_code(scenes):
+    """Lines of sight and paths of the canyon, asked of every triangle in NumPy."""
+    site = scenes.site((), ((-20.0, 0.0, 20.0),), scene=placed_scene(enumerate_.shipped("simple_street_canyon")))
+    rng = np.random.default_rng(14)
+    spots = np.column_stack([rng.uniform(-60, 60, 40), rng.uniform(-40, 40, 40), rng.uniform(1, 30, 40)])
+    found = replay(site, scenes.link(site), scenes.poses(spots))
+    source, none = np.array([-20.0, 0.0, 20.0]), np.zeros(0, dtype=np.int64)
+    direct = set(found.paths.pose[found.paths.depth == 0].tolist())
+    for pose, spot in enumerate(spots):
+        reason = why_not_there(found.surfaces, source, spot, none)
+        assert (reason == "") == (pose in direct)
+        assert reason == "" or reason.startswith("occluded by mesh-building_")
+    for row in np.flatnonzero(found.paths.depth)[:40]:
+        assert why_not_there(found.surfaces, source, spots[found.paths.pose[row]], found.paths.faces[row]) == ""
+    other = np.array([int(found.paths.faces[found.paths.depth == 1][0, 0])])
+    reasons = {why_not_there(found.surfaces, source, spot, other) for spot in spots}
+    assert len(reasons) >= 3
 
 
 def test_what_a_scene_cannot_do_is_said(scenes, tmp_path):

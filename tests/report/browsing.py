@@ -57,14 +57,23 @@ def asked_outside(driver) -> list[str]:
 
 
 def serious_findings(driver) -> dict[str, list[str]]:
-    """Findings of axe-core that are serious or critical, by rule."""
+    """Findings of axe-core that are serious or critical, by rule.
+
+    The window holds the whole page meanwhile: the packaged axe calls the contrast of what it must scroll to unknown.
+    """
     axe = pytest.importorskip("axe_selenium_python", reason="axe-selenium-python is not installed")
     source = resources.files(axe) / "node_modules" / "axe-core" / "axe.min.js"
     driver.execute_script(source.read_text(encoding="utf-8"))
     # HTML 5.2 lets <div> group the items of a <dl>, which the packaged axe does not know yet
     rules = {"rules": {"dlitem": {"enabled": False}}}
     driver.set_script_timeout(120)  # a busy machine: axe looks at every cell of every table
-    found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
+    try:
+        set_width(
+            driver, 1440, driver.execute_script("scrollTo(0, 0); return document.documentElement.scrollHeight") + 100
+        )
+        found = driver.execute_async_script("const done = arguments[1]; axe.run(arguments[0]).then(done);", rules)
+    finally:
+        usual_width(driver)
     return {
         v["id"]: [n["html"][:120] for n in v["nodes"]]
         for v in found["violations"]

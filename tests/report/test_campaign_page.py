@@ -72,6 +72,12 @@ def test_the_best_setting_is_named_in_words(data):
     assert words.count("dB;") < 4  # not all settings in one sentence
 
 
+def test_two_flights_show_no_difference_and_the_words_say_so():
+    words = " ".join(campaign_html.headline(fabricated.season(2, 3, 1, 1)))
+    assert "too few flights" in words
+    assert "not shown to be worse" not in words
+
+
 def test_hostile_names_stay_text(data):
     bad = '</script><img src=x onerror="alert(1)">'
     row = dataclasses.replace(data.rss[0], flight=bad, setting=bad, tower=bad, channel=bad)

@@ -4,10 +4,13 @@ from __future__ import annotations
 
 import os
 import signal
+import subprocess
 import sys
 import threading
+import time
 import types
 from functools import partial
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -50,6 +53,36 @@ def test_they_run_elsewhere_and_one_that_dies_is_made_up_for() -> None:
         return number
 
     assert list(drawing.in_order([partial(dies, n) for n in range(5)], 2)) == list(range(5))
+
+
+@linux
+def test_processes_end_with_a_killed_parent() -> None:
+    code = (
+        "import os, time; from aerpaw_cmp.report.drawing import in_order\n"
+        "def draw():\n    os.write(1, f'{os.getpid()}\\n'.encode()); time.sleep(120)\n"
+        "list(in_order([draw] * 4, 2))"
+    )
+    run = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    assert run.stdout is not None
+    children = [int(run.stdout.readline()) for _ in range(2)]
+    assert all(alive(child) for child in children)
+    run.kill()
+    run.stdout.close()
+    run.wait()
+    until = time.monotonic() + 20
+    while any(alive(child) for child in children) and time.monotonic() < until:
+        time.sleep(0.05)
+    left = [child for child in children if alive(child)]
+    for child in left:
+        os.kill(child, signal.SIGKILL)
+    assert not left
+
+
+def alive(process: int) -> bool:
+    try:
+        return Path(f"/proc/{process}/stat").read_text().rsplit(")", 1)[1].split()[0] != "Z"
+    except OSError:
+        return False
 
 
 def test_a_fault_in_a_figure_comes_through() -> None:

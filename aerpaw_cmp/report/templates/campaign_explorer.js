@@ -221,9 +221,10 @@
     const chosen = chosenLinks();
     at("place-caption").textContent = found ? `Mean residual (measured minus simulated) by place over flights, “${data.settings[data.reference]}”, ${found.link < 0 ? "all towers and channels" : links[found.link].name}, cells of ${data.cell_m} m.${chosen.length > 1 && chosen.length < links.length ? " (One tower and channel, or all, can be mapped.)" : ""}` : "No residuals by place.";
     if (!c || !c.e.length) return;
-    const xs = [...c.e], ys = [...c.n];
-    for (const t of data.site ? data.site.towers : []) if (found.link < 0 ? links.some(l => l.tower === t.name) : links[found.link].tower === t.name) { xs.push(t.at[0] / data.cell_m - 0.5); ys.push(t.at[1] / data.cell_m - 0.5); }
-    const m = data.cell_m, ext = list => list.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]), [a, b] = ext(xs).map(v => (v + 0.5) * m), [s, n] = ext(ys).map(v => (v + 0.5) * m);
+    const m = data.cell_m, ext = list => list.reduce(([a, b], v) => [Math.min(a, v), Math.max(b, v)], [Infinity, -Infinity]);
+    let [[a, b], [s, n]] = [ext(c.e).map(v => (v + 0.5) * m), ext(c.n).map(v => (v + 0.5) * m)];
+    const wide = Math.max(b - a, n - s) / 2, near = (data.site ? data.site.towers : []).map(t => t.at).filter(t => t[0] > a - wide && t[0] < b + wide && t[1] > s - wide && t[1] < n + wide);
+    for (const t of near) { a = Math.min(a, t[0]); b = Math.max(b, t[0]); s = Math.min(s, t[1]); n = Math.max(n, t[1]); }
     const scale = Math.min((w - 60) / (b - a + 3 * m), (h - 40) / (n - s + 3 * m)), mx = (a + b) / 2, my = (s + n) / 2;
     project = { x: e => 46 + (w - 52) / 2 + (e - mx) * scale, y: v => 6 + (h - 36) / 2 - (v - my) * scale, east: x => mx + (x - 46 - (w - 52) / 2) / scale, north: y => my - (y - 6 - (h - 36) / 2) / scale, scale };
     pen.save(); pen.beginPath(); pen.rect(46, 6, w - 52, h - 36); pen.clip();
@@ -249,6 +250,7 @@
     for (const e of ticks(project.east(50), project.east(w - 12), Math.floor(w / 110))) pen.fillText(number(e, 0), project.x(e), h - 17);
     pen.fillText("East [m]", w / 2, h - 3); pen.textAlign = "right";
     for (const v of ticks(project.north(h - 34), project.north(12), 5)) pen.fillText(number(v, 0), 42, project.y(v) + 4);
+    pen.textAlign = "center"; pen.save(); pen.translate(10, h / 2); pen.rotate(-Math.PI / 2); pen.fillText("North [m]", 0, 0); pen.restore();
     pen.textAlign = "left";
   }
   function drawLegend() {

@@ -3,7 +3,8 @@
 const common = (() => {
   const at = id => document.getElementById(id);
   const css = name => getComputedStyle(document.documentElement).getPropertyValue(name).trim();
-  const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? v.toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
+  // what rounds to zero has no sign
+  const number = (v, digits = 1, unit = "") => Number.isFinite(v) ? (+v.toFixed(digits) === 0 ? 0 : v).toFixed(digits).replace("-", "−") + (unit ? " " + unit : "") : "–";
   const FONT = "12px system-ui, sans-serif";
 
   // one deflated block in base64 that holds all arrays one after the other, each at a multiple of eight bytes

@@ -20,7 +20,7 @@ HISTORY = ROOT / "benchmarks" / "history.jsonl"
 FIGURE = "performance_scaling.png"
 AXES = {
     "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
-    "towers": ("Towers", "replay of 1000 poses, 4 x 4 elements, 12 buildings, depth 2"),
+    "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
     "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2; the field grows with them"),
     "samples": ("Samples of one channel", "comparison with all its intervals, without replay"),
     "report": ("Samples of a flight", "whole report, two channels, without audit"),

@@ -20,7 +20,7 @@ HISTORY = ROOT / "benchmarks" / "history.jsonl"
 FIGURE = "performance_scaling.png"
 AXES = {
     "poses": ("Poses", "replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2"),
-    "towers": ("Towers", "replay of 1000 poses, 4 x 4 elements, 12 buildings, depth 2"),
+    "towers": ("Towers", "replay of 10 000 poses, 4 x 4 elements, 12 buildings, depth 2"),
     "faces": ("Faces of buildings", "paths and fields of 100 poses of one tower, depth 2; the field grows with them"),
     "samples": ("Samples of one channel", "comparison with all its intervals, without replay"),
     "report": ("Samples of a flight", "whole report, two channels, without audit"),
@@ -223,6 +223,8 @@ def draw(scaling: dict[str, Any], path: Path) -> None:
         ax.loglog(sizes, [r["cpu_s"] for r in rows], "o-", color="#0072B2", label="processor [s]")
         ax.loglog(sizes, [r["peak_mib"] for r in rows], "s--", color="#D55E00", fillstyle="none", label="peak [MiB]")
         ax.loglog(sizes, [rows[-1]["cpu_s"] * s / sizes[-1] for s in sizes], ":", color="#888888", label="linear")
+        ax.set_xticks(sizes, [number(s) for s in sizes])
+        ax.minorticks_off()
         ax.set_xlabel(title)
         ax.set_title(f"power {power(scaling[axis]['power_cpu'])}", loc="left", fontsize=9)
         ax.grid(visible=True, color="#E2E2E2")

@@ -1,7 +1,7 @@
 """Cost against size of the parts that a season or a city would strain, each size in a process of its own.
 
 poses     replay of 5 towers, 4 x 4 elements, 12 buildings, depth 2
-towers    replay of 1000 poses, 12 buildings, depth 2
+towers    replay of 10 000 poses, 12 buildings, depth 2
 faces     paths of 100 poses of one tower, depth 2, ever more buildings (five faces each, and the ground)
 samples   comparison of one channel with its intervals (1000 bootstrap replicates), no replay
 report    report of a flight of two channels without audit, by its samples (benchmarks/long_flight.py)
@@ -34,9 +34,9 @@ import yaml
 
 ROOT = Path(__file__).resolve().parents[1]
 SIZES: dict[str, tuple[list[float], list[float]]] = {
-    "poses": ([1_000, 3_000, 10_000], [1_000, 10_000, 100_000, 1_000_000]),
+    "poses": ([10_000, 30_000, 100_000], [10_000, 100_000, 1_000_000]),
     "towers": ([1, 3, 10], [1, 3, 10, 30, 100]),
-    "faces": ([151, 501, 1_501], [151, 501, 1_501, 5_001]),
+    "faces": ([501, 1_501, 5_001], [501, 1_501, 5_001, 15_001]),
     "samples": ([10_000, 100_000, 1_000_000], [10_000, 100_000, 1_000_000, 3_000_000]),
     "report": ([0.1, 0.3, 1.0], [0.1, 1.0, 10.0]),
     "flights": ([2, 4, 8], [2, 8, 32]),
@@ -159,7 +159,7 @@ def short_flight(number: int) -> dict[str, Any]:
 
 MEASURES: dict[str, Callable[[float], dict[str, float]]] = {
     "poses": lambda n: replay_of(int(n), towers=5),
-    "towers": lambda n: replay_of(1000, towers=int(n)),
+    "towers": lambda n: replay_of(10_000, towers=int(n)),
     "faces": lambda n: faces(int(n)),
     "samples": lambda n: samples(int(n)),
     "report": report,

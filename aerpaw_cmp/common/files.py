@@ -15,7 +15,7 @@ from .errors import OutputError
 
 
 @contextlib.contextmanager
-def whole(target: Path, *, durable: bool = False) -> Iterator[Path]:
+def atomic_path(target: Path, *, durable: bool = False) -> Iterator[Path]:
     """A place to write to, which takes the name ``target`` when the block ends without an error.
 
     Parameters
@@ -88,7 +88,7 @@ def write_sealed(path: Path, content: bytes, mark: bytes) -> None:
     """
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
-        with whole(path) as part:
+        with atomic_path(path) as part:
             part.write_bytes(seal(content, mark))
 
 
@@ -110,7 +110,7 @@ def read_sealed(path: Path, mark: bytes) -> bytes | None:
 def write_whole(path: Path, content: str | bytes) -> None:
     """Write a file whole or not at all; OutputError where it cannot be written."""
     try:
-        with whole(path) as part:
+        with atomic_path(path) as part:
             part.write_bytes(content.encode("utf-8") if isinstance(content, str) else content)
     except OSError as error:
         raise OutputError(f"cannot be written ({error.strerror or error})", path=path) from None

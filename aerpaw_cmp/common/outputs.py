@@ -205,7 +205,7 @@ class OutputFile:
         """Write, sync, and take the name: a reader sees the old file or the new one, also after a power cut."""
         place = self._place
         assert place is not None, "used as a context"
-        with told(self.named):
+        with explained_os_errors(self.named):
             with os.fdopen(os.dup(place.descriptor), "wb") as stream:
                 stream.write(content)
                 stream.flush()
@@ -293,7 +293,7 @@ class OutputFolder:
         self._written = False
 
     def __enter__(self) -> OutputFolder:
-        with told(self.named):
+        with explained_os_errors(self.named):
             self._refuse_shape()
             try:
                 _make_folders(self.target.parent, self._made)
@@ -308,7 +308,7 @@ class OutputFolder:
 
     def refuse(self) -> None:
         """UsageError where a run with this output would be refused; writes nothing."""
-        with told(self.named):
+        with explained_os_errors(self.named):
             self._refuse_shape()
             self._refuse_content()
 
@@ -366,7 +366,7 @@ class OutputFolder:
         """An empty folder to write the results to; they take the name when the block ends without an error."""
         place = self._place
         assert place is not None, "used as a context"
-        with told(self.named):
+        with explained_os_errors(self.named):
             yield place.part
             place.refuse_gone()
             self._commit(place)
@@ -506,7 +506,7 @@ class OutputSet:
         self._journal = beside(self.folder / listing, "journal")
 
     def __enter__(self) -> OutputSet:
-        with told(self.named):
+        with explained_os_errors(self.named):
             try:
                 _make_folders(self.folder, self._made)
                 self._place = _Place(self.folder / self._listing, self.named, folder=False)
@@ -562,7 +562,7 @@ class OutputSet:
         }
         text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
         everything = {**contents, self._listing: text.encode("utf-8")}
-        with told(self.named):
+        with explained_os_errors(self.named):
             try:
                 for name, content in everything.items():
                     _write_synced(self._new(name), content)
@@ -662,7 +662,7 @@ class _Place:
         self.target, self.named = target, named
         self.part = beside(target, "part")
         self._further: list[int] = []
-        with told(named):
+        with explained_os_errors(named):
             self.descriptor = self._claim(folder)
             try:
                 if folder:
@@ -855,7 +855,7 @@ _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, e
 
 
 @contextlib.contextmanager
-def told(path: str | Path) -> Iterator[None]:
+def explained_os_errors(path: str | Path) -> Iterator[None]:
     """An OSError inside becomes one message that names the output and says what to do."""
     try:
         yield

@@ -559,8 +559,10 @@ def stale_reports(time_s: ArrayLike, rank: ArrayLike, others: Mapping[str, Array
         return Staleness(np.zeros(len(ri), dtype=bool), 0, float("nan"), "no rank")
     columns = [ri, *(np.asarray(v, dtype=np.float64) for v in (others or {}).values())]
     if len(columns) > 1:
-        told = np.any([np.isfinite(c) for c in columns[1:]], axis=0)  # a row without further numbers proves nothing
-        fresh = known & (_changes(columns) | ~told)
+        has_values = np.any(
+            [np.isfinite(c) for c in columns[1:]], axis=0
+        )  # a row without further numbers proves nothing
+        fresh = known & (_changes(columns) | ~has_values)
     else:
         fresh = known & _period_starts(ri)
     constant = all(np.ptp(c[np.isfinite(c)]) == 0 for c in columns if np.isfinite(c).any())

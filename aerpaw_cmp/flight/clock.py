@@ -219,7 +219,7 @@ def judge_clock(
         default=0,
     )
     lags = symmetric(window_s, 0.1)
-    heard: dict[str, Sampled] = {}
+    sampled_channels: dict[str, Sampled] = {}
     reasons = []
     for channel in channels:
         sampled = sample(
@@ -229,20 +229,22 @@ def judge_clock(
         if isinstance(sampled, str):
             reasons.append(sampled)
         else:
-            heard[channel.name] = sampled
-    if not heard:
+            sampled_channels[channel.name] = sampled
+    if not sampled_channels:
         return _estimate(no_lag(reasons[0], 0, window_s, lags), start, model)
-    span = max(s.t[-1] for s in heard.values()) - min(s.t[0] for s in heard.values())
+    span = max(s.t[-1] for s in sampled_channels.values()) - min(s.t[0] for s in sampled_channels.values())
     drifting = span >= DRIFT_FROM_S if drift is None else drift
-    own = {name: fit_lag(s.t, s.measured_db, s.prediction, lags, limit_s, drifting) for name, s in heard.items()}
+    own = {
+        name: fit_lag(s.t, s.measured_db, s.prediction, lags, limit_s, drifting) for name, s in sampled_channels.items()
+    }
     pooled = combine_lags(list(own.values()), limit_s=limit_s)
     found = _estimate(pooled, start, model, {name: fit.radio_minus_telemetry_s for name, fit in own.items()})
     if pooled.verdict == "failed":
         return found
-    found = replace(found, explained=_explained_share(list(heard.values()), found))
+    found = replace(found, explained=_explained_share(list(sampled_channels.values()), found))
     if pooled.verdict == "ambiguous":
         return found
-    return _checked(found, channels, heard, own, lags, limit_s)
+    return _checked(found, channels, sampled_channels, own, lags, limit_s)
 
 
 def _timed(times: ArrayLike) -> AnyArray:
@@ -275,7 +277,7 @@ def _estimate(fit: LagFit, start: int, model: str, channels: Mapping[str, float]
 def _checked(
     found: ClockEstimate,
     channels: Sequence[ClockChannel],
-    heard: Mapping[str, Sampled],
+    sampled_channels: Mapping[str, Sampled],
     own: Mapping[str, LagFit],
     lags: FloatArray,
     limit_s: float,
@@ -296,17 +298,17 @@ def _checked(
     for name, fit in own.items():
         if not _near(fit, lag):
             return doubt(f"channel {name} alone gives {fit.radio_minus_telemetry_s:+.1f} s")
-    halves = _halves(list(heard.values()), found, lags, limit_s)
+    halves = _halves(list(sampled_channels.values()), found, lags, limit_s)
     found = replace(found, halves_s=tuple(half.radio_minus_telemetry_s for half in halves))
     for name, half in zip(("first", "second"), halves, strict=True):
         if not _near(half, lag):
             return doubt(f"the {name} half of the flight alone gives {half.radio_minus_telemetry_s:+.1f} s")
-    free = _with_free_patterns(channels, heard, found, limit_s)
+    free = _with_free_patterns(channels, sampled_channels, found, limit_s)
     if free is not None:
         found = replace(found, free_patterns_s=free.radio_minus_telemetry_s)
         if not _near(free, lag):
             return doubt(f"with the antennas' patterns free it is {free.radio_minus_telemetry_s:+.1f} s")
-    held_out = _held_out(list(heard.values()), found, lags)
+    held_out = _held_out(list(sampled_channels.values()), found, lags)
     found = replace(found, held_out=held_out)
     low, high = found.ci95_s
     none = low <= 0.0 <= high or abs(lag) <= _NOT_RESOLVED_S
@@ -336,13 +338,15 @@ def _near(fit: LagFit, lag: float) -> bool:
     return abs(fit.radio_minus_telemetry_s - lag) <= AGREE_S or (possible and fit.verdict != "ok")
 
 
-def _halves(heard: Sequence[Sampled], found: ClockEstimate, lags: FloatArray, limit_s: float) -> tuple[LagFit, LagFit]:
+def _halves(
+    sampled_channels: Sequence[Sampled], found: ClockEstimate, lags: FloatArray, limit_s: float
+) -> tuple[LagFit, LagFit]:
     """Pooled fits to the first and the second half, without a drift of their own."""
-    middle = 0.5 * (min(s.t[0] for s in heard) + max(s.t[-1] for s in heard))
+    middle = 0.5 * (min(s.t[0] for s in sampled_channels) + max(s.t[-1] for s in sampled_channels))
 
     def fit(side: Callable[[FloatArray], BoolArray]) -> LagFit:
         fits = []
-        for s in heard:
+        for s in sampled_channels:
             part = side(s.t)
             if part.sum() >= FEWEST:
                 t = s.t[part]
@@ -355,15 +359,15 @@ def _halves(heard: Sequence[Sampled], found: ClockEstimate, lags: FloatArray, li
 
 
 def _with_free_patterns(
-    channels: Sequence[ClockChannel], heard: Mapping[str, Sampled], found: ClockEstimate, limit_s: float
+    channels: Sequence[ClockChannel], sampled_channels: Mapping[str, Sampled], found: ClockEstimate, limit_s: float
 ) -> LagFit | None:
     """Pooled fit with free terms of direction beside the prediction; None where no terms were given."""
     lags = symmetric(found.window_s, _FREE_STEP_S)
     fits = []
     for channel in channels:
-        if channel.terms is None or channel.name not in heard:
+        if channel.terms is None or channel.name not in sampled_channels:
             continue
-        s = heard[channel.name]
+        s = sampled_channels[channel.name]
         free = s.prediction.beside(channel.terms(_instants(channel.times, found.start_ns, s.prediction.times())))
         few = slice(None, None, -(-len(s.t) // _FREE_WITH))
         moved = s.t[few] - found.drift_s_per_s * (s.t[few] - found.reference_s)
@@ -377,10 +381,10 @@ def _instants(like: AnyArray, start_ns: int, seconds: FloatArray) -> AnyArray:
     return np.asarray(stamp.astype("datetime64[ns]") if np.asarray(like).dtype.kind not in "fiu" else stamp * 1e-9)
 
 
-def _explained_share(heard: Sequence[Sampled], found: ClockEstimate) -> float:
+def _explained_share(sampled_channels: Sequence[Sampled], found: ClockEstimate) -> float:
     """Share of the variance of one-second means that the prediction explains at the estimate."""
     left = total = 0.0
-    for s in heard:
+    for s in sampled_channels:
         lag = found.radio_minus_telemetry_s + found.drift_s_per_s * (s.t - found.reference_s)
         predicted = s.prediction.at(s.t - lag)
         ok = np.isfinite(predicted)
@@ -392,14 +396,14 @@ def _explained_share(heard: Sequence[Sampled], found: ClockEstimate) -> float:
     return 1.0 - left / total if total > 0 else float("nan")
 
 
-def _held_out(heard: Sequence[Sampled], found: ClockEstimate, lags: FloatArray) -> HeldOutBlocks:
+def _held_out(sampled_channels: Sequence[Sampled], found: ClockEstimate, lags: FloatArray) -> HeldOutBlocks:
     """Error of blocks of the flight, with a lag and offsets estimated on the other blocks, against no lag.
 
     Errors are root mean squares over one second and all channels: channels of one receiver hear the same fades.
     """
-    first, last = min(s.t[0] for s in heard), max(s.t[-1] for s in heard)
+    first, last = min(s.t[0] for s in sampled_channels), max(s.t[-1] for s in sampled_channels)
     blocks = int(np.clip((last - first) / _BLOCK_S, 4, 10))
-    tables = [_block_table(s, found, lags, np.linspace(first, last, blocks + 1)[1:-1]) for s in heard]
+    tables = [_block_table(s, found, lags, np.linspace(first, last, blocks + 1)[1:-1]) for s in sampled_channels]
     squares: dict[str, list[FloatArray]] = {"corrected": [], "uncorrected": []}
     improved = 0
     for block in range(blocks):

@@ -410,7 +410,7 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
     mode = data.settings.rt.attitude
     if mode == "ignored":
         return ()
-    told = []
+    messages = []
     for kind, tower, time in [("RSS", s.tower, s.time) for s in data.rss] + [
         ("rank", s.tower, s.time) for s in data.rank
     ]:
@@ -424,13 +424,13 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
                 if pose.valid.any()
                 else "the telemetry covers none of its instants (relative times want 'time_origin')"
             )
-            told.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
+            messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():
-            told.append(
+            messages.append(
                 f"rt.attitude: {mode} acts on {known} of {len(time)} samples of {kind} of {tower}: "
                 "the telemetry covers no more."
             )
-    return tuple(dict.fromkeys(told))
+    return tuple(dict.fromkeys(messages))
 
 
 def _known_tower(name: str | None, log: LogSettings, site: Site) -> str:

@@ -144,11 +144,11 @@ def drafts(
         Keys of a log that ``--map`` gave.
     """
     found = [flight for flight in flights(files) if flight.complete]
-    told = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
+    options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
     groups = [flight.files for flight in found] if len(found) > 1 else [list(files)]
     made = []
     for group in groups:
-        text, remarks = draft(group, folder, **told)  # type: ignore[arg-type]
+        text, remarks = draft(group, folder, **options_of_clock)  # type: ignore[arg-type]
         made.append(Draft(_name(_flown(group), group), text, tuple(remarks)))
     home = {file.path for group in groups for file in group}
     left = [one_line(os.path.relpath(Path(f.path).resolve(), folder)) for f in files if f.path not in home]

@@ -664,29 +664,29 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
     """
     if not fits or any(len(fit.curve_lag_s) != len(fits[0].curve_lag_s) for fit in fits):
         raise ValueError("lags to combine must be at least one, and searched over the same window")
-    heard = [fit for fit in fits if np.isfinite(fit.radio_minus_telemetry_s)]
-    if len(heard) < 2:
-        return heard[0] if heard else fits[0]
-    lags = heard[0].curve_lag_s
-    total = np.sum([np.minimum(fit.evidence, 1e6) for fit in heard], axis=0) * _INDEPENDENT
+    finite_fits = [fit for fit in fits if np.isfinite(fit.radio_minus_telemetry_s)]
+    if len(finite_fits) < 2:
+        return finite_fits[0] if finite_fits else fits[0]
+    lags = finite_fits[0].curve_lag_s
+    total = np.sum([np.minimum(fit.evidence, 1e6) for fit in finite_fits], axis=0) * _INDEPENDENT
     total = total - total.min()
-    sharp = min(heard, key=lambda fit: fit.ci95_s[1] - fit.ci95_s[0])
+    sharp = min(finite_fits, key=lambda fit: fit.ci95_s[1] - fit.ci95_s[0])
     best = float(lags[best_of(np.where(total > 0, total, 0.0) + 1.0, lags)])
     step = float(lags[1] - lags[0])
     near = abs(sharp.radio_minus_telemetry_s - best) <= step  # the sharpest fit is finer than the grid
     # valleys narrower than a step fall between its points: fits that agree among themselves are believed
-    near |= all(abs(fit.radio_minus_telemetry_s - sharp.radio_minus_telemetry_s) <= 0.5 * step for fit in heard)
+    near |= all(abs(fit.radio_minus_telemetry_s - sharp.radio_minus_telemetry_s) <= 0.5 * step for fit in finite_fits)
     lag = sharp.radio_minus_telemetry_s if near else best
     width = 0.5 * float(lags[1] - lags[0])
     if near and sharp.verdict == "ok":
         width = 0.5 * (sharp.ci95_s[1] - sharp.ci95_s[0])
     verdict, reason, interval = _judge(lag, width, total, lags, limit_s)
-    count = sum(fit.n for fit in heard)
+    count = sum(fit.n for fit in finite_fits)
 
     def pooled(name: str) -> float:
-        return float(np.sqrt(sum(fit.n * getattr(fit, name) ** 2 for fit in heard) / count))
+        return float(np.sqrt(sum(fit.n * getattr(fit, name) ** 2 for fit in finite_fits) / count))
 
-    curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in heard], axis=0) / count)
+    curve = np.sqrt(np.sum([fit.n * fit.curve_rmse_db**2 for fit in finite_fits], axis=0) / count)
     return LagFit(
         radio_minus_telemetry_s=lag,
         ci95_s=interval,
@@ -698,7 +698,7 @@ def combine_lags(fits: Sequence[LagFit], *, limit_s: float = LAG_LIMIT_S) -> Lag
         n=count,
         rmse_db=pooled("rmse_db"),
         rmse_unshifted_db=pooled("rmse_unshifted_db"),
-        window_s=heard[0].window_s,
+        window_s=finite_fits[0].window_s,
         curve_lag_s=lags,
         curve_rmse_db=curve,
         evidence=total,

@@ -66,7 +66,7 @@ class TrackAccount:
     @property
     def warnings(self) -> tuple[str, ...]:
         """What a user should know, one sentence each."""
-        told = (
+        reasons = (
             (self.hour_steps, "step(s) of whole hours between telemetry rows: daylight-saving change or a reset clock"),
             (self.backward_time, "telemetry row(s) out of time order were left out"),
             (self.duplicate_time, "telemetry row(s) repeat the time stamp before them and were left out"),
@@ -75,7 +75,7 @@ class TrackAccount:
             (self.gaps, f"telemetry gap(s), the longest {self.longest_gap_s:.1f} s, were not bridged"),
             (self.unknown_attitude, "telemetry row(s) without attitude: level flight along the course stands in"),
         )
-        return tuple(f"{count} {text}" for count, text in told if count)
+        return tuple(f"{count} {text}" for count, text in reasons if count)
 
 
 @dataclass(frozen=True, slots=True)

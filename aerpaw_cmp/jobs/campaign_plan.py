@@ -233,7 +233,7 @@ def kept_outcomes(
             if outcome is not None:
                 found[number] = outcome
                 del orders[number]
-    for text in store.told:
+    for text in store.warnings:
         progress(text)
     if found:
         progress(f"{len(found)} of {len(tasks)} outcomes are kept from before in {store.place.url}")

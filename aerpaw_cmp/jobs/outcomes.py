@@ -46,14 +46,14 @@ class OutcomeStore:
 
     Attributes
     ----------
-    told : list of str
+    warnings : list of str
         Damaged entries that were not used.
     """
 
     def __init__(self, place: Place | Path, types: Iterable[type]) -> None:
         self.place = open_place(place) if isinstance(place, Path) else place
         self._types = {kind.__name__: kind for kind in types}
-        self.told: list[str] = []
+        self.warnings: list[str] = []
 
     def load(self, key: str) -> Any | None:
         """The outcome of a key, or None where there is no sound entry."""
@@ -63,7 +63,9 @@ class OutcomeStore:
         try:
             content = unseal(entry, _SEAL)
         except ValueError:
-            self.told.append(f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz")
+            self.warnings.append(
+                f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz"
+            )
             return None
         with np.load(io.BytesIO(content), allow_pickle=False) as parts:
             return self._decode(json.loads(str(parts["content"])), zlib.decompress(parts["arrays"].tobytes()))

@@ -14,7 +14,7 @@ from typing import Protocol
 from urllib.parse import unquote, urlsplit
 
 from ..common.errors import InputError, UsageError
-from ..common.files import whole
+from ..common.files import atomic_path
 
 _OBJECT_STORES = {"s3", "s3a", "gs", "gcs", "az", "abfs", "abfss", "adl", "oci", "oss", "memory"}
 """Protocols that put an object whole or not at all; elsewhere it is written beside and renamed."""
@@ -60,7 +60,7 @@ class Folder:
 
     def write(self, name: str, content: bytes) -> None:  # noqa: D102
         self.folder.mkdir(parents=True, exist_ok=True)
-        with whole(self.folder / name) as part:
+        with atomic_path(self.folder / name) as part:
             part.write_bytes(content)
 
     def names(self) -> set[str]:  # noqa: D102

@@ -88,10 +88,10 @@ def run_ingest(
         files = ingest(paths, options=ReadOptions(**options), reader=reader)
         account = summary(files)
         if draft is not None:
-            told = {key: options.get(key) for key in ("timezone", "time_origin")}
+            options_of_clock = {key: options.get(key) for key in ("timezone", "time_origin")}
             named = ("columns", "kind", "unit", "ri_base")
-            told["mapping"] = {key: options[key] for key in named if options.get(key)}
-            made = drafts(files, drafted.target.parent, **told)
+            options_of_clock["mapping"] = {key: options[key] for key in named if options.get(key)}
+            made = drafts(files, drafted.target.parent, **options_of_clock)
             account["draft"] = list(made[0].remarks)
             drafted.write(sealed(made[0].text))
             account["drafts"] = [str(draft)]

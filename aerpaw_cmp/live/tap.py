@@ -42,15 +42,15 @@ NOISE_LINES_PER_S = 50
 _NMEA = re.compile(rb"\$[A-Z]{4,5},[^\r\n]*\*[0-9A-F]{2}")
 
 
-def not_a_modem(path: Path, heard: bytes) -> InputError:
-    """The error for a port that does not answer ``AT``, by what was heard on it."""
+def not_a_modem(path: Path, received: bytes) -> InputError:
+    """The error for a port that does not answer ``AT``, by what was received on it."""
     expected = "an answer to 'AT' (interface 02 or 03 of the modem)"
-    if _NMEA.search(heard):
+    if _NMEA.search(received):
         found, cause = "the port speaks NMEA: it is a GPS port", "interface 01 was given, or the numbers moved"
-    elif heard.count(0x7E) >= 1 and sum(b < 9 or b > 126 for b in heard) > len(heard) // 10:
+    elif received.count(0x7E) >= 1 and sum(b < 9 or b > 126 for b in received) > len(received) // 10:
         found, cause = "the port speaks HDLC frames: it is a DIAG port", "interface 00 was given, or the numbers moved"
-    elif heard:
-        excerpt = ascii(Redactor().clean(heard[:40].decode("latin-1"), cut=True))
+    elif received:
+        excerpt = ascii(Redactor().clean(received[:40].decode("latin-1"), cut=True))
         found, cause = f"the port sends {excerpt} but no answer", "another device, or a wrong baud rate"
     else:
         found, cause = "nothing answers on the port", "the modem is off, still starts, or this is not its AT port"
@@ -343,7 +343,7 @@ class Tap:
 
     def _reconnect(self) -> None:
         """Look for the port with back-off until it answers, then set the modem up again."""
-        pause, told = self._settings.reconnect_min_s, ""
+        pause, last_message = self._settings.reconnect_min_s, ""
         while not self._stop.count:
             self._wait(pause)
             pause = min(2 * pause, self._settings.reconnect_max_s)
@@ -351,9 +351,9 @@ class Tap:
                 self._connect()
                 break
             except (PortGoneError, InputError) as error:
-                if isinstance(error, InputError) and str(error) != told:
-                    told = str(error)
-                    self._say(told)
+                if isinstance(error, InputError) and str(error) != last_message:
+                    last_message = str(error)
+                    self._say(last_message)
         if self._port is None:
             return
         self._initialise()

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError
+from ..common.units import AnyArray
 from .readers import InBlocks, Reader, ReadOptions
 from .records import Attribute, ReadResult, RejectedLine, Stream
 
@@ -218,7 +219,7 @@ class Gathered:
         self.rejected: list[RejectedLine] = []
         self.warnings = _Warnings()
         self.order: list[tuple[str, str]] = []
-        self.parts: dict[tuple[str, str], list[pd.DataFrame]] = {}
+        self.parts: dict[tuple[str, str], list[dict[str, AnyArray]]] = {}
         self.attributes: dict[tuple[str, str], dict[str, Attribute]] = {}
 
     def add(self, result: ReadResult, before: ReadResult | None) -> None:
@@ -251,7 +252,9 @@ class Gathered:
                 frame = frame[frame["line"].to_numpy() > front]
             if len(frame):
                 added.append(key)
-                self.parts.setdefault(key, []).append(frame.assign(line=frame["line"] + shift) if shift else frame)
+                columns = {name: frame[name].to_numpy(copy=True) for name in frame.columns}  # each alone can be freed
+                columns["line"] += shift
+                self.parts.setdefault(key, []).append(columns)
                 self.attributes[key] = _joined(self.attributes.get(key), stream.attributes)
         self.order = in_order(self.order, added)
 
@@ -306,20 +309,18 @@ def _joined(known: dict[str, Attribute] | None, more: Any) -> dict[str, Attribut
     return made
 
 
-def _concatenated(parts: list[pd.DataFrame]) -> pd.DataFrame:
-    """Frames one behind the other, with at most one column held twice; a column that one lacks is NaN there."""
+def _concatenated(parts: list[dict[str, AnyArray]]) -> pd.DataFrame:
+    """Columns one behind the other, at most one of them held twice; a column that one part lacks is NaN there."""
     import numpy as np
     import pandas as pd
 
     names: list[str] = []
     for part in parts:
-        names = in_order(names, list(part.columns)) if list(part.columns) != names else names
-    columns = [{name: part[name].to_numpy() for name in part.columns} for part in parts]
-    lengths = [len(part) for part in parts]
-    parts.clear()
+        names = in_order(names, list(part)) if list(part) != names else names
+    lengths = [len(part["line"]) for part in parts]
     content: dict[str, Any] = {}
     for name in names:
-        pieces = [one.pop(name, None) for one in columns]
+        pieces = [part.pop(name, None) for part in parts]
         joined = np.concatenate(
             [np.full(n, np.nan) if piece is None else piece for n, piece in zip(lengths, pieces, strict=True)]
         )

@@ -256,9 +256,9 @@ def try_library(
     if reason := _too_old(library.version):
         return Trial(library, False, reason)
     reason, answer = _run_trial(library, "llvm_ad_mono_polarized", python, program, timeout_s)
-    told = answer.get("llvm")
-    if isinstance(told, list) and told:
-        library = Library(library.path, tuple(int(part) for part in told))
+    version = answer.get("llvm")
+    if isinstance(version, list) and version:
+        library = Library(library.path, tuple(int(part) for part in version))
     return _verdict(library, reason or _too_old(library.version))
 
 

@@ -40,13 +40,13 @@ class PathCache:
 
     Attributes
     ----------
-    told : list of str
+    warnings : list of str
         Entries that were damaged, for people.
     """
 
     def __init__(self, folder: Path) -> None:
         self.folder = folder
-        self.told: list[str] = []
+        self.warnings: list[str] = []
 
     def key(
         self,
@@ -93,7 +93,7 @@ class PathCache:
         return digest.hexdigest()
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
-        """Paths and the seconds that their search took; None when the entry is missing or damaged (see ``told``)."""
+        """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""
         columns = self._columns(key)
         if columns is None:
             return None
@@ -109,7 +109,9 @@ class PathCache:
         try:
             entry = read_sealed(place, _SEAL)
         except ValueError:
-            self.told.append(f"a damaged entry of the path cache was not used, the paths were searched anew: {place}")
+            self.warnings.append(
+                f"a damaged entry of the path cache was not used, the paths were searched anew: {place}"
+            )
             return None
         if entry is None:
             return None

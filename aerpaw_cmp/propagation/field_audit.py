@@ -270,9 +270,9 @@ class _OneLink:
         sigma = np.linalg.svd(h, compute_uv=False)
         differs = False
         for k in ks:
-            heard = sigma[0] > 0
-            near = heard and (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()
-            expected = int((sigma > sigma[0] / k).sum()) if heard else 0
+            has_channel = sigma[0] > 0
+            near = has_channel and (np.abs(sigma * k / sigma[0] - 1.0) < 1e-4).any()
+            expected = int((sigma > sigma[0] / k).sum()) if has_channel else 0
             differs |= not near and int(channel_rank(ours, k)) != expected
         if differs:
             failures.append(f"{self.name}: another rank")

@@ -119,7 +119,7 @@ def grow_paths(
     longest_m: float = np.inf,
     threads: int | None = None,
     progress: Progress | None = None,
-    told: Callable[[str, float], None] | None = None,
+    on_estimate: Callable[[str, float], None] | None = None,
     solids: bool = False,
 ) -> tuple[PathSet, Effort]:
     """All paths with at most ``max_depth`` reflections.
@@ -146,7 +146,7 @@ def grow_paths(
         Default: the cores that this process may use.
     progress : callable, optional
         Called with the share done.
-    told : callable, optional
+    on_estimate : callable, optional
         Called once, after the first faces, with the estimate of time and memory in words and its seconds.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
@@ -184,7 +184,7 @@ def grow_paths(
                 if progress:
                     progress((tower + done) / len(sources_m))
 
-            parts, spent = one.run(first, thread_count(threads), share, told if tower == 0 else None)
+            parts, spent = one.run(first, thread_count(threads), share, on_estimate if tower == 0 else None)
             found += [_pad(part, poses, tower, max_depth) for part in parts]
             effort = Effort(
                 sequences=effort.sequences + spent.sequences,
@@ -251,7 +251,7 @@ class _Search:
         return np.random.default_rng(0).permutation(np.flatnonzero(good)), int(hidden)
 
     def run(
-        self, first: IntArray, threads: int, share: Progress, told: Callable[[str, float], None] | None
+        self, first: IntArray, threads: int, share: Progress, on_estimate: Callable[[str, float], None] | None
     ) -> tuple[list[_Found], Effort]:
         """Follow all sequences that begin with the faces ``first``."""
         found: list[_Found] = []
@@ -283,8 +283,8 @@ class _Search:
                 for some in part:
                     chunk(some)
                 estimate = (time.perf_counter() - _follow_again) * len(first) / size / max(1, threads)
-                if told:
-                    told(
+                if on_estimate:
+                    on_estimate(
                         f"about {estimate:.0f} s for each source: {len(first)} first faces, some "
                         f"{int(totals[0] * len(first) / size)} sequences, streamed in {memory_mib(self):.0f} MiB",
                         estimate,

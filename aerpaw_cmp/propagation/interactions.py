@@ -198,8 +198,8 @@ def path_powers(paths: OtherPaths, link: Link, poses: Poses, loss_db: FloatArray
             away, basis = _basis(paths.departure_rad[rows])
             sent = np.einsum("bip,ipt->bpt", basis, radiated(array, mount, away))
             away, basis = _basis(paths.arrival_rad[rows])
-            heard = np.einsum("aip,ipu->apu", basis, radiated(link.uav_array, turn, away))
-            h = np.einsum("apu,pab,bpt->put", heard, paths.jones[rows], sent, optimize=True)
+            received = np.einsum("aip,ipu->apu", basis, radiated(link.uav_array, turn, away))
+            h = np.einsum("apu,pab,bpt->put", received, paths.jones[rows], sent, optimize=True)
             power[rows] = (h.real**2 + h.imag**2).mean(axis=(1, 2))
     return power if loss_db is None else power * amplitude_from_db(-loss_db) ** 2
 
@@ -253,15 +253,15 @@ def summary(parts: Iterable[tuple[FloatArray, OtherInteractions]]) -> dict[str, 
     """
     paths = links = dark = 0
     shares: list[FloatArray] = []
-    whole: dict[int, dict[str, int]] = {}  # channels that share a replay share its kinds
+    replays: dict[int, dict[str, int]] = {}  # channels that share a replay share its kinds
     for reflected, other in parts:
-        whole[id(other.kinds)] = other.kinds
+        replays[id(other.kinds)] = other.kinds
         has = other.power > 0.0
         paths += int(other.paths.sum())
         links += int(has.sum())
         dark += int((has & (reflected <= 0.0)).sum())
         shares.append((other.power[has] / (other.power[has] + reflected[has])).ravel())
-    kinds = sum((Counter(one) for one in whole.values()), Counter[str]())
+    kinds = sum((Counter(one) for one in replays.values()), Counter[str]())
     every = np.concatenate(shares) if shares else np.zeros(0)
     return {
         "paths": paths,

@@ -268,7 +268,7 @@ def replay(
         choice = _choose_samples(scene, link, poses, settings, cache)
         settings = replace(settings, samples=choice.samples)
     paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
-    left_out += cache.told if cache else []
+    left_out += cache.warnings if cache else []
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
     if crowns is not None and scene.surfaces is not None:
@@ -426,15 +426,15 @@ def _by_pairs(
         power += fields.power.reshape(len(poses), len(names), ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
     level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
-    heard = np.isfinite(level)
-    h = np.where(heard[:, :, None, None], h, 0.0)
+    covered = np.isfinite(level)
+    h = np.where(covered[:, :, None, None], h, 0.0)
     size = np.sqrt(np.maximum(mean_pair_power(h), mean_pair_power(centre.h)))
     return replace(
         centre,
         rss_dbm=level,
         rss_power_dbm=rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm),
         h=h,
-        has_path=heard,
+        has_path=covered,
         pairs_differ=np.abs(h - centre.h).max(axis=(2, 3)) > PAIRS_DIFFER * size,
     )
 
@@ -478,11 +478,11 @@ def _within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
     bad = far | ~turned
     if not bad.any():
         return poses, []
-    told = [
+    reasons = [
         (far, f"poses further than {REACH_M / 1000:g} km from every tower"),
         (known & ~far & ~turned, "poses without a rotation"),
     ]
-    lines = [f"{int(mask.sum())} {what}: no path was searched for them" for mask, what in told if mask.any()]
+    lines = [f"{int(mask.sum())} {what}: no path was searched for them" for mask, what in reasons if mask.any()]
     position = np.where(bad[:, None], np.nan, poses.position_m)
     rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
     return Poses(position, rotation), lines
@@ -553,7 +553,7 @@ def _search(
             usable=scene.usable,
             excluded=scene.excluded,
             threads=settings.threads,
-            told=long_search,
+            on_estimate=long_search,
             progress=progress,
         )[0]
     if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 from ..common.jsonable import json_safe
 from . import canvas
 from .calibration_data import AntennaMap, CalibrationData
-from .canvas import Picture, Plate
+from .canvas import FigureSpec, Picture
 from .export import write_file
 from .html import by_section, environment, policy
 from .names import safe_name
@@ -129,12 +129,12 @@ def _mean(rows: Sequence[Mapping[str, Any]], key: str = "rmse_db") -> float:
     return float(np.mean([r[key] for r in rows])) if rows else float("nan")
 
 
-def plates(data: CalibrationData) -> list[Plate]:
+def figure_specs(data: CalibrationData) -> list[FigureSpec]:
     """All figures."""
     out = []
     if data.scores.get("flight_left_out"):
         out.append(
-            Plate(
+            FigureSpec(
                 name="scores",
                 section="scores",
                 title="What carries over",
@@ -146,7 +146,7 @@ def plates(data: CalibrationData) -> list[Plate]:
         )
     for a in data.antennas:
         out.append(
-            Plate(
+            FigureSpec(
                 name=f"antenna_{safe_name(a.name)}",
                 section="antennas",
                 title=a.name,
@@ -160,7 +160,7 @@ def plates(data: CalibrationData) -> list[Plate]:
         )
     if data.place is not None:
         out.append(
-            Plate(
+            FigureSpec(
                 name="place",
                 section="place",
                 title="Field over places",
@@ -176,7 +176,7 @@ def plates(data: CalibrationData) -> list[Plate]:
 def write_calibration(data: CalibrationData, folder: Path) -> list[Path]:
     """Write ``calibration.html``, ``metrics.json`` and ``figures/``."""
     written = [write_file(folder / "metrics.json", json.dumps(calibration_metrics(data), indent=2) + "\n")]
-    drawn, files = canvas.write_plates(plates(data), folder / "figures")
+    drawn, files = canvas.write_figures(figure_specs(data), folder / "figures")
     page = write_file(folder / "calibration.html", _page(data, drawn))
     return [page, *written, *files]
 

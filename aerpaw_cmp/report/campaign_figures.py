@@ -12,7 +12,7 @@ from ..site.site import Site
 from .campaign_data import CampaignData, HeldOutFold, RssRow, place_means
 from .canvas import (
     BASELINE,
-    Plate,
+    FigureSpec,
     beyond,
     colour_bar,
     count,
@@ -219,12 +219,12 @@ def season_places(data: CampaignData) -> Figure:
     return fig
 
 
-def season_plates(data: CampaignData) -> list[Plate]:
+def season_plates(data: CampaignData) -> list[FigureSpec]:
     """What stands on the page where no script runs, and in print."""
     if not data.season.over_all():
         return []
     found = [
-        Plate(
+        FigureSpec(
             name="season_errors",
             section="season",
             title="Error of the flights under every setting",
@@ -233,7 +233,7 @@ def season_plates(data: CampaignData) -> list[Plate]:
             alt="Distribution of the error over flights for each setting",
             draw=lambda: season_errors(data),
         ),
-        Plate(
+        FigureSpec(
             name="season_drift",
             section="season",
             title="Offsets over the season",
@@ -244,7 +244,7 @@ def season_plates(data: CampaignData) -> list[Plate]:
     ]
     if any(len(p.n) for p in data.season.places):
         found.append(
-            Plate(
+            FigureSpec(
                 name="season_places",
                 section="season",
                 title="Where the simulation errs, over all flights",
@@ -405,13 +405,13 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
     return fig
 
 
-def plates(data: CampaignData) -> list[Plate]:
+def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    found: list[Plate] = season_plates(data)
+    found: list[FigureSpec] = season_plates(data)
     if data.rss and len(data.rss) <= MOST_BARS:
         found.append(
-            Plate(
+            FigureSpec(
                 name="settings_rmse",
                 section="result",
                 title="RMSE of every setting and flight",
@@ -424,7 +424,7 @@ def plates(data: CampaignData) -> list[Plate]:
         )
     if data.rank and len(data.rank) <= MOST_BARS:
         found.append(
-            Plate(
+            FigureSpec(
                 name="rank_tv",
                 section="result",
                 title="Total variation of rank, every setting and flight",
@@ -437,7 +437,7 @@ def plates(data: CampaignData) -> list[Plate]:
     if numbers and data.site is not None:
         site = data.site
         found.append(
-            Plate(
+            FigureSpec(
                 name="tracks",
                 section="overlay",
                 title="The flights laid over each other",
@@ -453,12 +453,12 @@ def plates(data: CampaignData) -> list[Plate]:
     return found
 
 
-def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[Plate]:
+def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[FigureSpec]:
     scored = [row for row in rows if row.n > 0]
     if not scored or len(scored) > MOST_FLIGHTS:
         return []
     return [
-        Plate(
+        FigureSpec(
             name=f"distance_{safe_name(link)}",
             section="overlay",
             title=f"{link}: RSS against distance, all flights",
@@ -468,7 +468,7 @@ def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dic
             alt=f"Medians of measured and simulated RSS of {link} against distance for each flight",
             draw=lambda: against_distance(scored, numbers),
         ),
-        Plate(
+        FigureSpec(
             name=f"places_{safe_name(link)}",
             section="overlay",
             title=f"{link}: where the simulation errs, flight by flight",
@@ -481,9 +481,9 @@ def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dic
     ]
 
 
-def _fold_plate(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> Plate:
+def _fold_plate(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> FigureSpec:
     on = ", ".join(fold.fitted_on)
-    return Plate(
+    return FigureSpec(
         name=f"held_out_{number + 1}",
         section="held_out",
         title=f"Fitted on {on}",

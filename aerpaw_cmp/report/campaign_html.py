@@ -392,7 +392,7 @@ def write_campaign(
         *write_parquet(table, folder / "campaign.parquet", progress),
     ]
     tables = [path.name for path in written]
-    drawn, pictures = canvas.write_plates(campaign_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
     written += pictures
     samples = of_campaign(data) if exports else None
     exported = [] if samples is None else write_exports(samples, folder, exports, progress)

@@ -54,7 +54,7 @@ WIDE = (9.2, 4.2)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class Plate:
+class FigureSpec:
     """A figure that can be drawn, with the words that go with it; ``page``: the page itself shows it."""
 
     name: str
@@ -185,7 +185,7 @@ def smaller(png: bytes, colours: int = 256) -> bytes:
     return min(out.getvalue(), png, key=len)
 
 
-def render(plate: Plate, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
+def render(plate: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
     """Draw a plate and forget the figure."""
     with style(kind):
         files = save_as(plate.draw(), formats, kind)
@@ -199,8 +199,8 @@ def render(plate: Plate, formats: Sequence[str] = ("svg", "png"), kind: str = "s
     )
 
 
-def write_plates(
-    plates: Sequence[Plate],
+def write_figures(
+    plates: Sequence[FigureSpec],
     folder: Path,
     formats: Sequence[str] = ("svg", "png"),
     kind: str = "screen",
@@ -210,7 +210,7 @@ def write_plates(
 
     Parameters
     ----------
-    plates : sequence of Plate
+    plates : sequence of FigureSpec
     folder : Path
         Made when missing.
     formats : sequence of str

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .canvas import POINTS_PER_CLOUD, Plate, count
+from .canvas import POINTS_PER_CLOUD, FigureSpec, count
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track
 from .names import safe_name
 from .rank_figures import agreement_curve, confusion, rank_histograms, rank_maps, rank_over_time
@@ -33,9 +33,9 @@ if TYPE_CHECKING:
 # --- all plates of a report ---------------------------------------------------------------------
 
 
-def plates(data: ReportData) -> list[Plate]:
+def figure_specs(data: ReportData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
-    result: list[Plate] = []
+    result: list[FigureSpec] = []
     if data.rss or data.rank:
         result += _overview_plate(data)
     if data.track is not None and len(data.track.time):
@@ -47,7 +47,7 @@ def plates(data: ReportData) -> list[Plate]:
         result.append(_pair_plate(data, pair))
     if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
         result.append(
-            Plate(
+            FigureSpec(
                 name="ladder",
                 section="ladder",
                 title="Models from the simplest to the richest",
@@ -65,7 +65,7 @@ def plates(data: ReportData) -> list[Plate]:
             result += _rank_plates(data, rank)
     if data.speed:
         result.append(
-            Plate(
+            FigureSpec(
                 name="speed_against_error",
                 page=True,
                 section="speed",
@@ -80,7 +80,7 @@ def plates(data: ReportData) -> list[Plate]:
     return _with_own_names(result)
 
 
-def _with_own_names(found: list[Plate]) -> list[Plate]:
+def _with_own_names(found: list[FigureSpec]) -> list[FigureSpec]:
     """The same plates, a number added where two names became one file name."""
     seen: dict[str, int] = {}
     result = []
@@ -90,13 +90,13 @@ def _with_own_names(found: list[Plate]) -> list[Plate]:
     return result
 
 
-def _overview_plate(data: ReportData) -> list[Plate]:
+def _overview_plate(data: ReportData) -> list[FigureSpec]:
     """The picture of the first screen where no script runs: the first channel, or the first rank."""
     panels = [panel for panel in data.rss if len(panel.time) and panel.n]
     if not panels:
         return []
     return [
-        Plate(
+        FigureSpec(
             name="overview",
             page=True,
             section="overview",
@@ -109,7 +109,7 @@ def _overview_plate(data: ReportData) -> list[Plate]:
     ]
 
 
-def _track_plates(data: ReportData, track: Track) -> list[Plate]:
+def _track_plates(data: ReportData, track: Track) -> list[FigureSpec]:
     there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
     invented = (
         f" {' and '.join(there).capitalize()} are illustrative: they were invented to show the method."
@@ -117,7 +117,7 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
         else ""
     )
     return [
-        Plate(
+        FigureSpec(
             name="trajectory",
             page=True,
             section="flight",
@@ -126,7 +126,7 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
             alt=f"Plan of {data.site.name} with {len(data.site.towers)} towers and the flown line.",
             draw=lambda: trajectory(data, track),
         ),
-        Plate(
+        FigureSpec(
             name="altitude",
             page=True,
             section="flight",
@@ -139,11 +139,11 @@ def _track_plates(data: ReportData, track: Track) -> list[Plate]:
     ]
 
 
-def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
+def _rss_plates(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
     result = [
-        Plate(
+        FigureSpec(
             name=f"rss_{stem}",
             page=True,
             section=section,
@@ -165,7 +165,7 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
             f"{panel.n} samples.",
             draw=lambda: rss_over_time(data, panel),
         ),
-        Plate(
+        FigureSpec(
             name=f"rss_check_{stem}",
             section=section,
             title=f"{panel.name}: can the number be trusted?",
@@ -177,7 +177,7 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
     ]
     if any(name in GEOMETRY for name in panel.geometry):
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"rss_residual_{stem}",
                 section=section,
                 title=f"{panel.name}: where it fails",
@@ -188,7 +188,7 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
         )
     if {"azimuth_deg", "elevation_deg"} <= set(panel.geometry):
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"rss_angles_{stem}",
                 section=section,
                 title=f"{panel.name}: from where the antennas see each other",
@@ -202,9 +202,9 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[Plate]:
     return result
 
 
-def _pair_plate(data: ReportData, pair: ChannelPair) -> Plate:
+def _pair_plate(data: ReportData, pair: ChannelPair) -> FigureSpec:
     words = f"{pair.first} against {pair.second}"
-    return Plate(
+    return FigureSpec(
         name=f"pair_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
         section=f"pair/{pair.tower}/{pair.first}/{pair.second}",
         title=f"{pair.tower}: {words}",
@@ -215,11 +215,11 @@ def _pair_plate(data: ReportData, pair: ChannelPair) -> Plate:
     )
 
 
-def _rank_plates(data: ReportData, panel: RankPanel) -> list[Plate]:
+def _rank_plates(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
     stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
 
-    def plate(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> Plate:
-        return Plate(
+    def plate(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> FigureSpec:
+        return FigureSpec(
             name=f"{name}_{stem}",
             section=section,
             title=f"{panel.tower}: {title}",

@@ -10,7 +10,7 @@ import numpy as np
 from ..common.units import FloatArray
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
-from .canvas import RANK_HATCH, TOWER, Plate, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
+from .canvas import RANK_HATCH, TOWER, FigureSpec, beyond, colour_bar, figure, plain_ticks, rank_colour, spread_out
 from .data import RANKS
 from .maps_data import JOINT, Correlation, LearningCurve, MapError, MapsData, RankMap, RssMap
 from .names import k_key, safe_name
@@ -323,9 +323,9 @@ def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
     return float(5 * np.floor(low / 5)), float(max(5 * np.ceil(high / 5), 5 * np.floor(low / 5) + 5))
 
 
-def plates(data: MapsData) -> list[Plate]:
+def figure_specs(data: MapsData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
-    result: list[Plate] = []
+    result: list[FigureSpec] = []
     limits = level_limits(data.rss)
     for (antennas, foliage, height), maps in grouped(
         data.rss, lambda one: (one.antennas, one.foliage, one.altitude_m)
@@ -335,7 +335,7 @@ def plates(data: MapsData) -> list[Plate]:
     for (antennas, foliage), maps in grouped(data.rss, lambda one: (one.antennas, one.foliage)).items():
         words = f"{antennas}{f', foliage {foliage}' if foliage else ''}"
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"rss_cdf_{safe_name(words)}",
                 section="rss",
                 title=f"Distribution of RSS, {words}",
@@ -347,8 +347,8 @@ def plates(data: MapsData) -> list[Plate]:
     return result + _rank_plates(data) + _layer_plates(data) + _kriging_plates(data)
 
 
-def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> Plate:
-    return Plate(
+def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> FigureSpec:
+    return FigureSpec(
         name=f"rss_map_{safe_name(words)}",
         section="rss",
         title=f"RSS, {words}",
@@ -359,12 +359,12 @@ def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, floa
     )
 
 
-def _rank_plates(data: MapsData) -> list[Plate]:
+def _rank_plates(data: MapsData) -> list[FigureSpec]:
     result = []
     for (k, foliage), maps in grouped(data.rank, lambda one: (one.k, one.foliage)).items():
         words = f"K = {k_key(k)}{f', foliage {foliage}' if foliage else ''}"
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"rank_map_{safe_name(words)}",
                 section="rank",
                 title=f"Rank, {words}",
@@ -376,7 +376,7 @@ def _rank_plates(data: MapsData) -> list[Plate]:
     for foliage, maps in grouped(data.rank, lambda one: one.foliage).items():
         words = f", foliage {foliage}" if foliage else ""
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"rank_share{f'_{safe_name(words)}' if words else ''}",
                 section="rank",
                 title=f"Rank against height{words}",
@@ -388,9 +388,9 @@ def _rank_plates(data: MapsData) -> list[Plate]:
     return result
 
 
-def _layer_plates(data: MapsData) -> list[Plate]:
+def _layer_plates(data: MapsData) -> list[FigureSpec]:
     return [
-        Plate(
+        FigureSpec(
             name=f"layer_{safe_name(name)}",
             section="layers",
             title=name,
@@ -402,11 +402,11 @@ def _layer_plates(data: MapsData) -> list[Plate]:
     ]
 
 
-def _kriging_plates(data: MapsData) -> list[Plate]:
+def _kriging_plates(data: MapsData) -> list[FigureSpec]:
     result = []
     if data.correlation:
         result.append(
-            Plate(
+            FigureSpec(
                 name="correlation",
                 section="kriging",
                 title="Spatial correlation",
@@ -418,7 +418,7 @@ def _kriging_plates(data: MapsData) -> list[Plate]:
         )
     for evaluation, errors in grouped(data.errors, lambda one: one.evaluation).items():
         result.append(
-            Plate(
+            FigureSpec(
                 name=f"mae_{safe_name(evaluation)}",
                 section="kriging",
                 title=f"Error of interpolated rank, {evaluation}",
@@ -429,7 +429,7 @@ def _kriging_plates(data: MapsData) -> list[Plate]:
         )
     if data.learning:
         result.append(
-            Plate(
+            FigureSpec(
                 name="learning_curve",
                 section="kriging",
                 title="How many samples are needed",

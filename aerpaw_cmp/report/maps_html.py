@@ -102,7 +102,7 @@ def write_maps(data: MapsData, folder: str | Path) -> list[Path]:
     """Write ``map.html``, ``metrics.json`` and ``figures/``; returns the files, the page first."""
     folder = Path(folder)
     written = [write_file(folder / "metrics.json", json.dumps(maps_metrics(data), indent=2, ensure_ascii=False) + "\n")]
-    drawn, pictures = canvas.write_plates(maps_figures.plates(data), folder / "figures")
+    drawn, pictures = canvas.write_figures(maps_figures.figure_specs(data), folder / "figures")
     written += pictures
     page = write_file(folder / "map.html", maps_page(data, drawn, ["metrics.json"]))
     return [page, *written]

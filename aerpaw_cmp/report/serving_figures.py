@@ -8,7 +8,7 @@ import numpy as np
 
 from ..common.units import AnyArray
 from ..compare.serving import ServingComparison
-from .canvas import TOWER, Plate, colour_bar, count, figure
+from .canvas import TOWER, FigureSpec, colour_bar, count, figure
 
 MOST_CELLS = 16
 """Cells with a row of their own; the others stand together."""
@@ -69,10 +69,10 @@ def _frame(place: int) -> Any:
     return Rectangle((place - 0.47, place - 0.46), 0.94, 0.92, fill=False, edgecolor=TOWER, linewidth=1.4)
 
 
-def serving_plate(serving: ServingComparison) -> Plate:
+def serving_plate(serving: ServingComparison) -> FigureSpec:
     """The matrix with its words."""
     n_cells = int((np.asarray(serving.confusion).sum(axis=1) > 0).sum())
-    return Plate(
+    return FigureSpec(
         name="serving_confusion",
         page=True,
         section="serving",

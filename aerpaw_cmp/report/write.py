@@ -10,7 +10,7 @@ from pathlib import Path
 
 from ..common.stages import Stages
 from . import figures, html
-from .canvas import FORMATS, STYLES, write_plates
+from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
 from .export import metrics, rank_csv, rss_csv, write_file
 from .exports.samples import of_report
@@ -71,9 +71,9 @@ def write_report(
         for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
             # written even without rows: a reader finds the same files in every report
             written.append(write_file(folder / name, text))
-        plates = [] if drawn == "none" else [p for p in figures.plates(data) if p.page or drawn != PAGE]
+        plates = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
-        pictures, paths = write_plates(plates, folder / "figures", formats, style, stages.progress)
+        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress)
     written += paths
     if exports:
         with stages("exports"):

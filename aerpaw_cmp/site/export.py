@@ -10,7 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
-from ..common.outputs import told
+from ..common.outputs import explained_os_errors
 from .materials import (
     CONSTANT,
     CROWN,
@@ -53,7 +53,7 @@ def export_scene(
     lines = ['<scene version="2.1.0">', f"<!-- {_comment(site)} -->"]
     lines += [_bsdf(name, gamma_db_per_m) for name in dict.fromkeys(name for _, name, _ in parts)]
     written = [folder / "scene.xml"]
-    with told(folder):
+    with explained_os_errors(folder):
         folder.mkdir(exist_ok=True)
         (folder / "meshes").mkdir(exist_ok=True)
         for title, name, mesh in parts:

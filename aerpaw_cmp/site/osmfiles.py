@@ -52,9 +52,9 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
     for identity, tags in data.trees.items():
         result.trees.append(TreeLine(f"{path.name}: node {identity}", tags, (data.nodes[identity],)))
     lines: Counter[str] = Counter()
-    told = _relations(data, result, lines, line_of)
+    used_ways = _relations(data, result, lines, line_of)
     for identity, way in data.ways.items():
-        if way.get("tags") and identity not in told:
+        if way.get("tags") and identity not in used_ways:
             try:
                 _way_outline(identity, way, data, result, lines)
             except BROKEN_ELEMENT as error:
@@ -132,8 +132,8 @@ def _points(way: Element, data: _Data, outline: Outline) -> list[Position]:
 
 
 def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineOf) -> set[str]:
-    """Adds multipolygons; gives the ways that are told by them and must not come again, with their holes filled."""
-    told: set[str] = set()
+    """Adds multipolygons; gives the ways that are part of them and must not come again, with their holes filled."""
+    used_ways: set[str] = set()
     for identity, relation in data.relations.items():
         tags = _words(relation)
         if tags.get("type") not in ("multipolygon", "boundary"):
@@ -157,9 +157,9 @@ def _relations(data: _Data, result: MapFile, lines: Counter[str], line_of: LineO
             result.notes.append(left_out(data.path, line_of(relation["index"]), f"relation {identity}", error))
             continue
         if outline.parts:
-            told |= {ref for ref in own if kind_of(_words(data.ways[ref])) == kind}
+            used_ways |= {ref for ref in own if kind_of(_words(data.ways[ref])) == kind}
         result.outlines.append(outline)
-    return told
+    return used_ways
 
 
 def _multipolygon(relation: Element, data: _Data, outline: Outline) -> None:

@@ -62,7 +62,7 @@ def _table(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, dict[str, float]
 def _number(text: str, base: int) -> float:
     try:
         return float(int(text, 16)) if base == 16 else float(text)
-    except ValueError:
+    except (ValueError, OverflowError):
         return float("nan")
 
 

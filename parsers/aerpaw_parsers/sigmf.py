@@ -86,9 +86,9 @@ def _stream(
     counts.append(len(texts))
     if not texts:
         return None
-    clock, cells, told = _stamps.read(texts, options)
+    clock, cells, clock_warnings = _stamps.read(texts, options)
     relative, instants, valid = _rows.times(cells, options, clock=clock, reader="sigmf")
-    warnings += [*told, *instants.warnings, *([_rows.RELATIVE] if relative else [])]
+    warnings += [*clock_warnings, *instants.warnings, *([_rows.RELATIVE] if relative else [])]
     flag = _lines.flags(len(texts))
     instants.flag(flag)
     if "rss_db" in values:

@@ -256,10 +256,10 @@ def _stream(
         _lines.add_flag(flag, samples.line == len(lines) - 1, _lines.UNTERMINATED)
     frame = _frames.frame("rss", instants.time, samples.line + 1, flag, {"rss_db": value})
     warnings += [*instants.warnings, *_frames.steps_back(frame)]
-    told = _NAMED.search(options.file_name.lower())
-    name = options.channel or (told.group(1) if told else "power")
+    named = _NAMED.search(options.file_name.lower())
+    name = options.channel or (named.group(1) if named else "power")
     ratio = name.lower() in ("quality", "snr")
-    if options.channel is None and not told:
+    if options.channel is None and not named:
         warnings.append(
             "power, quality and SNR logs have one layout: read as power, as the file name does not say; name another "
             "with the channel option"

@@ -7,14 +7,14 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.common.files import whole
+from aerpaw_cmp.common.files import atomic_path
 
 
 @pytest.mark.parametrize("durable", [False, True])
 def test_the_new_content_takes_the_name(tmp_path: Path, durable: bool) -> None:
     target = tmp_path / "a.txt"
     target.write_text("old")
-    with whole(target, durable=durable) as part:
+    with atomic_path(target, durable=durable) as part:
         part.write_text("new")
         assert target.read_text() == "old"
     assert target.read_text() == "new"
@@ -26,7 +26,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
     target.write_text("old")
 
     def half() -> None:
-        with whole(target) as part:
+        with atomic_path(target) as part:
             part.write_text("half of the n")
             raise RuntimeError("no more")
 
@@ -39,7 +39,7 @@ def test_a_failure_leaves_the_old_file_and_nothing_else(tmp_path: Path) -> None:
 def test_rights_follow_the_umask(tmp_path: Path) -> None:
     before = os.umask(0o027)
     try:
-        with whole(tmp_path / "a") as part:
+        with atomic_path(tmp_path / "a") as part:
             part.write_bytes(b"")
     finally:
         os.umask(before)
@@ -47,7 +47,7 @@ def test_rights_follow_the_umask(tmp_path: Path) -> None:
 
 
 def test_a_missing_folder_is_an_oserror(tmp_path: Path) -> None:
-    with pytest.raises(OSError, match="No such file"), whole(tmp_path / "none" / "a") as part:
+    with pytest.raises(OSError, match="No such file"), atomic_path(tmp_path / "none" / "a") as part:
         part.write_bytes(b"")
 
 
@@ -57,6 +57,6 @@ def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None
         part.write_text("half")
     os.utime(old, (0, 0))
     os.utime(other, (0, 0))
-    with whole(tmp_path / "a") as part:
+    with atomic_path(tmp_path / "a") as part:
         part.write_text("whole")
     assert {p.name for p in tmp_path.iterdir()} == {"a", new.name, other.name}

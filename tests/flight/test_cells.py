@@ -96,7 +96,7 @@ def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> 
     record = report_data(found.data, found.result)
     assert record.serving is not None
     entry = record.extra_metrics["serving"]
-    (plate,) = (p for p in figures.plates(record) if p.section == "serving")
+    (plate,) = (p for p in figures.figure_specs(record) if p.section == "serving")
     assert plate.page
     names, table = shown_confusion(record.serving)
     assert names == entry["cells"]

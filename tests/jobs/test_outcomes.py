@@ -80,7 +80,7 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     content[place] ^= 0xFF
     file.write_bytes(content)
     assert store.load("a") is None
-    assert "damaged" in store.told[0]
+    assert "damaged" in store.warnings[0]
 
 
 def key_of(settings: FlightFile, flight: Path) -> str:

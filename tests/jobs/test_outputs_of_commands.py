@@ -178,8 +178,8 @@ def test_a_report_is_replaced_as_a_whole(tmp_path: Path, monkeypatch: pytest.Mon
     """An error inside the writing leaves the old set whole."""
     from aerpaw_cmp.report import figures, html
 
-    plates = figures.plates
-    monkeypatch.setattr(figures, "plates", lambda data: plates(data)[:2])  # drawing is the slow part
+    every = figures.figure_specs
+    monkeypatch.setattr(figures, "figure_specs", lambda data: every(data)[:2])  # drawing is the slow part
     out = tmp_path / "reports" / "r"
     command = ["report", str(tiny_flight(tmp_path)), "-o", str(out)]
     assert main(command) == 0
@@ -217,7 +217,7 @@ def test_a_map_that_fails_in_its_exports_leaves_the_old_one(tmp_path: Path, monk
     """Exports were written in place: a cut maps.kmz stood under its final name."""
     from aerpaw_cmp.report import maps_figures
 
-    monkeypatch.setattr(maps_figures, "plates", lambda _data: [])  # drawing is the slow part
+    monkeypatch.setattr(maps_figures, "figure_specs", lambda _data: [])  # drawing is the slow part
     out = tmp_path / "map"
     small = ["--spacing", "500", "--rss-altitude", "30", "--rank-altitude", "30", "-k", "10", "--foliage", "none"]
     command = ["map", *small, "--max-depth", "0", "--no-study", "-o", str(out)]

@@ -86,7 +86,7 @@ def test_outcomes_come_back_from_any_place_and_damaged_ones_do_not(place: Place)
     place.write("k.npz", bytes(content))
     assert not store.sound("k")
     assert store.load("k") is None
-    assert "damaged" in store.told[0]
+    assert "damaged" in store.warnings[0]
 
 
 def test_a_bucket_that_is_not_there_is_told_before_anything_runs(s3: str) -> None:

@@ -91,5 +91,7 @@ def test_what_fuzzing_found() -> None:
     odd = b"12,600.0,35.73-1e30,-78.7000003,3.9,2.0,,,\n"
     assert by_name("nemo_csv").read(head + row, OPTIONS).accepted == 1
     assert by_name("nemo_csv").read(head + row + odd, OPTIONS).accepted == 1
+    row = SAMPLES["amarisoft"]["monitor"][0].replace(b" 0046 ", b" " + b"9" * 400 + b" ")
+    assert by_name("amarisoft").read(row, OPTIONS).accepted == 2
     dotted = b"11,500.0,35.7300002,-78.7000003,.5,2.0,,,\n"
     assert by_name("nemo_csv").read(head + dotted, OPTIONS).accepted == 0

@@ -84,7 +84,9 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
     found = [
-        grow_paths(surfaces, source, targets, max_depth=2, shadows=on, told=lambda text, _: words.append(text))[0]
+        grow_paths(surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda text, _: words.append(text))[
+            0
+        ]
         for on in (True, False)
     ]
     assert len(words) == 2

@@ -228,9 +228,9 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
     report = audit(site, link, poses, found, reference="image", links=None, cache_dir="")
     assert (report.missing_paths, report.extra_paths, report.difference.coverage_differs) == (0, 0, 0)
     assert report.rss_max_error_db < 0.01
-    said = summary([(np.abs(found.h[..., 0, 0]) ** 2, found.other)])
-    assert said["links_without_reflections"] == 2
-    assert said["paths"] == sum(found.other.kinds.values())
+    counted = summary([(np.abs(found.h[..., 0, 0]) ** 2, found.other)])
+    assert counted["links_without_reflections"] == 2
+    assert counted["paths"] == sum(found.other.kinds.values())
 
     def fail(*args, **settings):
         raise AssertionError("traced again")

@@ -114,7 +114,7 @@ def test_without_pyarrow_a_line_says_what_is_missing(data, tmp_path, monkeypatch
 
 
 def test_figures_of_a_season_are_few_and_can_be_drawn(data):
-    plates = campaign_figures.plates(data)
+    plates = campaign_figures.figure_specs(data)
     assert {p.name for p in plates} >= {"season_errors", "season_drift", "season_places"}
     assert len(plates) < 8
     for plate in plates:

@@ -22,13 +22,13 @@ linux = pytest.mark.skipif(
 )
 
 
-def plate(number: int) -> canvas.Plate:
+def plate(number: int) -> canvas.FigureSpec:
     def draw():
         fig = canvas.figure((3.0, 2.0))
         fig.subplots().plot(np.arange(5) * number)
         return fig
 
-    return canvas.Plate(name=f"p{number}", section="s", title="t", caption="c", alt="a", draw=draw)
+    return canvas.FigureSpec(name=f"p{number}", section="s", title="t", caption="c", alt="a", draw=draw)
 
 
 @linux

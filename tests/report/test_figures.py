@@ -17,7 +17,7 @@ from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, T
 
 
 def drawn(data: ReportData):
-    for plate in figures.plates(data):
+    for plate in figures.figure_specs(data):
         with canvas.style():
             fig = plate.draw()
         yield plate, fig
@@ -55,7 +55,7 @@ def test_every_figure_has_labels_with_units_and_a_legend(small_report):
 
 def test_file_names_are_safe_and_unique(report_data):
     panels = tuple(dataclasses.replace(report_data.rss[0], tower="../LW 1", channel=c) for c in ("a/b", "a b"))
-    names = [p.name for p in figures.plates(dataclasses.replace(report_data, rss=panels))]
+    names = [p.name for p in figures.figure_specs(dataclasses.replace(report_data, rss=panels))]
     assert all(re.fullmatch(r"[A-Za-z0-9._-]+", name) for name in names)
     assert len(names) == len(set(names))
 
@@ -81,7 +81,7 @@ def test_svg_stays_small_however_long_the_flight(report_data):
 
 
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
-    plate = next(p for p in figures.plates(small_report) if p.name == "altitude")
+    plate = next(p for p in figures.figure_specs(small_report) if p.name == "altitude")
     one, two = canvas.render(plate), canvas.render(plate)
     assert one.formats["svg"] == two.formats["svg"]
     fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.formats["svg"])
@@ -92,7 +92,7 @@ def test_style_leaves_the_users_settings_alone(small_report):
     import matplotlib
 
     before = dict(matplotlib.rcParams)
-    canvas.render(figures.plates(small_report)[1])
+    canvas.render(figures.figure_specs(small_report)[1])
     assert dict(matplotlib.rcParams) == before
 
 
@@ -242,7 +242,7 @@ def test_grey_steps_of_the_ranks_are_apart():
 
 def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
     """``Figure.savefig`` draws once more before each file; leaving that out must not move anything."""
-    plate = next(p for p in figures.plates(small_report) if p.name == "trajectory")
+    plate = next(p for p in figures.figure_specs(small_report) if p.name == "trajectory")
     with canvas.style():
         ours = canvas.save(plate.draw())[1]
         theirs = io.BytesIO()
@@ -300,7 +300,7 @@ def test_no_empty_rank_plane_where_no_setting_changes_a_rank(report_data):
     with canvas.style():
         fig = speed_figures.pareto(same)
     assert len(fig.axes) == 1
-    plate = next(p for p in figures.plates(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
+    plate = next(p for p in figures.figure_specs(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
     assert plate.caption.endswith("No setting changes the rank of a link.")
 
 
@@ -308,7 +308,7 @@ def test_captions_speak_of_what_is_drawn(report_data):
     bare = dataclasses.replace(
         report_data, waypoints=(), site=dataclasses.replace(report_data.site, buildings=(), illustrative=True)
     )
-    captions = {p.name: p.caption for p in figures.plates(bare)}
+    captions = {p.name: p.caption for p in figures.figure_specs(bare)}
     assert "waypoints" not in captions["altitude"]
     assert "uildings" not in captions["trajectory"]
     for panel in bare.rss:
@@ -317,7 +317,7 @@ def test_captions_speak_of_what_is_drawn(report_data):
 
 
 def test_a_log_axis_says_plain_numbers(small_report):
-    plate = next(p for p in figures.plates(small_report) if p.name.startswith("rank_k_"))
+    plate = next(p for p in figures.figure_specs(small_report) if p.name.startswith("rank_k_"))
     with canvas.style():
         fig = plate.draw()
         fig.draw_without_rendering()

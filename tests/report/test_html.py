@@ -72,11 +72,11 @@ def parse(text: str) -> Page:
 
 
 def fake_pictures(data: ReportData) -> list[Picture]:
-    from aerpaw_cmp.report.figures import plates
+    from aerpaw_cmp.report.figures import figure_specs
 
     return [
         Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, formats={"svg": b"<svg/>"})
-        for p in plates(data)
+        for p in figure_specs(data)
     ]
 
 
@@ -105,10 +105,10 @@ def test_well_formed_and_loads_nothing_from_elsewhere(report_data):
 
 
 def test_every_figure_has_a_place(report_data):
-    from aerpaw_cmp.report.figures import plates
+    from aerpaw_cmp.report.figures import figure_specs
 
     page = render(report_data)
-    assert [p.name for p in plates(report_data) if p.name not in page.ids] == []
+    assert [p.name for p in figure_specs(report_data) if p.name not in page.ids] == []
 
 
 def test_first_screen_says_what_and_how_well(report_data):

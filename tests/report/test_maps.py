@@ -15,7 +15,7 @@ from aerpaw_cmp.report.maps_data import MapsData
 def pictures(data):
     return [
         Picture(name=p.name, section=p.section, title=p.title, caption=p.caption, alt=p.alt, formats={"svg": b"<svg/>"})
-        for p in maps_figures.plates(data)
+        for p in maps_figures.figure_specs(data)
     ]
 
 
@@ -29,7 +29,7 @@ def test_files(few_maps, tmp_path):
     files = maps_html.write_maps(few_maps, tmp_path)
     assert files[0].name == "map.html"
     page = files[0].read_text()
-    names = {p.name for p in maps_figures.plates(few_maps)}
+    names = {p.name for p in maps_figures.figure_specs(few_maps)}
     assert all(f'id="{name}"' in page for name in names)
     assert not re.search(r'(?:src|href)="(?!data:|#)', page)
     assert page.count("<script") == 2  # its data and its one script
@@ -41,7 +41,7 @@ def test_files(few_maps, tmp_path):
 
 
 def test_every_map_figure_has_units_and_a_legend(few_maps):
-    for plate in maps_figures.plates(few_maps):
+    for plate in maps_figures.figure_specs(few_maps):
         with canvas.style():
             fig = plate.draw()
         labels = [ax.get_xlabel() + ax.get_ylabel() for ax in fig.axes]
@@ -135,5 +135,5 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
     )
     maps_html.maps_page(empty, pictures(empty), [])
     dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
-    for plate in maps_figures.plates(dataclasses.replace(empty, rss=(dark,))):
+    for plate in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
         canvas.render(plate)

@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.report import names, write
-from aerpaw_cmp.report.figures import plates
+from aerpaw_cmp.report.figures import figure_specs
 
 
 def test_whole_report(small_report, tmp_path):
@@ -20,7 +20,7 @@ def test_whole_report(small_report, tmp_path):
     assert json.loads((tmp_path / "metrics.json").read_text())["rss"]["LW4"]["USRP1"]["n"] == small_report.rss[0].n
     assert {p.name for p in tmp_path.iterdir()} == {"report.html", "metrics.json", "rss.csv", "rank.csv", "figures"}
     assert {p.name for p in figures.iterdir()} <= {f.name for f in files}
-    drawn = {p.name for p in plates(small_report) if p.page}
+    drawn = {p.name for p in figure_specs(small_report) if p.page}
     assert {f.stem for f in figures.iterdir()} == drawn
     assert (tmp_path / "report.html").stat().st_size < 4e6
 
@@ -31,7 +31,7 @@ def test_figures_are_drawn_as_asked(small_report, tmp_path, drawn, suffixes):
     files = write.write_report(data, tmp_path, drawn=drawn, style="paper").files
     figures = [f for f in files if f.parent.name == "figures"]
     assert {f.suffix for f in figures} == suffixes
-    assert len(figures) == len(suffixes) * len(plates(data))
+    assert len(figures) == len(suffixes) * len(figure_specs(data))
     assert max((f.stat().st_size for f in figures if f.suffix == ".svg"), default=0) < 900_000
 
 

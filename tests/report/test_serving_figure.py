@@ -58,7 +58,7 @@ def test_many_cells_are_gathered_without_losing_a_sample():
 
 def test_it_stands_in_the_report(report_data, serving):
     data = dataclasses.replace(report_data, serving=serving)
-    plates = [p for p in figures.plates(data) if p.section == "serving"]
+    plates = [p for p in figures.figure_specs(data) if p.section == "serving"]
     assert [p.name for p in plates] == ["serving_confusion"]
     pictures = [canvas.render(p, ("png",)) for p in plates]
     page = html.page(data, pictures, [])

@@ -45,20 +45,22 @@ def _write(export: Export, samples: SampleSet, path: Path) -> Path:
 
 
 def _schema(pa: Any, export: Export, samples: SampleSet) -> Any:
-    def told(unit: str, meaning: str, flags: tuple[str, ...] = ()) -> dict[str, str]:
+    def metadata_of(unit: str, meaning: str, flags: tuple[str, ...] = ()) -> dict[str, str]:
         codes = {"codes": json.dumps(dict(enumerate(flags)))} if flags else {}
         return {"unit": unit, "description": meaning, **codes}
 
     text = pa.dictionary(pa.int32(), pa.string())
     when = "instant, UTC" if export.clock else "instant after 1970-01-01: the logs have no origin of time"
-    fields = [pa.field("time", pa.timestamp("ns", tz="UTC"), metadata=told("", when))]
-    fields += [pa.field(name, text, metadata=told("", meaning)) for name, meaning in _TEXTS.items()]
-    fields += [pa.field(name, pa.float64(), metadata=told(*said)) for name, said in _PLACES.items()]
+    fields = [pa.field("time", pa.timestamp("ns", tz="UTC"), metadata=metadata_of("", when))]
+    fields += [pa.field(name, text, metadata=metadata_of("", meaning)) for name, meaning in _TEXTS.items()]
+    fields += [pa.field(name, pa.float64(), metadata=metadata_of(*said)) for name, said in _PLACES.items()]
     fields += [
-        pa.field(c.name, pa.int8() if c.flags else pa.float64(), metadata=told(c.shown_unit, c.meaning, c.flags))
+        pa.field(c.name, pa.int8() if c.flags else pa.float64(), metadata=metadata_of(c.shown_unit, c.meaning, c.flags))
         for c in samples.columns
     ]
-    fields.append(pa.field("geometry", pa.binary(), metadata=told("", "longitude, latitude [deg], up_m [m] as WKB")))
+    fields.append(
+        pa.field("geometry", pa.binary(), metadata=metadata_of("", "longitude, latitude [deg], up_m [m] as WKB"))
+    )
     about = {"title": export.title, "name": export.name, "remarks": " ".join(export.remarks), **export.attributes}
     geo = {
         "version": "1.1.0",

@@ -27,6 +27,7 @@ from ..propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
+from ..propagation.interactions import Interaction
 from ..site.antennas import Isotropic
 
 Positive = Annotated[float, Field(gt=0)]
@@ -339,6 +340,10 @@ class RtSettings(Settings):
     samples: Literal["auto"] | Annotated[int, Field(ge=1, le=100_000_000)] = "auto"
     """Rays per tower of Sionna; ``auto`` raises the number until two pilots find the same paths."""
     batch: Annotated[int, Field(ge=1, le=100)] = 50
+    interactions: Annotated[list[Interaction], Field(min_length=1)] = ["reflection"]
+    """Besides reflections, engine sionna: their power is added to RSS; H and ranks leave them out."""
+    scattering_coefficient: Annotated[float, Field(gt=0, le=1)] | None = None
+    """Share of the reflected amplitude that every material scatters; needed with ``scattering``."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
     """``logged``: the UAV array turns with the aircraft; ``level``: heading only; ``ignored``: fixed in the site."""
     foliage: Literal["none", "attenuating", "opaque"] = "none"
@@ -364,6 +369,24 @@ class RtSettings(Settings):
     """Of Sionna's search (auto: a GPU where there is one) and, with cuda, of the field."""
     threads: Annotated[int, Field(ge=1, le=1024)] | None = None
     """Of compiled code; by default the cores this process may use. Results do not depend on it."""
+
+    @model_validator(mode="after")
+    def _possible_interactions(self) -> RtSettings:
+        asked = self.interactions
+        if len(set(asked)) < len(asked) or "reflection" not in asked:
+            raise ValueError("interactions must name reflection, and each interaction once")
+        if self.other_interactions and self.max_depth == 0:
+            raise ValueError("interactions besides reflection need max_depth of 1 or more: each counts in it")
+        if "scattering" in asked and self.scattering_coefficient is None:
+            raise ValueError("interactions: scattering needs scattering_coefficient (materials of P.2040 state none)")
+        if "scattering" not in asked and self.scattering_coefficient is not None:
+            raise ValueError("scattering_coefficient belongs to interactions: scattering")
+        return self
+
+    @property
+    def other_interactions(self) -> list[str]:
+        """Interactions besides reflections."""
+        return [name for name in self.interactions if name != "reflection"]
 
 
 class PortSettings(Settings):

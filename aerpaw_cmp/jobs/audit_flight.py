@@ -20,7 +20,9 @@ from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..propagation.audit import Audit, audit
+from ..propagation.channel import mean_pair_power
 from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
+from ..propagation.interactions import summary
 from ..propagation.reference import (
     C_MPS,
     PATTERNS,
@@ -70,7 +72,14 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
         },
         left_out=tuple(dict.fromkeys(text for r in replays for text in r.replay.left_out)),
         audit=_audit(data, replays, progress) if rt.audit_links and now else None,
+        other_interactions=_other_interactions(replays) if rt.other_interactions else None,
     )
+
+
+def _other_interactions(replays: Sequence[Replayed]) -> dict[str, object]:
+    """What diffraction, scattering and refraction added, over all RSS series."""
+    found = [r.replay for r in replays if r.replay.other is not None]
+    return summary((mean_pair_power(f.h), f.other) for f in found if f.other is not None)
 
 
 def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:

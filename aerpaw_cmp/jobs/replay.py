@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.errors import UsageError
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import ClockResult
@@ -22,7 +23,7 @@ from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
-from ..propagation.tracer import Engine, Loss, Replay, replay
+from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
 from ..site.site import Site, Trees
 
 COHERENT_STEP_S = 0.02
@@ -292,6 +293,7 @@ def part_of(whole: Replay, start: int, stop: int) -> Replay:
         has_path=whole.has_path[start:stop],
         pairs_differ=None if whole.pairs_differ is None else whole.pairs_differ[start:stop],
         paths=dataclasses.replace(paths.select(chosen), pose=paths.pose[chosen] - start),
+        other=None if whole.other is None else whole.other.part(start, stop),
         seconds=whole.seconds * share,
         search_seconds=whole.search_seconds * share,
     )
@@ -313,7 +315,8 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
         poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
         progress(f"replay rank {series.tower}: {len(poses)} poses")
-        found = replay_poses(data.site, data.settings.rt, link, poses, progress=progress)
+        # H holds reflections alone, so nothing else is searched
+        found = replay_poses(data.site, data.settings.rt, link, poses, others=False, progress=progress)
         out.append(Replayed(link=link, poses=poses, valid=valid, replay=found, track=track))
     return out
 
@@ -346,7 +349,14 @@ def _poses(track: TrackPoses, attitude: str) -> Poses:
 
 
 def replay_poses(
-    site: Site, rt: RtSettings, link: Link, poses: Poses, *, engine: Engine | None = None, progress: Progress = silent
+    site: Site,
+    rt: RtSettings,
+    link: Link,
+    poses: Poses,
+    *,
+    engine: Engine | None = None,
+    others: bool | None = None,
+    progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
 
@@ -359,9 +369,18 @@ def replay_poses(
         Carrier, power and arrays; its towers are those of ``site`` by name.
     poses : Poses
     engine : {"image", "sionna"}, optional
+    others : bool, optional
+        Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
     progress : Progress
         Share done; of the sionna engine alone.
+
+    Raises
+    ------
+    UsageError
+        ``rt.interactions`` besides reflection with ``rt.engine: image``; what a replay raises.
     """
+    check_interactions(rt)
+    others = engine is None if others is None else others
     engine = engine or rt.engine
     crowns = reflecting_crowns(site.trees, rt)
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
@@ -374,7 +393,7 @@ def replay_poses(
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
-    return replay(
+    found = replay(
         site,
         link,
         poses,
@@ -389,9 +408,24 @@ def replay_poses(
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         device=rt.device,
+        interactions=rt.interactions if others else ("reflection",),
+        scattering_coefficient=rt.scattering_coefficient if others else None,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
     )
+    if rt.other_interactions and not others:
+        found.left_out.append(NOT_IN_RANKS)
+    return found
+
+
+def check_interactions(rt: RtSettings) -> None:
+    """Refuse interactions that the engine has not; not in the settings, since ``--engine`` comes after them."""
+    if rt.other_interactions and rt.engine != "sionna":
+        raise UsageError(
+            f"rt.interactions: {', '.join(rt.interactions)} with engine {rt.engine!r}",
+            expected="rt.engine: sionna (or --engine sionna), or reflection alone",
+            cause="the image engine searches reflections exactly and knows no other interaction",
+        )
 
 
 def _joined_replays(parts: list[Replay]) -> Replay:

@@ -178,6 +178,7 @@ def audit(
     -------
     Audit
     """
+    replay = replay.of_reflections()  # the others have no second implementation: they are listed apart
     chosen = _spread(poses, None if links is None else -(-links // max(1, len(replay.towers))))
     other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])

@@ -7,15 +7,17 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from importlib import metadata
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from .. import __version__
 from ..common.files import read_sealed, write_sealed
-from ..common.units import FloatArray
+from ..common.units import AnyArray, FloatArray
+from .interactions import OtherPaths, OtherSearch
 from .paths import PathSet
 from .scene import Scene, Settings
 
@@ -46,7 +48,14 @@ class PathCache:
         self.folder = folder
         self.warnings: list[str] = []
 
-    def key(self, scene: Scene, targets_m: FloatArray, carrier_hz: float, settings: Settings) -> str:
+    def key(
+        self,
+        scene: Scene,
+        targets_m: FloatArray,
+        carrier_hz: float,
+        settings: Settings,
+        others: OtherSearch | None = None,
+    ) -> str:
         """Digest of everything that decides the paths.
 
         Parameters
@@ -59,6 +68,8 @@ class PathCache:
             Counts for Sionna alone: an image path is the same at every frequency.
         settings : Settings
             Engine, depth, samples and the rest.
+        others : OtherSearch, optional
+            Of an entry that holds paths with these interactions.
         """
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]
@@ -69,6 +80,8 @@ class PathCache:
             [*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()) if k not in ("threads", "device"))]
         )
         digest.update(text.encode())
+        if others is not None:
+            digest.update(f"\n{others}".encode())
         faces = scene.faces
         for polygon in faces.polygon:
             digest.update(b"-" if polygon is None else polygon.wkb)
@@ -81,6 +94,17 @@ class PathCache:
 
     def load(self, key: str) -> tuple[PathSet, float] | None:
         """Paths and the seconds that their search took; None where there is no whole entry (see ``warnings``)."""
+        columns = self._columns(key)
+        if columns is None:
+            return None
+        return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
+
+    def load_others(self, key: str) -> OtherPaths | None:
+        """Paths with other interactions; None as for :meth:`load`."""
+        columns = self._columns(key)
+        return None if columns is None else OtherPaths(**columns)
+
+    def _columns(self, key: str) -> dict[str, AnyArray] | None:
         place = self.folder / f"{key}.npz"
         try:
             entry = read_sealed(place, _SEAL)
@@ -92,11 +116,17 @@ class PathCache:
         if entry is None:
             return None
         with np.load(io.BytesIO(entry), allow_pickle=False) as columns:
-            return PathSet(*(columns[name] for name in _COLUMNS)), float(columns["seconds"])
+            return {name: columns[name] for name in columns.files}
 
     def save(self, key: str, paths: PathSet, seconds: float) -> None:
         """Write an entry; another process sees either nothing or all of it."""
-        columns = {column: getattr(paths, column) for column in _COLUMNS}
+        self._write(key, {"seconds": np.float64(seconds), **{column: getattr(paths, column) for column in _COLUMNS}})
+
+    def save_others(self, key: str, paths: OtherPaths) -> None:
+        """Write an entry of :meth:`load_others`."""
+        self._write(key, {one.name: getattr(paths, one.name) for one in fields(paths)})
+
+    def _write(self, key: str, columns: dict[str, Any]) -> None:
         entry = io.BytesIO()
-        np.savez(entry, seconds=np.float64(seconds), **columns)
+        np.savez(entry, **columns)
         write_sealed(self.folder / f"{key}.npz", entry.getvalue(), _SEAL)

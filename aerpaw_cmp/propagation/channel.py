@@ -229,6 +229,15 @@ def _mirror(normal: FloatArray, vector: AnyArray) -> AnyArray:
     return np.asarray(vector - 2.0 * (normal * vector).sum(axis=0) * normal)
 
 
+def radiated(array: Array, turn: FloatArray, direction: FloatArray) -> ComplexArray:
+    """Field vectors (3, paths, elements) in site axes of an array's elements in one direction (3, paths) per path.
+
+    ``turn`` (paths, 3, 3) turns the device into the site; directions point away from the device.
+    """
+    everywhere = np.broadcast_to(direction[:, :, None, None], (*direction.shape, 1, len(array)))
+    return _radiate(array, turn, everywhere, 3)[:, :, 0]
+
+
 def _radiate(array: Array, turn: FloatArray, direction: FloatArray, axis: int) -> ComplexArray:
     """Field vectors in site axes.
 

@@ -33,6 +33,7 @@ from ..site.materials import material
 from .arrays import Array, Link, Poses
 from .faces import inside, triangles
 from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
+from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
 from .paths import Faces, PathSet
 from .surfaces import Surfaces
 
@@ -57,6 +58,8 @@ LARGEST_BATCH = 100
 NO_SHAPE = 0xFFFFFFFF
 HALF_SPACE_THICKNESS_M = 10.0
 """Sionna knows slabs only; in this one no second echo returns. Its coefficients are not used for H."""
+WELD_M = 1e-3
+"""Corners of triangles this near are one: Sionna diffracts where two triangles share an edge."""
 EDGE_TOLERANCE_M = 1e-3
 """A float32 reflection point may lie this far outside its face."""
 
@@ -129,8 +132,14 @@ def _build(
     *,
     own_table: bool = False,
     surfaces: Surfaces | None = None,
+    wedges: bool = False,
+    scattering: float = 0.0,
 ) -> _Scene:
-    """Scene of the faces ``chosen``: one mesh per material; ``own_table`` takes Sionna's own constants of P.2040."""
+    """Scene of the faces ``chosen``: one mesh per material.
+
+    ``own_table`` takes Sionna's own constants of P.2040. ``wedges`` lets triangles share the corners in which they
+    meet, which is how Sionna knows an edge. ``scattering`` is the scattering coefficient of every material.
+    """
     import mitsuba as mi
     import sionna.rt as rt
 
@@ -143,21 +152,29 @@ def _build(
         members = [i for i in chosen if faces.material[i] == name]
         rows = np.flatnonzero(np.isin(owner, members))
         corners, place = np.unique(triangle[rows], return_inverse=True)
+        points = vertices[corners]
+        if wedges:
+            _, first, same = np.unique(np.round(points / WELD_M), axis=0, return_index=True, return_inverse=True)
+            points, place = points[first], same.reshape(-1)[place]
         plain = re.sub(r"[^a-z0-9_]+", "-", name)
-        mesh = mi.Mesh(f"faces-{plain}", vertex_count=len(corners), face_count=len(rows))
+        mesh = mi.Mesh(f"faces-{plain}", vertex_count=len(points), face_count=len(rows))
         parameters = mi.traverse(mesh)
-        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(vertices[corners], np.float32).ravel())
+        parameters["vertex_positions"] = mi.Float(np.ascontiguousarray(points, np.float32).ravel())
         parameters["faces"] = mi.UInt32(place.astype(np.uint32).ravel())
         parameters.update()
         objects.append(
-            rt.SceneObject(mi_mesh=mesh, name=f"faces-{plain}", radio_material=_material(name, carrier_hz, own_table))
+            rt.SceneObject(
+                mi_mesh=mesh,
+                name=f"faces-{plain}",
+                radio_material=_material(name, carrier_hz, own_table, scattering),
+            )
         )
         owners.append(owner[rows])
     scene.add(objects)
     return _Scene(scene, {int(o.object_id): f for o, f in zip(objects, owners, strict=True)})
 
 
-def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
+def _material(name: str, carrier_hz: float, own_table: bool, scattering: float = 0.0) -> Any:
     import sionna.rt as rt
 
     what = material(name)
@@ -171,7 +188,11 @@ def _material(name: str, carrier_hz: float, own_table: bool) -> Any:
             return rt.ITURadioMaterial(f"m-{plain}", name.partition(" with ")[0], thickness=thick)
     conductivity = -eta.imag * 2.0 * np.pi * carrier_hz * 8.8541878128e-12
     return rt.RadioMaterial(
-        f"m-{plain}", thickness=thick, relative_permittivity=float(eta.real), conductivity=float(conductivity)
+        f"m-{plain}",
+        thickness=thick,
+        relative_permittivity=float(eta.real),
+        conductivity=float(conductivity),
+        scattering_coefficient=scattering,
     )
 
 
@@ -232,6 +253,8 @@ class _Finder:
         Plane waves over the arrays, or each element its own end.
     patterns : (str, str)
         Sionna's names of the elements' patterns at the sources and at the targets.
+    flags : dict of str to bool
+        Arguments of PathSolver that switch interactions on.
     """
 
     def __init__(
@@ -243,12 +266,14 @@ class _Finder:
         *,
         synthetic: bool = True,
         patterns: tuple[str, str] = ("iso", "iso"),
+        flags: dict[str, bool] | None = None,
     ) -> None:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = SPECULAR_TABLE_SLOTS
         self.built, self.batch, self.synthetic = built, batch, synthetic
+        self.flags = {"diffuse_reflection": False, "refraction": False, "diffraction": False} | (flags or {})
         scene = built.scene
         arrays = (("tx_array", sources.elements_m, patterns[0]), ("rx_array", elements_m, patterns[1]))
         for name, elements, kind in arrays:
@@ -323,9 +348,7 @@ class _Finder:
             synthetic_array=self.synthetic,
             los=True,
             specular_reflection=max_depth > 0,
-            diffuse_reflection=False,
-            refraction=False,
-            diffraction=False,
+            **self.flags,
         )
 
     def _more_room(self) -> bool:
@@ -358,6 +381,10 @@ class _Finder:
 
     def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
         """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
+        return self.searched(targets_m, max_depth, samples)[1]
+
+    def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> tuple[Any, dict[str, Any]]:
+        """Sionna's paths of one batch, searched until there was room for all, and what :meth:`solve` gives."""
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         while max_depth and self._more_room():
@@ -369,7 +396,7 @@ class _Finder:
                 f"a tower has nearly {self.limit} paths in one batch, beyond which Sionna drops paths",
                 cause="take a smaller batch",
             )
-        return {
+        return paths, {
             "valid": valid[:count],
             "kind": paths.interactions.numpy()[:, :count],
             "shape": paths.objects.numpy()[:, :count],
@@ -443,6 +470,99 @@ def find_paths(
 
         found = without_coincident(found, surfaces)
     return found if excluded is None else found.select(~excluded[found.tower, found.pose])
+
+
+def find_others(
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    carrier_hz: float,
+    search: OtherSearch,
+    max_depth: int = 2,
+    samples: int = 1_000_000,
+    batch: int = 50,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    surfaces: Surfaces | None = None,
+    variant: str | None = None,
+    progress: Progress | None = None,
+) -> Iterator[OtherPaths]:
+    """Paths with an interaction that is no reflection, as Sionna has them: float32, nothing refined.
+
+    Parameters
+    ----------
+    faces, sources_m, targets_m, carrier_hz, max_depth, samples, batch, usable, excluded, surfaces, variant, progress
+        As in :func:`find_paths`; ``max_depth`` counts every interaction.
+    search : OtherSearch
+        Interactions besides the reflections, and the scattering coefficient.
+
+    Yields
+    ------
+    OtherPaths
+        Of each batch.
+    """
+    if not 1 <= batch <= LARGEST_BATCH:
+        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
+    load_variant(variant)
+    flags = {
+        "diffraction": search.diffraction,
+        "refraction": search.refraction,
+        "diffuse_reflection": search.scattering,
+    }
+    if search.diffraction:
+        flags["diffraction_lit_region"] = False  # where the direct path is there, phases would decide
+    alive = np.isfinite(targets_m).all(axis=1)
+    groups = list(_groups(faces, sources_m, usable))
+    for number, (towers, chosen) in enumerate(groups):
+        poses = np.flatnonzero(alive if excluded is None else alive & ~excluded[towers].all(axis=0))
+        if not len(poses):
+            continue
+        reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
+        scattering = search.scattering_coefficient if search.scattering else 0.0
+        built = _build(
+            faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=search.diffraction, scattering=scattering
+        )
+        with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch, flags=flags) as finder:
+            for start in range(0, len(poses), batch):
+                some = poses[start : start + batch]
+                found, raw = finder.searched(targets_m[some], max_depth, samples)
+                _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
+                part = _others(found, raw, built.face_of, some, towers)
+                yield part if excluded is None else part.select(~excluded[part.tower, part.pose])
+                if progress:
+                    progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
+        del built
+
+
+def _others(
+    found: Any, raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray
+) -> OtherPaths:
+    """The paths of one batch that are no chain of reflections."""
+    kind, shape, primitive = raw["kind"], raw["shape"], raw["primitive"]
+    receiver, tower, path = np.nonzero(raw["valid"] & (kind > REFLECTED).any(axis=0))
+    kinds = kind[:, receiver, tower, path].T.astype(np.int64)
+    hit = np.full(kinds.shape, -1, dtype=np.int64)
+    for number, owner in face_of.items():
+        # a diffracted path names a triangle beside the edge, which is no mirror
+        here = (kinds > 0) & (kinds != DIFFRACTED) & np.equal(shape[:, receiver, tower, path].T, number)
+        hit[here] = owner[primitive[:, receiver, tower, path].T[here]]
+    vertices = np.moveaxis(found.vertices.numpy()[:, receiver, tower, path], 0, 1).astype(np.float64)
+    vertices[kinds == 0] = np.nan
+    real, imaginary = (np.asarray(part.numpy())[receiver, :, tower, :, path] for part in found.a)
+    angles = [
+        getattr(found, f"{name}_{end}").numpy()[receiver, tower, path] for end in "tr" for name in ("theta", "phi")
+    ]
+    return OtherPaths(
+        pose=poses[receiver],
+        tower=towers[tower],
+        kinds=kinds,
+        faces=hit,
+        vertices_m=vertices,
+        jones=(real + 1j * imaginary).astype(np.complex128),
+        departure_rad=np.stack(angles[:2], axis=1).astype(np.float64),
+        arrival_rad=np.stack(angles[2:], axis=1).astype(np.float64),
+    ).once()
 
 
 @dataclass(frozen=True, slots=True)
@@ -732,4 +852,12 @@ def _relocate(
     return np.asarray(result)
 
 
-__all__ = ["Coefficients", "engine_versions", "find_paths", "load_variant", "own_channels", "own_coefficients"]
+__all__ = [
+    "Coefficients",
+    "engine_versions",
+    "find_others",
+    "find_paths",
+    "load_variant",
+    "own_channels",
+    "own_coefficients",
+]

@@ -5,7 +5,8 @@ from __future__ import annotations
 import os
 import time
 import warnings
-from collections.abc import Callable, Iterable, Iterator
+from collections import Counter
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -14,7 +15,7 @@ from typing import Any, Literal
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.units import BoolArray, ComplexArray, FloatArray
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
 from ..site.site import Site
 from . import image
 from .arrays import Array, Link, Poses
@@ -23,6 +24,14 @@ from .channel import channel_matrices, mean_pair_power, rss_dbm
 from .compiled import ENOUGH_WORK
 from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
+from .interactions import (
+    SCATTERING_SAMPLES,
+    OtherInteractions,
+    OtherPaths,
+    OtherSearch,
+    other_searches,
+    path_powers,
+)
 from .paths import Faces, PathSet
 from .relevance import idle_objects, in_words
 from .samples import Choice, Samples, enough_samples, spread
@@ -70,6 +79,9 @@ class Replay:
         Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
     surfaces : Surfaces, optional
         What the faces are made of, where the site is a scene of triangles.
+    other : OtherInteractions, optional
+        What diffraction, scattering and refraction add to both levels and to ``has_path``, where they were asked for;
+        ``h`` and ``paths`` are of reflections alone.
     """
 
     rss_dbm: FloatArray
@@ -88,6 +100,16 @@ class Replay:
     samples_reason: str = ""
     pairs_differ: BoolArray | None = None
     surfaces: Surfaces | None = None
+    other: OtherInteractions | None = None
+
+    def of_reflections(self) -> Replay:
+        """The replay without what other interactions add: what its paths and H are."""
+        other = self.other
+        if other is None:
+            return self
+        return replace(
+            self, rss_dbm=other.rss_dbm, rss_power_dbm=other.rss_power_dbm, has_path=other.has_path, other=None
+        )
 
     def __repr__(self) -> str:
         """One line: the arrays are too large to be shown."""
@@ -150,6 +172,8 @@ def replay(
     threads: int | None = None,
     device: Device = "auto",
     whole: Whole | None = None,
+    interactions: Sequence[str] = ("reflection",),
+    scattering_coefficient: float | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -193,6 +217,11 @@ def replay(
         alone evaluates it on a GPU).
     whole : Whole, optional
         What the poses are a part of; see :func:`replay_parts`.
+    interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
+        ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
+        (:mod:`aerpaw_cmp.propagation.interactions`).
+    scattering_coefficient : float, optional
+        Of every material, where "scattering" is asked for.
     progress : callable, optional
         Called with the share done.
 
@@ -203,7 +232,8 @@ def replay(
     Raises
     ------
     UsageError
-        Unknown tower or engine, a scene too large for ``image``, a ``relevance_db`` that is not positive.
+        Unknown tower or engine, a scene too large for ``image``, a ``relevance_db`` that is not positive, other
+        interactions than reflections with ``image``.
     """
     if engine not in ("image", "sionna"):
         raise UsageError(f"unknown engine {engine!r}", expected="'image' or 'sionna'")
@@ -215,6 +245,14 @@ def replay(
         )
     if relevance_db is not None and not relevance_db > 0.0:
         raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
+    searches = other_searches(interactions, scattering_coefficient)
+    if searches and (engine != "sionna" or max_depth == 0):
+        raise UsageError(
+            f"interactions {', '.join(interactions)} with "
+            + (f"engine {engine!r}" if engine != "sionna" else "max_depth 0"),
+            expected="engine 'sionna' and a max_depth of 1 or more, or reflections alone",
+            cause="the image engine knows reflections; every interaction counts in max_depth",
+        )
     started = time.perf_counter()
     poses, refused = _within_reach(site, poses)
     scene = Scene.of(site, link, poses)
@@ -239,8 +277,14 @@ def replay(
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
+    others = None
+    if searches:
+        others = _other_powers(site, scene, link, poses, settings, searches, loss, cache)
+        left_out.append(NOT_IN_RANKS)
     result, idle = _evaluate(scene, link, poses, paths, settings, loss, relevance_db)
     left_out += idle
+    if others is not None:
+        result = _with_others(result, link, tuple(interactions), *others)
     if visibility == "pairs":
         small = drop_small_faces
         result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
@@ -557,6 +601,104 @@ def _search(
     )
 
 
+NOT_IN_RANKS = "other interactions than reflections in H and ranks: their power is added to RSS alone"
+
+
+def _other_powers(
+    site: Site,
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    searches: Sequence[OtherSearch],
+    loss: Loss | None,
+    cache: PathCache | None,
+) -> tuple[FloatArray, IntArray, dict[str, int]]:
+    """Power and number (poses, towers) of the paths with other interactions, and what they are made of."""
+    shape = (len(poses), len(scene.sources_m))
+    power, count, kinds = np.zeros(shape), np.zeros(shape, dtype=np.int64), Counter[str]()
+    for search in searches:
+        for found in _others(scene, link, poses, settings, search, cache):
+            clear = _clear_of_terrain(site, scene, poses, found.geometry)
+            paths = found.select(clear)
+            loss_db = None if loss is None else loss(paths.reflections, scene.sources_m, poses.position_m)
+            if loss_db is not None:
+                paths, loss_db = paths.select(np.isfinite(loss_db)), loss_db[np.isfinite(loss_db)]
+            np.add.at(power, (paths.pose, paths.tower), path_powers(paths, link, poses, loss_db))
+            np.add.at(count, (paths.pose, paths.tower), 1)
+            kinds.update(paths.named())
+    return power, count, dict(sorted(kinds.items()))
+
+
+def _others(
+    scene: Scene, link: Link, poses: Poses, settings: Settings, search: OtherSearch, cache: PathCache | None
+) -> Iterator[OtherPaths]:
+    """Paths of one search, batch by batch; scattered ones, of which each link has hundreds, are not kept."""
+    cache = None if search.scattering else cache
+    samples = min(settings.samples, SCATTERING_SAMPLES) if search.scattering else settings.samples
+    key = cache.key(scene, poses.position_m, link.carrier_hz, settings, search) if cache else ""
+    kept = cache.load_others(key) if cache else None
+    if kept is not None:
+        yield kept
+        return
+    from . import sionna
+
+    batches = sionna.find_others(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        carrier_hz=link.carrier_hz,
+        search=search,
+        max_depth=settings.max_depth,
+        samples=samples,
+        batch=settings.batch,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        surfaces=scene.surfaces,
+        variant=settings.variant,
+    )
+    if cache is None:
+        yield from batches
+        return
+    found = OtherPaths.joined(batches, settings.max_depth)
+    cache.save_others(key, found)
+    yield found
+
+
+def _with_others(
+    result: Replay,
+    link: Link,
+    asked: tuple[str, ...],
+    power: FloatArray,
+    count: IntArray,
+    kinds: dict[str, int],
+) -> Replay:
+    """Levels with the power of other interactions: a level never falls by it."""
+    other = OtherInteractions(
+        asked=asked,
+        power=power,
+        paths=count,
+        kinds=kinds,
+        rss_dbm=result.rss_dbm,
+        rss_power_dbm=result.rss_power_dbm,
+        has_path=result.has_path,
+    )
+
+    def raised(known: FloatArray) -> FloatArray:
+        own = np.where(np.isfinite(known), power_from_db(np.nan_to_num(known) - link.transmit_power_dbm), 0.0)
+        summed = rss_dbm(own + power, link.transmit_power_dbm, link.noise_floor_dbm)
+        return np.asarray(np.where(power > 0.0, summed, known))
+
+    level = raised(result.rss_dbm)
+    return replace(
+        result,
+        rss_dbm=level,
+        rss_power_dbm=raised(result.rss_power_dbm),
+        has_path=result.has_path | np.isfinite(level),
+        other=other,
+    )
+
+
 def _pairs(link: Link, poses: Poses) -> int:
     """Element pairs of all links."""
     return len(poses) * sum(len(array) for array in link.tower_arrays.values()) * len(link.uav_array)
@@ -578,6 +720,17 @@ def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tu
     """
     if site.dem is None or len(paths) == 0:
         return paths, []
+    clear = _clear_of_terrain(site, scene, poses, paths)
+    lost = int((~clear).sum())
+    return paths.select(clear), [
+        f"{lost} of {len(paths)} paths end at the terrain of the elevation model"
+    ] if lost else []
+
+
+def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
+    """Paths (paths,) that the elevation model lets through."""
+    if site.dem is None or len(paths) == 0:
+        return np.ones(len(paths), dtype=np.bool_)
     source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
     ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
     over_ground = ground[paths.faces].any(axis=1)
@@ -592,10 +745,7 @@ def _above_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> tu
         end = np.where(np.isfinite(corner), corner, target[rows])
         clear[rows] &= site.dem.clear(start, end)
         start = end
-    lost = int((~clear).sum())
-    return paths.select(clear), [
-        f"{lost} of {len(paths)} paths end at the terrain of the elevation model"
-    ] if lost else []
+    return clear
 
 
 def _evaluate(

@@ -131,6 +131,7 @@ def _engine_metrics(engine: Engine) -> dict[str, Any]:
         "seconds": engine.seconds,
         "paths": engine.paths,
         "left_out": list(engine.left_out),
+        **({} if engine.other_interactions is None else {"other_interactions": dict(engine.other_interactions)}),
         "audit": None
         if audit is None
         else {

@@ -22,6 +22,8 @@ INTERNAL_ERROR = 70
 INTERRUPTED = 130
 BROKEN_PIPE = 141
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
+_SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
+"""Typer's word for: do not look for a shell above this process (there may be none), it stands on the command line."""
 """Set by a shell that asks what may follow on the line."""
 ISSUES = "the project's issue tracker"
 
@@ -134,6 +136,8 @@ def main(arguments: list[str] | None = None) -> int:
     debug = "--debug" in before_dashes or os.environ.get("AERPAW_CMP_DEBUG", "0") not in ("", "0")
     if "--debug" in before_dashes:
         arguments.remove("--debug")
+    if arguments[:1] in (["--install-completion"], ["--show-completion"]) and len(arguments) > 1:
+        os.environ.setdefault(_SHELL_IS_NAMED, "1")
     try:
         code = _quick_answer(arguments)
         return _run(arguments) if code is None else code

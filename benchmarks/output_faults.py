@@ -447,14 +447,14 @@ def plant() -> None:
     @contextlib.contextmanager
     def in_place(self: outputs.OutputFolder) -> Iterator[Path]:
         self.target.mkdir(parents=True, exist_ok=True)
-        with outputs.told(self.named):
+        with outputs.explained_os_errors(self.named):
             yield self.target
             names = [p for p in self.target.rglob("*") if p.is_file() and p.name not in (outputs.SUMS, FOREIGN)]
             rows = "".join(f"{_digest(p)}  {p.relative_to(self.target).as_posix()}\n" for p in sorted(names))
             (self.target / outputs.SUMS).write_text(f"# aerpaw-cmp: planted\n{rows}")
 
     def straight(self: outputs.OutputFile, content: bytes) -> None:
-        with outputs.told(self.named):
+        with outputs.explained_os_errors(self.named):
             self.target.write_bytes(content)
 
     outputs.OutputFolder.filling = in_place  # type: ignore[method-assign]

@@ -390,7 +390,7 @@ def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float
 
 def mean_pair_power(h: ComplexArray) -> FloatArray:
     """Mean over the last two axes of ``|h|^2``; tiny and huge channels neither vanish nor overflow."""
-    parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], -1)
+    parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], 2 * h.shape[-2] * h.shape[-1])
     pairs = max(parts.shape[-1] // 2, 1)
     with np.errstate(over="ignore", under="ignore"):
         power = np.asarray(np.einsum("...i,...i->...", parts, parts) / pairs)

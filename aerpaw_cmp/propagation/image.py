@@ -275,7 +275,7 @@ def _grow(
                 f"the scene has more than {budget} face sequences of {now.shape[1] + 1} reflections "
                 f"({len(faces)} faces)",
                 expected="a rural scene with few faces",
-                cause="pip install 'aerpaw-cmp[fast]' searches such scenes; or a smaller max_depth",
+                cause="many buildings: engine 'sionna', a smaller max_depth, or pip install 'aerpaw-cmp[fast]'",
             )
     return Sequences(np.concatenate(grown), np.concatenate(images))
 

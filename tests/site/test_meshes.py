@@ -79,7 +79,7 @@ def test_conductivity_gives_gamma() -> None:
 
 def test_export_is_well_formed(tmp_path: Path) -> None:
     path, *parts = export_scene(load_site("lake_wheeler"), tmp_path / "scene")
-    assert {part.stem for part in parts} == {"medium_dry_ground", "concrete", "wood", "vegetation"}
+    assert {part.stem for part in parts} == {"all_medium_dry_ground", "all_concrete", "all_wood", "all_vegetation"}
     root = ElementTree.parse(path).getroot()
     ids = {bsdf.get("id") for bsdf in root.iter("bsdf")}
     assert {ref.get("id") for ref in root.iter("ref")} == ids

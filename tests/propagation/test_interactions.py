@@ -93,6 +93,10 @@ def test_paths_found_twice_are_one_and_parts_join(scenes):
     moved = replace(paths, vertices_m=np.ones((2, 1, 3)))
     assert len(OtherPaths.joined([paths, moved], 1).once()) == 4
     assert twice.named() == {"refraction": 4}
+    nothing = OtherPaths.empty(2)
+    assert (len(nothing.once()), nothing.named(), len(nothing.reflections)) == (0, {}, 0)
+    assert path_powers(nothing, scenes.link(site), poses).shape == (0,)
+    assert len(OtherPaths.joined([], 2)) == 0
     assert summary([])["median_power_share"] is None
 
 

@@ -118,9 +118,11 @@ class OtherPaths:
 
     def once(self) -> OtherPaths:
         """Each path once, in the order of poses and towers: an edge is found from both of its faces."""
+        if not len(self):
+            return self
         points = np.nan_to_num(np.round(self.vertices_m / SAME_M), nan=-1.0).reshape(len(self), -1)
         keys = np.column_stack([self.pose, self.tower, self.kinds, points.astype(np.int64)])
-        return self.select(np.unique(keys, axis=0, return_index=True)[1]) if len(self) else self
+        return self.select(np.unique(keys, axis=0, return_index=True)[1])
 
     @property
     def geometry(self) -> PathSet:

@@ -633,7 +633,7 @@ def own_coefficients(
                     some = np.arange(start, min(start + batch, len(poses)))
                     target = _Ends(poses.position_m[some], turns[1][some], np.zeros((1, 3)))
                     part, gain = _raw_paths(finder, built, target, some, towers, max_depth, samples)
-                    weights = _slants(probe.uav_array), np.stack([_slants(arrays[t]) for t in part.tower])
+                    weights = _slants(probe.uav_array), np.stack([_slants(array) for array in arrays])[part.tower]
                     gains.append(np.einsum("pab,au,pbv->puv", gain, weights[0], weights[1]))
                     pieces.append(part)
             del built

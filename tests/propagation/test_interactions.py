@@ -12,7 +12,12 @@ from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight.settings import RtSettings
 from aerpaw_cmp.jobs.replay import check_interactions
 from aerpaw_cmp.propagation import interactions
-from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
+from aerpaw_cmp.propagation.arrays import (
+    rotation_from_aircraft,
+    single_element,
+    tower_comparison_array,
+    uav_comparison_array,
+)
 from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.channel import channel_matrices
 from aerpaw_cmp.propagation.interactions import OtherPaths, other_searches, path_powers, summary
@@ -93,6 +98,10 @@ def test_paths_found_twice_are_one_and_parts_join(scenes):
     moved = replace(paths, vertices_m=np.ones((2, 1, 3)))
     assert len(OtherPaths.joined([paths, moved], 1).once()) == 4
     assert twice.named() == {"refraction": 4}
+    nothing = OtherPaths.empty(2)
+    assert (len(nothing.once()), nothing.named(), len(nothing.reflections)) == (0, {}, 0)
+    assert path_powers(nothing, scenes.link(site), poses).shape == (0,)
+    assert len(OtherPaths.joined([], 2)) == 0
     assert summary([])["median_power_share"] is None
 
 
@@ -192,6 +201,25 @@ def test_diffraction_behind_a_roof_is_that_of_a_wedge(sionna, scenes, name):
         assert (level < hard + 0.2).all()
         assert level == pytest.approx(knife, abs=3.0 if name == "metal" else 2.0)
         assert level[-1] == pytest.approx(knife[-1], abs=0.5)
+
+
+@pytest.mark.sionna
+def test_sionnas_coefficients_of_reflections_have_the_power_of_h(sionna, scenes, monkeypatch):
+    """Its reflected paths taken as if they were others: bases, slants, patterns and attitude, cross terms too."""
+    monkeypatch.setattr(sionna, "REFLECTED", -1)
+    site = hall(scenes, "concrete", towers=((25.0, 15.0, 4.0),))
+    rng = np.random.default_rng(8)
+    angles = rng.uniform(-25, 25, (3, 10))
+    turns = rotation_from_aircraft(angles[0], angles[1], 14 * angles[2])
+    poses = scenes.poses(rng.uniform([10, -10, 10], [30, 10, 14], (10, 3)), turns)
+    one = replace(single_element(TR38901()), slant_rad=np.array([0.6]))
+    link = scenes.link(site, one, replace(single_element(), slant_rad=np.array([-0.9])))
+    plain = replay(site, link, poses)
+    assert (np.bincount(plain.paths.pose) > 2).sum() > 7
+    found = replay(site, link, poses, "sionna", interactions=("reflection", "refraction"), **SEARCH)
+    assert found.other.paths.sum() == len(plain.paths)
+    level = 10 * np.log10(found.other.power) + link.transmit_power_dbm
+    assert level == pytest.approx(plain.rss_power_dbm, abs=0.02)
 
 
 def slab_transmission(name, carrier_hz):

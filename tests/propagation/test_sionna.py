@@ -284,3 +284,15 @@ def test_scenes_are_freed(sionna, scenes, lone):
         )
     gc.collect()
     assert not [item for item in gc.get_objects() if isinstance(item, Scene)]
+
+
+def test_coefficients_of_links_without_a_path(sionna, scenes):
+    site = scenes.site([Building("barn", box(30, -10, 50, 10), 8.0)])
+    poses, link = scenes.poses([[52.0, 0, 1.0]]), scenes.link(site, tower_comparison_array(), tower_comparison_array())
+    probe, _ = field_audit._probe(link)
+    scene = Scene.of(site, link, poses)
+    found = sionna.own_coefficients(
+        scene.faces, scene.sources_m, poses, probe, (np.eye(3)[None], poses.rotation),
+        usable=scene.usable, excluded=scene.excluded, samples=1000, batch=BATCH,
+    )  # fmt: skip
+    assert (len(found.paths), found.gain.shape) == (0, (0, 2, 2))

@@ -17,7 +17,7 @@ from .arrays import Array, Link, Pattern, Poses
 from .compiled import column, in_threads
 from .paths import Faces, PathSet
 
-PATHS_PER_CHUNK = 8192
+PATHS_PER_CHUNK = 4096
 """Paths of a call of the kernel: some milliseconds of work for a thread."""
 
 

@@ -103,6 +103,13 @@ def evaluate(
     device : {"cpu", "cuda"}
         "cuda" where patterns are formulas; links with other patterns are evaluated on the CPU.
 
+    Returns
+    -------
+    h : (poses, towers, n_rx, n_tx) complex
+        Coherent sum over paths; zero without a path.
+    power : (paths,)
+        Mean over element pairs of ``|h|^2`` of each path alone.
+
     Raises
     ------
     UsageError

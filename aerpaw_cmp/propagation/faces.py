@@ -299,6 +299,8 @@ def smaller_than_fresnel_zone(
     sources_m, targets_m : (s, 3), (n, 3)
         Ends of the links [m].
     frequency_hz : float
+    area_m2 : (faces,), optional
+        Areas of the faces [m^2].
 
     Returns
     -------

@@ -251,6 +251,11 @@ class Sequences:
             Most reflections; most sequences of one depth.
         tolerance_m : float
             A point this far behind a face still counts as before it [m].
+
+        Returns
+        -------
+        list of Sequences
+            One per depth, from the line of sight on; shorter where no sequence is left.
         """
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]

@@ -171,7 +171,7 @@ def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.Monkey
     for i, size in enumerate((30, 90, 1, 250, 7, 600)):
         more = {
             "line": np.arange(size),
-            "flag": np.array([f"reason_{i}_{n % 90}" if n % 3 else "" for n in range(size)], dtype=object),
+            "flag": np.array([f"reason_{i}_{n % 400}" if n % 3 else "" for n in range(size)], dtype=object),
             "level": np.arange(size) + (0.5 if i > 2 else 0),
         }
         more["level"] = more["level"].astype(np.float64 if i > 2 else np.int64)

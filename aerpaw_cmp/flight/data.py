@@ -326,6 +326,11 @@ def gather(
     logs_root : Path, optional
         Where logs and antenna files resolve, in place of ``folder``.
 
+    Returns
+    -------
+    FlightData
+        Site, track and series, with the warnings of the logs.
+
     Raises
     ------
     UsageError

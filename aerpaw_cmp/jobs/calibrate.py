@@ -136,6 +136,11 @@ def calibrate(
     workers : Workers, optional
         Share the scores and the controls.
 
+    Returns
+    -------
+    Calibration
+        What was learned, its scores on flights left out, and the controls.
+
     Raises
     ------
     UsageError
@@ -432,7 +437,28 @@ class ScoreOrder:
 def score_on(
     workers: Workers, path: Path, logs_root: Path | None, recipe: Recipe
 ) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
-    """What :func:`score_all` gives, by workers that read the flights themselves."""
+    """What :func:`score_all` gives, by workers that read the flights themselves.
+
+    Parameters
+    ----------
+    workers : Workers
+    path : Path
+        calibration.yaml, as the workers reach it.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    recipe : Recipe
+        Says which controls there are.
+
+    Returns
+    -------
+    scores, controls : dict of str to tuple of Score
+        By kind of what is left out, and by control.
+
+    Raises
+    ------
+    InputError
+        A worker was lost, or could not score its part.
+    """
     stamp = uuid.uuid4().hex
     names = ["", *_controls((), recipe)]
     orders = [ScoreOrder(path=path, logs_root=logs_root, control=name, stamp=stamp) for name in names]

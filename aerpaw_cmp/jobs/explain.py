@@ -118,6 +118,11 @@ def run_explain(
     logs_root : Path, optional
     progress : Progress
 
+    Returns
+    -------
+    Explanation
+        The paths of the link with their losses [dB], what is not there and why.
+
     Raises
     ------
     UsageError

@@ -147,6 +147,11 @@ def report_plan(
         As for the report.
     force : bool
 
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
     Raises
     ------
     UsageError, InputError
@@ -251,6 +256,16 @@ def map_plan(
     flight : Path, optional
         Whose track trains the test "along a flight".
     force : bool
+
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
+    Raises
+    ------
+    UsageError
+        There is no such flight file; the output is an input, or holds files of others.
     """
     from ..maps.grid import Grid
     from .coverage_map import make_maps

@@ -70,6 +70,16 @@ def run_ingest(
     force : bool
     options
         Fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
+
+    Returns
+    -------
+    dict
+        What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``.
+
+    Raises
+    ------
+    UsageError, InputError, OutputError
+        With what was found, expected, and the likely cause.
     """
     from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -122,6 +132,16 @@ def run_simulate(
     force : bool
     progress : Progress
         Gets the name of each log.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    UsageError, OutputError
+        As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
@@ -183,6 +203,10 @@ def run_report(
         ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
     progress : Progress
 
+    Returns
+    -------
+    ReportOutcome
+
     Raises
     ------
     UsageError, InputError
@@ -233,7 +257,26 @@ def plan_report(
     figures: str = "page",
     force: bool = False,
 ) -> Any:
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing.
+
+    Parameters
+    ----------
+    flight : Path
+    out, logs_root : Path, optional
+    engine, audit : str, optional
+    figures : str
+    force : bool
+        As for :func:`run_report`.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    UsageError, InputError
+        What the report itself would raise of its settings, logs and output.
+    """
     from ..flight.settings import load_flight
     from .plan import report_plan
 
@@ -273,6 +316,11 @@ def run_audit(
     force : bool
         Replace also what was changed in the folder by hand.
     progress : Progress
+
+    Returns
+    -------
+    ReportOutcome
+        Of the report made anew.
 
     Raises
     ------
@@ -464,6 +512,16 @@ def run_site_import(
         What areas without a tag are: building, forest or geofence.
     force : bool
         Replace a file that this tool did not write.
+
+    Returns
+    -------
+    list of str
+        A line per thing that was done.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
     """
     from ..site.footprints import import_site, site_yaml
 
@@ -504,6 +562,16 @@ def run_site_show(
         Also the scene as PLY and Mitsuba XML.
     force : bool
         Replace files that this tool did not write.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    UsageError
+        A pose without a flight, or one that the track does not have.
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
@@ -643,10 +711,25 @@ def run_map(
         A coarse map; what ``options`` state still counts.
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
+    logs_root : Path, optional
+        Folder against which its logs resolve.
     workers, scheduler
         Who evaluates the pieces of the grid: workers of this machine, or of a Dask scheduler.
+    force : bool
+        Write into a folder that holds files of others.
+    progress : Progress
+        Stage and share done.
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
+
+    Returns
+    -------
+    MapsOutcome
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
     """
     from ..common.versions import versions
     from ..report.maps_html import maps_metrics, write_maps
@@ -706,7 +789,25 @@ def plan_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None, force: bool = False,
     **options: Any,
 ) -> Any:  # fmt: skip
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing."""
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing.
+
+    Parameters
+    ----------
+    site : str
+    out, flight : Path, optional
+    quick, force : bool
+    options
+        As for :func:`run_map`.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    UsageError
+        What the map itself would raise of its settings and output.
+    """
     from .plan import map_plan
 
     inputs = [Path(site), *([] if flight is None else [flight])]
@@ -783,6 +884,10 @@ def run_campaign(
         Formats of the samples of the first setting, besides those that campaign.yaml names.
     progress : Progress
 
+    Returns
+    -------
+    CampaignOutcome
+
     Raises
     ------
     UsageError
@@ -854,7 +959,30 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 def campaign_status(
     path: Path, *, logs_root: Path | None = None, keep: str | None = None, fresh: bool = False, workers: int = 1
 ) -> Any:
-    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`)."""
+    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`).
+
+    Parameters
+    ----------
+    path : Path
+        campaign.yaml.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    keep : str, optional
+        Folder or URL of the outcomes, in place of what campaign.yaml says.
+    fresh : bool
+        As though nothing were kept.
+    workers : int
+        Tasks side by side, for the time.
+
+    Returns
+    -------
+    CampaignStatus
+
+    Raises
+    ------
+    UsageError
+        A campaign.yaml that is wrong.
+    """
     from . import campaign_plan
     from .campaign import campaign_tasks, load_campaign
 
@@ -899,6 +1027,10 @@ def run_calibrate(
         Replace also what this tool did not write; never an input.
     progress : Progress
         Stage and share done.
+
+    Returns
+    -------
+    CalibrateOutcome
 
     Raises
     ------

@@ -136,6 +136,13 @@ def ground_nodes(
     warnings : list of str, optional
         Takes what is to be said of the tracks.
 
+    Returns
+    -------
+    Site
+        A node that moves stands in the middle of its positions.
+    dict of str to Track
+        Of the nodes that move, by name.
+
     Raises
     ------
     UsageError

@@ -516,6 +516,11 @@ def fields_from(
     poses : Poses
     loss : callable or None
         Loss per path [dB].
+
+    Returns
+    -------
+    Fields
+        H (poses, 1, n_rx, n_tx) and powers.
     """
     loss_db = loss_along(loss, paths, sources_m, poses.position_m)
     if len(sources_m) == 1:

@@ -291,6 +291,11 @@ def moving_matrices(
         With one tower.
     loss_db : (paths,), optional
         Further loss of each path.
+
+    Returns
+    -------
+    Fields
+        H (poses, 1, n_rx, n_tx) and powers.
     """
     (name,) = _one_tower(link)
     ports, uav = len(link.tower_arrays[name]), len(link.uav_array)
@@ -328,6 +333,12 @@ def loss_along(loss: Loss | None, paths: PathSet, sources_m: FloatArray, targets
     sources_m : (1 or poses, 3)
         Place of the one tower, at all poses or at each [m].
     targets_m : (poses, 3)
+        Of the UAV [m].
+
+    Returns
+    -------
+    (paths,) or None
+        Loss [dB].
     """
     if loss is None:
         return None

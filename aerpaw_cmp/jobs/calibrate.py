@@ -30,7 +30,7 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import RATIOS, SNR, FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
@@ -192,7 +192,7 @@ def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None
     for name in settings.flights:
         path = folder / name
         flight = load_flight(path)
-        out.append(gather(flight, path.parent, read_logs(flight, path.parent, logs_root), logs_root))
+        out.append(load_data(flight, path.parent, logs_root))
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:

@@ -157,11 +157,11 @@ def report_plan(
     UsageError, InputError
         What the report itself would raise of its settings, logs and output.
     """
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
 
     OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
     start = time.process_time()
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}

@@ -508,9 +508,24 @@ def merge(
     in_order: bool = False,
     threads: int | None = 1,
 ) -> PathSet:
-    """One sorted set of several; with ``faces``, of paths over coplanar faces that overlap only one is kept.
+    """One sorted set of several.
 
-    ``in_order`` says that the pieces, one after another, are sorted.
+    Parameters
+    ----------
+    pieces : list of PathSet
+    max_depth : int
+        Of the set where there is no path at all.
+    faces : Faces or None
+        Where given, of paths over coplanar faces that overlap only one is kept.
+    in_order : bool
+        The pieces, one after another, are sorted.
+    threads : int, optional
+        That copy; default: the cores that this process may use.
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces.
     """
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:

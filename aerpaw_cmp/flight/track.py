@@ -7,7 +7,7 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Literal
 
 import numpy as np
@@ -110,6 +110,12 @@ class TrackPoses:
 
     def __len__(self) -> int:
         return len(self.valid)
+
+    def pick(self, rows: BoolArray) -> TrackPoses:
+        """The poses of some rows (n,) bool; the very same where these are all of them."""
+        if rows.all():
+            return self
+        return TrackPoses(**{one.name: getattr(self, one.name)[rows] for one in fields(self)})
 
     @property
     def reason(self) -> AnyArray:

@@ -43,7 +43,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
+    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; all else has those alone."""
 
     link: Link
     poses: Poses
@@ -88,20 +88,21 @@ def replay_rss(
     for members in groups.values():
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
-        tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
+        whole_tracks = (_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members)
+        valid, tracks = zip(*((track.valid, track.pick(track.valid)) for track in whole_tracks), strict=True)
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
-        whole = replay_poses(data.site, rt, link, joined, progress=progress)
+        found = replay_poses(data.site, rt, link, joined, progress=progress)
         start = 0
-        for index, track, part in zip(members, tracks, poses, strict=True):
+        for index, here, track, part in zip(members, valid, tracks, poses, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
                 link=link,
                 poses=part,
-                valid=track.valid,
-                replay=part_of(whole, start, stop),
+                valid=here,
+                replay=part_of(found, start, stop),
                 track=track,
                 clock=shifts[index],
             )
@@ -309,11 +310,11 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
     for series in data.rank:
         link = data.settings.link.rank.build([series.tower], data.folder)
         position, valid = rank_positions(series, data.track)
-        track = None if data.track is None else _track_poses(data.track, series.time)
-        rotation = np.tile(np.eye(3), (len(position), 1, 1))
+        track = None if data.track is None else _track_poses(data.track, series.time).pick(valid)
+        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
-        poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
+        poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
         found = replay_poses(data.site, data.settings.rt, link, poses, others=False, progress=progress)
@@ -342,10 +343,9 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def _poses(track: TrackPoses, attitude: str) -> Poses:
-    rotation = attitude_rotation(track, attitude)
-    if track.valid.all():  # the very arrays of the track: a long flight has one copy of them
-        return Poses(track.position_m, np.ascontiguousarray(rotation))
-    return Poses(track.position_m[track.valid], np.ascontiguousarray(rotation[track.valid]))
+    """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
+    some = track.pick(track.valid)
+    return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
 
 def replay_poses(

@@ -146,6 +146,11 @@ def run(
     stage, progress : callable
         A context manager per named stage; lines of progress.
 
+    Returns
+    -------
+    CampaignData
+        Rows of every flight and setting, pooled offsets, repeats, folds; a flight that failed is among ``failures``.
+
     Raises
     ------
     UsageError

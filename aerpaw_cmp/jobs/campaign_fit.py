@@ -175,6 +175,13 @@ def fit_all(
         Search between the values, too.
     spread : callable, optional
         Computes the errors of all combinations of values, flight by flight, on workers: the same numbers, sooner.
+    progress : Progress
+        Gets what is fitted.
+
+    Returns
+    -------
+    list of HeldOutFold
+        One with ``fit_on``, else one per flight, which is left out of it.
 
     Raises
     ------
@@ -255,6 +262,11 @@ def search(
         Names of the flights to fit on.
     refine : bool
         Search between the values, too (where all combinations are tried).
+
+    Returns
+    -------
+    Search
+        The best values, those at the end of their list, and how many points were looked at.
     """
 
     def objective(point: Mapping[str, float], flight: str) -> FloatArray:

@@ -153,6 +153,11 @@ def fit_rank_all(
         Evenly spread reports per series that the search looks at; all are scored.
     progress : Progress
 
+    Returns
+    -------
+    list of RankHeldOutFold
+        One with ``fit_on``, else one per flight, which is left out of it.
+
     Raises
     ------
     UsageError

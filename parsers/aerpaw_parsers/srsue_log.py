@@ -37,7 +37,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
             rsrp_dbm=rsrp[i],
             serving=True,
             beside=(np.nan, np.nan, snr[i], loss[i]),
-        )
+        )  # fmt: skip
         for i in range(len(rows))
     ]
     yield from _cells.streams(rows, readings, source="srsUE")

@@ -16,13 +16,13 @@ from ..compare.result import FoliageLoss, FoliageRankChange
 from ..flight.data import RssSeries
 from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
-from ..propagation.channel import Fields, channel_matrices, mean_pair_power, rss_dbm
+from ..propagation.channel import Fields, mean_pair_power, rss_dbm
 from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from ..propagation.tracer import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
-from .replay import Replayed, attitude_rotation, path_loss
+from .replay import Replayed, attitude_rotation, fields_from, path_loss
 
 LEAVES = ("in", "out")
 
@@ -53,10 +53,7 @@ def evaluate(
         H (poses, towers, n_rx, n_tx) and the power of each path.
     """
     link, poses = link or replayed.link, poses or replayed.poses
-    sources = np.array([site.towers[name].position_m for name in replayed.replay.towers])
-    paths = replayed.replay.paths
-    loss_db = None if loss is None else loss(paths, sources, poses.position_m)
-    return channel_matrices(paths, replayed.replay.faces, sources, poses, link, loss_db)
+    return fields_from(replayed.source_m(site), replayed.replay.faces, replayed.replay.paths, link, poses, loss)
 
 
 def level_dbm(link: Link, fields: Fields, field: RssField) -> FloatArray:

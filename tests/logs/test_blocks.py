@@ -160,3 +160,32 @@ def test_a_large_member_of_an_archive_goes_through_blocks(tmp_path: Path, monkey
     (file,) = ingest(tmp_path / "a.zip", options=OPTIONS)
     same(file.result, whole.result)
     assert seen
+
+
+def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the size where its room is moved and not copied, with a type that widens on the way."""
+    monkeypatch.setattr(blocks, "_DOUBLING", 100)
+    monkeypatch.setattr(blocks, "_AT_ONCE", 37)
+    records = blocks._Records()
+    expected = []
+    for i, size in enumerate((30, 90, 1, 250, 7, 600)):
+        more = {
+            "line": np.arange(size),
+            "flag": np.array([f"reason_{i}_{n % 400}" if n % 3 else "" for n in range(size)], dtype=object),
+            "level": np.arange(size) + (0.5 if i > 2 else 0),
+        }
+        more["level"] = more["level"].astype(np.float64 if i > 2 else np.int64)
+        if i > 3:
+            more["beside"] = np.full(size, float(i))
+        expected.append(pd.DataFrame(more))
+        records.extend(more)
+    frame = records.frame()
+    pd.testing.assert_frame_equal(frame, pd.concat(expected, ignore_index=True).astype({"flag": object}))
+    texts = frame["flag"].tolist()
+    assert len({id(text) for text in texts}) == len(set(texts)) > 256, "one object per text"
+
+
+def test_steps_back_are_counted_over_the_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocks, "_AT_ONCE", 3)
+    time = np.random.default_rng(3).integers(0, 5, 100)
+    assert blocks.steps_back(time.astype("datetime64[ns]")) == (np.diff(time) < 0).sum()

@@ -29,15 +29,7 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
     readings = [
-        _cells.Reading(
-            row=i,
-            rat=rats[i],
-            pci=pci[i],
-            arfcn=np.nan,
-            rsrp_dbm=rsrp[i],
-            serving=True,
-            beside=(np.nan, np.nan, snr[i], loss[i]),
-        )  # fmt: skip
+        _cells.Reading(i, rats[i], pci[i], np.nan, rsrp[i], True, (np.nan, np.nan, snr[i], loss[i]))
         for i in range(len(rows))
     ]
     yield from _cells.streams(rows, readings, source="srsUE")

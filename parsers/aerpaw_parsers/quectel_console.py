@@ -78,10 +78,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     kept = [found[i] for i in rows.at.tolist()]
     readings = [
         _cells.Reading(
-            i, "lte" if title == "LTE" else "nr", value.get("PCID", np.nan),
-            value.get("earfcn", value.get("ARFCN", np.nan)),
-            value.get("RSRP", np.nan), True,
-            (value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
+            row=i, rat="lte" if title == "LTE" else "nr", pci=value.get("PCID", np.nan),
+            arfcn=value.get("earfcn", value.get("ARFCN", np.nan)),
+            rsrp_dbm=value.get("RSRP", np.nan), serving=True,
+            beside=(value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
         )
         for i, (_, _, title, value) in enumerate(kept) if "RSRP" in value
     ]  # fmt: skip

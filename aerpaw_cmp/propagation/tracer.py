@@ -266,7 +266,15 @@ def replay(
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads, device)
+    settings = Settings(
+        engine=engine,
+        max_depth=max_depth,
+        samples=0 if samples == "auto" else samples,
+        batch=batch,
+        variant=variant,
+        threads=threads,
+        device=device,
+    )
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":

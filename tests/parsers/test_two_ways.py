@@ -110,7 +110,7 @@ def test_damaged_samples(case: tuple[str, str], data: st.DataObject) -> None:
 
 TABLES = (
     b"Time,Lat,Note,Level\n2025-03-02 10:00:00.250,35.7,a b,-80.5\n2025-03-02 10:00:01.250,,c,-1e1\n2025-03-02 10:00:02,1,nan,\n",
-    b"Time;Level\r\n1740927600.5;-80,5\r\n1740927601.5;n/a\r\n1740927602.5;word\r\n \r\n",
+    b"Time;Level\r\n0.5;-80,5\r\n1.5;n/a\r\n2.5;word\r\n \r\n",
     b"Level\tTime\n-80.12345678901234\t2025-03-02T10:00:00.25-05:00\n+5.\t2025-03-02T10:00:00.2Z\n.5\t2025/03/02 10:00:00\n-inf\tx\n",
 )
 
@@ -121,7 +121,7 @@ def test_mapped_tables_by_columns_and_by_cells(table: bytes, data: st.DataObject
     """The whole result, damaged or not: cells that are no numbers, other numbers of fields, other forms of times."""
     sample = bytearray(table)
     for _ in range(data.draw(st.integers(0, 3))):
-        at = data.draw(st.integers(len(table.split(b"\n")[0]), len(sample) - 1))
+        at = data.draw(st.integers(table.index(b"\n") + 1, len(sample) - 1))
         new = data.draw(
             st.sampled_from(
                 [b"", b"7", b",", b";", b"-", b".", b"e", b"\n", b"\r", b"x", b" ", b"\xe2\x80\x8b", b"inf"]

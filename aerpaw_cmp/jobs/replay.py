@@ -45,7 +45,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
+    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; all else has those alone."""
 
     link: Link
     poses: Poses
@@ -100,7 +100,7 @@ def replay_rss(
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
-        places, tracks = _towers_and_poses(data, tower, times)
+        valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
@@ -108,12 +108,12 @@ def replay_rss(
         towers_m = None if tower not in data.nodes else np.concatenate(places)
         whole = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
         start = 0
-        for index, track, part, place in zip(members, tracks, poses, places, strict=True):
+        for index, here, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
                 link=link,
                 poses=part,
-                valid=track.valid,
+                valid=here,
                 replay=part_of(whole, start, stop),
                 track=track,
                 clock=shifts[index],
@@ -125,15 +125,16 @@ def replay_rss(
 
 def _towers_and_poses(
     data: FlightData, tower: str, times: Sequence[Times]
-) -> tuple[list[FloatArray], list[TrackPoses]]:
-    """Places of a tower and poses of the UAV at instants; poses are valid where both are known, places are of those."""
-    places, tracks = [], []
+) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
+    """At which instants a tower and the UAV are known; their places and poses at those."""
+    valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
         track = _track_poses(data.track, time).where(known)
-        tracks.append(track)
+        valid.append(track.valid)
+        tracks.append(track.pick(track.valid))
         places.append(place if len(place) == 1 and tower not in data.nodes else place[track.valid])
-    return places, tracks
+    return valid, places, tracks
 
 
 def _joined_poses(poses: Sequence[Poses]) -> Poses:
@@ -344,11 +345,11 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         place, known = data.tower_at(series.tower, series.time)
         valid = valid & known
         towers_m = place[valid] if series.tower in data.nodes else None
-        track = None if data.track is None else _track_poses(data.track, series.time)
-        rotation = np.tile(np.eye(3), (len(position), 1, 1))
+        track = None if data.track is None else _track_poses(data.track, series.time).pick(valid)
+        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
-        poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
+        poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
         found = replay_poses(
@@ -379,10 +380,9 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def _poses(track: TrackPoses, attitude: str) -> Poses:
-    rotation = attitude_rotation(track, attitude)
-    if track.valid.all():  # the very arrays of the track: a long flight has one copy of them
-        return Poses(track.position_m, np.ascontiguousarray(rotation))
-    return Poses(track.position_m[track.valid], np.ascontiguousarray(rotation[track.valid]))
+    """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
+    some = track.pick(track.valid)
+    return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
 
 def replay_poses(

@@ -162,6 +162,22 @@ def test_a_large_member_of_an_archive_goes_through_blocks(tmp_path: Path, monkey
     assert seen
 
 
+@pytest.mark.parametrize(
+    ("head", "damaged"), [(b"|    | LTE ", b"xy |    | LTE "), (b"SINR |\n", b"SINR ;\n")], ids=["inside", "endless"]
+)
+def test_a_damaged_head_of_a_drawn_table_counts_alike_in_blocks(head: bytes, damaged: bytes) -> None:
+    """One not at the start of its line was a head in one piece alone; one without an end hid the head before it."""
+    data = samples.QUECTEL_CONSOLE + samples.QUECTEL_CONSOLE.replace(head, damaged, 1)
+    assert damaged in data
+    whole = by_name("quectel_console").read(data, OPTIONS)
+    same(in_two("quectel_console", data.splitlines(keepends=True), OPTIONS), whole)
+    alone = samples.QUECTEL_CONSOLE.replace(head, damaged, 1)
+    same(
+        in_two("quectel_console", alone.splitlines(keepends=True), OPTIONS),
+        by_name("quectel_console").read(alone, OPTIONS),
+    )
+
+
 def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the size where its room is moved and not copied, with a type that widens on the way."""
     monkeypatch.setattr(blocks, "_DOUBLING", 100)

@@ -33,8 +33,9 @@ FROM_BYTES = 24 << 20
 _CHUNK = 4 << 20
 _AT_ONCE = 1 << 20
 """Rows that a step over a whole column takes at a time: what it needs beside the column stays small."""
-_DOUBLING = 1 << 22
-"""Rows up to which a column doubles its room; above, it grows by a sixteenth, in place."""
+_ROOM = 1 << 22
+"""Rows up to which a column takes room for eight times as many (which costs nothing before it is written to); above, it
+grows by a sixteenth, in place."""
 _MOST_RATIO = 1100
 """Deflate makes a file at most 1032 times smaller."""
 _SUMMED = re.compile(
@@ -340,10 +341,10 @@ class _Column:
         self.count = end
 
     def _grow(self, need: int) -> None:
-        if need > _DOUBLING:
+        if need > _ROOM:
             self.values.resize(need + need // 16, refcheck=False)
             return
-        wider = np.empty(max(need, min(2 * len(self.values), _DOUBLING)), dtype=self.values.dtype)
+        wider = np.empty(min(8 * need, _ROOM), dtype=self.values.dtype)
         wider[: self.count] = self.values[: self.count]
         self.values = wider
 

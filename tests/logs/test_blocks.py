@@ -180,7 +180,7 @@ def test_a_damaged_head_of_a_drawn_table_counts_alike_in_blocks(head: bytes, dam
 
 def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the size where its room is moved and not copied, with a type that widens on the way."""
-    monkeypatch.setattr(blocks, "_DOUBLING", 100)
+    monkeypatch.setattr(blocks, "_ROOM", 100)
     monkeypatch.setattr(blocks, "_AT_ONCE", 37)
     records = blocks._Records()
     expected = []

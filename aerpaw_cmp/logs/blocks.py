@@ -122,6 +122,12 @@ def _unmarked(chunks: Iterator[bytes]) -> Iterator[bytes]:
         yield chunk.removeprefix(b"\xef\xbb\xbf") if i == 0 else chunk
 
 
+def whole_lines(chunks: Iterator[bytes]) -> Iterator[bytes]:
+    """Blocks of whole lines, for a reader that keeps by itself what later lines hang on."""
+    for _, data in _blocks(_unmarked(chunks), None, None, ()):
+        yield data
+
+
 def first_line(data: bytes, options: ReadOptions) -> int:  # noqa: ARG001 - the contract of heads
     """Bytes of the first line: the ``head`` of a table whose header stands there."""
     return data.find(b"\n") + 1
@@ -235,7 +241,7 @@ class Gathered:
         self.rejected: list[RejectedLine] = []
         self.warnings = _Warnings()
         self.order: list[tuple[str, str]] = []
-        self.records: dict[tuple[str, str], _Records] = {}
+        self.records: dict[tuple[str, str], Records] = {}
         self.attributes: dict[tuple[str, str], dict[str, Attribute]] = {}
 
     def add(self, result: ReadResult, before: ReadResult | None) -> None:
@@ -267,7 +273,7 @@ class Gathered:
             if len(columns["line"]):
                 added.append(key)
                 columns["line"] = columns["line"] + shift
-                self.records.setdefault(key, _Records()).extend(columns)
+                self.records.setdefault(key, Records()).extend(columns)
                 self.attributes[key] = _joined(self.attributes.get(key), stream.attributes)
         self.order = in_order(self.order, added)
 
@@ -383,7 +389,7 @@ class _Flags(_Column):
         return made
 
 
-class _Records:
+class Records:
     """The records of a stream, block behind block; a column that a block lacks is NaN there."""
 
     def __init__(self) -> None:

@@ -255,6 +255,11 @@ def parts_left_out(
         :func:`altitude_parts`, :func:`heading_parts`, :func:`sector_parts` or :func:`route_parts`.
     own : bool
         Learn from the rest of the flight, too.
+
+    Returns
+    -------
+    tuple of Score
+        One per series, over all its parts; series of which no part could be predicted are left out.
     """
     out: list[Score | None] = []
     for flight in spread_flights(flights_of(observed)):

@@ -275,6 +275,13 @@ def cell_means(
         Samples that count.
     cell_m : float
         Side of a square [m].
+
+    Returns
+    -------
+    cells : (c, 2) int
+        Numbers of the squares, east and north, ascending.
+    residual_db, height_m : (c,)
+        Means over the samples of each square.
     """
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     found, which = np.unique(cells, axis=0, return_inverse=True)

@@ -399,6 +399,11 @@ def k_curve(
         Grid of K, by default :func:`k_grid`.
     replicates, seed : int
         Block bootstrap for the intervals of the best K.
+
+    Returns
+    -------
+    KCurve
+        Agreement and total variation by K; NaN where no pose has both ranks.
     """
     grid = k_grid() if k is None else np.asarray(k, dtype=np.float64)
     ri = _ranks(measured)
@@ -745,6 +750,16 @@ def compare_rank(
         Further numbers of the report, to recognise stale RI (``sinr_db`` takes part by itself).
     replicates, seed : int
         Bootstrap.
+
+    Returns
+    -------
+    RankComparison
+        Histograms, agreement and distances per K and rule, the curve over K, and what was stale.
+
+    Raises
+    ------
+    ValueError
+        A measured rank of 0; an H of another shape or length.
     """
     ri = _ranks(measured)
     if np.any(ri == 0):
@@ -799,6 +814,11 @@ def compare_ranks(
         Ranks of the same samples: NaN unknown, 0 no channel.
     replicates, seed : int
         Of the bootstrap and the permutation test.
+
+    Returns
+    -------
+    RankFit
+        Agreement, kappa and distances with their 95 % intervals and permutation tests.
     """
     one, two = _ranks(measured), _ranks(simulated)
     bars_one, bars_two = histogram(one), histogram(two)
@@ -897,6 +917,11 @@ def repeat_rank(
         As in :func:`~aerpaw_cmp.compare.statistics.same_places`.
     replicates, seed : int
         Bootstrap; with 0 replicates the interval is in closed form, to first order.
+
+    Returns
+    -------
+    RankRepeat
+        Kappa, its interval, agreement and the number of pairs; NaN without pairs.
     """
     one, two = _ranks(rank), _ranks(other_rank)
     known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)

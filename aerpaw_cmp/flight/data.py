@@ -16,9 +16,8 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
-from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
+from ..logs.ingest import IngestedFile, ingest, read_log
 from ..logs.limits import UNSCORED, flagged
-from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
@@ -163,45 +162,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
-    files = []
-    for log in settings.logs:
-        path = (logs_root or folder) / log.path
-        if not exists(path):
-            root = logs_root or folder
-            raise InputError(
-                "there is no such log",
-                expected=f"the file below {root}",
-                cause="a wrong path, or --logs-root",
-                path=path,
-            )
-        reader = None if log.reader is None else by_name(log.reader)
-        if reader is not None:
-            _refuse_other_kind(path, reader)
-        (file,) = ingest([path], options=log.options(settings.timezone), reader=log.reader)
-        if not file.result.streams:
-            raise InputError(
-                "no record could be read",
-                expected=f"records of reader {file.result.reader!r}",
-                cause=file.result.rejected[0].reason if file.result.rejected else "an aborted run",
-                path=path,
-            )
-        files.append(file)
-    return tuple(files)
-
-
-def _refuse_other_kind(path: Path, reader: Reader) -> None:
-    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
-    if reader.name == "generic_csv":
-        return  # its columns were named: no other reader knows better
-    others = sniffers_of(path)
-    if not others or reader.name in others:
-        return
-    raise InputError(
-        f"the content is that of {' or '.join(others)}",
-        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
-        cause="the wrong file, or the wrong 'reader:'",
-        path=path,
-    )
+    root = logs_root or folder
+    return tuple(read_log(root, log.path, log.options(settings.timezone), reader=log.reader) for log in settings.logs)
 
 
 SNR = "snr"
@@ -240,6 +202,11 @@ def gather(
         In the order of ``settings.logs``.
     logs_root : Path, optional
         Where logs and antenna files resolve, in place of ``folder``.
+
+    Returns
+    -------
+    FlightData
+        Site, track and series, with the warnings of the logs.
 
     Raises
     ------
@@ -290,6 +257,20 @@ def gather(
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
+    """The data of a flight: :func:`gather` of what :func:`read_logs` reads.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file.
+    logs_root : Path, optional
+        Where logs and antenna files resolve, in place of ``folder``.
+    """
+    return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
 
 
 def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]) -> list[str]:

@@ -30,7 +30,7 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import RATIOS, SNR, FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
@@ -136,6 +136,11 @@ def calibrate(
     workers : Workers, optional
         Share the scores and the controls.
 
+    Returns
+    -------
+    Calibration
+        What was learned, its scores on flights left out, and the controls.
+
     Raises
     ------
     UsageError
@@ -187,7 +192,7 @@ def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None
     for name in settings.flights:
         path = folder / name
         flight = load_flight(path)
-        out.append(gather(flight, path.parent, read_logs(flight, path.parent, logs_root), logs_root))
+        out.append(load_data(flight, path.parent, logs_root))
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:
@@ -427,7 +432,28 @@ class ScoreOrder:
 def score_on(
     workers: Workers, path: Path, logs_root: Path | None, recipe: Recipe
 ) -> tuple[dict[str, tuple[Score, ...]], dict[str, tuple[Score, ...]]]:
-    """What :func:`score_all` gives, by workers that read the flights themselves."""
+    """What :func:`score_all` gives, by workers that read the flights themselves.
+
+    Parameters
+    ----------
+    workers : Workers
+    path : Path
+        calibration.yaml, as the workers reach it.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    recipe : Recipe
+        Says which controls there are.
+
+    Returns
+    -------
+    scores, controls : dict of str to tuple of Score
+        By kind of what is left out, and by control.
+
+    Raises
+    ------
+    InputError
+        A worker was lost, or could not score its part.
+    """
     stamp = uuid.uuid4().hex
     names = ["", *_controls((), recipe)]
     orders = [ScoreOrder(path=path, logs_root=logs_root, control=name, stamp=stamp) for name in names]

@@ -127,6 +127,25 @@ def bench_of(data: FlightData) -> Bench:
     return Bench(data, clocks, measured)
 
 
+def training_sets(names: Sequence[str], fit_on: Sequence[str] | None, kind: str) -> list[list[str]]:
+    """Flights of each fit: those that are named and gave ``kind`` (RSS, rank), or all but one, each in turn.
+
+    Raises
+    ------
+    UsageError
+        No flight to fit on, or too few to leave one out.
+    """
+    if fit_on is None:
+        if len(names) < 2:
+            raise UsageError(f"{len(names)} flights with {kind}", expected="two or more, to leave one out at a time")
+        return [[name for name in names if name != left] for left in names]
+    chosen = [name for name in fit_on if name in names]
+    if not chosen:
+        known = ", ".join(names) or "none has"
+        raise UsageError(f"no flight of held_out.fit_on gave {kind}", expected=f"a flight that has {kind}: {known}")
+    return [chosen]
+
+
 def fit_all(
     flights: Mapping[str, FlightData],
     grids: Mapping[str, Sequence[float]],
@@ -156,6 +175,13 @@ def fit_all(
         Search between the values, too.
     spread : callable, optional
         Computes the errors of all combinations of values, flight by flight, on workers: the same numbers, sooner.
+    progress : Progress
+        Gets what is fitted.
+
+    Returns
+    -------
+    list of HeldOutFold
+        One with ``fit_on``, else one per flight, which is left out of it.
 
     Raises
     ------
@@ -164,13 +190,7 @@ def fit_all(
     InputError
         A flight of the fit has no sample that could be compared.
     """
-    names = list(flights)
-    chosen = None if fit_on is None else [name for name in fit_on if name in names]
-    if chosen == []:
-        known = ", ".join(names) or "none has"
-        raise UsageError("no flight of held_out.fit_on gave RSS", expected=f"a flight that has RSS: {known}")
-    if chosen is None and len(names) < 2:
-        raise UsageError(f"{len(names)} flights with RSS", expected="two or more, to leave one out at a time")
+    names, trainings = list(flights), training_sets(list(flights), fit_on, "RSS")
     full = {}
     for name, data in flights.items():
         progress(f"held-out: prepare {name}")
@@ -179,10 +199,12 @@ def fit_all(
     if spread is not None and _combinations(grids) <= LARGEST_PRODUCT:
         progress(f"held-out: {_combinations(grids)} combinations of values on the workers")
         points = [dict(zip(grids, map(float, values), strict=True)) for values in product(*grids.values())]
-        for name, errors in spread(dict.fromkeys(chosen or names, points)).items():
+        for name, errors in spread(
+            dict.fromkeys(dict.fromkeys(n for train in trainings for n in train), points)
+        ).items():
             few[name].known.update(zip(map(_named, points), errors, strict=True))
     folds = []
-    for train in [chosen] if chosen is not None else [[n for n in names if n != left] for left in names]:
+    for train in trainings:
         progress("held-out: fit on " + ", ".join(train))
         test = [name for name in names if name not in train]
         try:
@@ -240,6 +262,11 @@ def search(
         Names of the flights to fit on.
     refine : bool
         Search between the values, too (where all combinations are tried).
+
+    Returns
+    -------
+    Search
+        The best values, those at the end of their list, and how many points were looked at.
     """
 
     def objective(point: Mapping[str, float], flight: str) -> FloatArray:

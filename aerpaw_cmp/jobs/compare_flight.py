@@ -404,6 +404,13 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
         Its poses, arrays and which samples have a pose.
     rt : RtSettings
         ``foliage`` says whether the depth of foliage counts.
+
+    Returns
+    -------
+    dict of str to (n,)
+        ``altitude_m``, ``distance_m``, ``elevation_deg``, ``azimuth_deg``, ``tower_elevation_deg``,
+        ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
+        NaN where no pose is known.
     """
     place, link = site.towers[tower], replayed.link
     seen = rss.link_geometry(

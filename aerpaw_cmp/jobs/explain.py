@@ -15,7 +15,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray
-from ..flight.data import FlightData, RankSeries, RssSeries, gather, rank_positions, read_logs
+from ..flight.data import FlightData, RankSeries, RssSeries, load_data, rank_positions
 from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
 from ..propagation.explained import (
@@ -117,13 +117,18 @@ def run_explain(
     logs_root : Path, optional
     progress : Progress
 
+    Returns
+    -------
+    Explanation
+        The paths of the link with their losses [dB], what is not there and why.
+
     Raises
     ------
     UsageError
         Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
     """
     settings = load_flight(flight)
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     series = _series(data, tower, channel)
     at, seconds = _sample(series, time, settings.timezone)
     link, pose, notes = _pose(data, series, at, progress)

@@ -78,6 +78,11 @@ def run_flight(
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
+
+    Returns
+    -------
+    FlightRun
+        Replays, numbers of the comparison, and the ladder where it was asked for.
     """
     stages = stages or Stages()
     replays = replay_flight(data, stages)

@@ -42,6 +42,11 @@ def with_later_audit(
         The flight file, the folder of the report, ``--logs-root``.
     asked : mapping
         Further arguments of :func:`aerpaw_cmp.jobs.run.run_report`.
+
+    Returns
+    -------
+    ReportData
+        The same record with ``extra_metrics`` and ``audit_command`` filled.
     """
     made_from = {
         "flight": _from(folder, flight),

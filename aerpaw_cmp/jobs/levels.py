@@ -55,6 +55,11 @@ def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, sett
         At the replayed poses [dB].
     settings : RssSettings
         ``field`` and ``window_s``.
+
+    Returns
+    -------
+    (n,)
+        [dB]; NaN where no pose is known.
     """
     level = replayed.spread(level_db)
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level

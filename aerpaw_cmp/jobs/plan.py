@@ -147,16 +147,21 @@ def report_plan(
         As for the report.
     force : bool
 
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
     Raises
     ------
     UsageError, InputError
         What the report itself would raise of its settings, logs and output.
     """
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
 
     OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
     start = time.process_time()
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
@@ -251,6 +256,16 @@ def map_plan(
     flight : Path, optional
         Whose track trains the test "along a flight".
     force : bool
+
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
+    Raises
+    ------
+    UsageError
+        There is no such flight file; the output is an input, or holds files of others.
     """
     from ..maps.grid import Grid
     from .coverage_map import make_maps

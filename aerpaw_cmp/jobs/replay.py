@@ -374,6 +374,11 @@ def replay_poses(
     progress : Progress
         Share done; of the sionna engine alone.
 
+    Returns
+    -------
+    Replay
+        H (poses, towers, n_rx, n_tx), levels [dBm] and paths.
+
     Raises
     ------
     UsageError

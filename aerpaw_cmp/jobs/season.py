@@ -115,7 +115,23 @@ def error_of(row: RssRow) -> float:
 def rank_settings(
     rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
 ) -> list[SettingRank]:
-    """Settings by their mean error over flights, and their difference to the first on the same flights and links."""
+    """Settings by their mean error over flights, and their difference to the first on the same flights and links.
+
+    Parameters
+    ----------
+    rows : iterable of RssRow
+    settings : sequence of str
+        Labels; ties keep their order.
+    flights : sequence of str
+        Those that are compared.
+    link : str
+        What the rows are of, for the record.
+
+    Returns
+    -------
+    list of SettingRank
+        Least mean error first; settings without a finite error are left out.
+    """
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
     for row in rows:
         if np.isfinite(error_of(row)):

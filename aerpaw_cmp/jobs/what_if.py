@@ -46,6 +46,11 @@ def evaluate(
         Loss per path [dB], as :func:`aerpaw_cmp.jobs.replay.path_loss` gives it.
     link, poses : optional
         In place of those of the replay; as many poses.
+
+    Returns
+    -------
+    Fields
+        H (poses, towers, n_rx, n_tx) and the power of each path.
     """
     link, poses = link or replayed.link, poses or replayed.poses
     sources = np.array([site.towers[name].position_m for name in replayed.replay.towers])

@@ -88,6 +88,11 @@ def by_lines(
         MULTILINE patterns of lines on which later ones hang: the last of each is put in front of a block.
     settle : callable, optional
         What only the whole log can tell, from the joined result.
+
+    Returns
+    -------
+    callable
+        ``in_blocks(chunks, options)``: the same result as ``read`` of all bytes at once.
     """
 
     def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:

@@ -42,6 +42,11 @@ def write_netcdf(
     generated, version : str
         When the maps were made (ISO 8601), and by which version.
 
+    Returns
+    -------
+    Path
+        The file.
+
     Raises
     ------
     UsageError

@@ -55,6 +55,12 @@ def report_data(
         Files besides the logs: settings, site, antennas.
     stages_s : mapping of str to float
         Seconds per stage.
+    paths : sequence of PosePaths
+        Paths at the samples, for the page that shows them.
+
+    Returns
+    -------
+    ReportData
     """
     settings = data.settings
     warnings = [

@@ -219,6 +219,11 @@ def write_figures(
         Style, as in :func:`render`.
     progress : Progress
         Share of the figures that are drawn.
+
+    Returns
+    -------
+    pictures : list of Picture
+    files : list of Path
     """
     drawn: list[Picture] = []
     written: list[Path] = []
@@ -625,6 +630,10 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
     label : str
     extend : {"neither", "min", "max", "both"}
         Ends beyond which values lie.
+
+    Returns
+    -------
+    matplotlib.colorbar.Colorbar
     """
     bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:

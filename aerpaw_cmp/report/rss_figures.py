@@ -351,6 +351,11 @@ def running_levels(quantity: FloatArray, values: FloatArray, bins: int = 20, few
     fewest : int
         Samples that a bin needs.
 
+    Returns
+    -------
+    (bins, 4)
+        Mean quantity, then the 10, 50 and 90 % points of the values.
+
     Examples
     --------
     >>> at = np.concatenate([np.arange(40.0), 360.0 + np.arange(41.0)])

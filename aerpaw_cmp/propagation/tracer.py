@@ -174,6 +174,7 @@ def replay(
     whole: Whole | None = None,
     interactions: Sequence[str] = ("reflection",),
     scattering_coefficient: float | None = None,
+    only: BoolArray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -222,6 +223,8 @@ def replay(
         (:mod:`aerpaw_cmp.propagation.interactions`).
     scattering_coefficient : float, optional
         Of every material, where "scattering" is asked for.
+    only : (towers, poses) bool, optional
+        Links that count; the others have no path and are not searched for.
     progress : callable, optional
         Called with the share done.
 
@@ -258,10 +261,20 @@ def replay(
     scene = Scene.of(site, link, poses)
     if whole is not None:
         scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
+    if only is not None:
+        scene = replace(scene, excluded=scene.excluded | ~only)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads, device)
+    settings = Settings(
+        engine=engine,
+        max_depth=max_depth,
+        samples=0 if samples == "auto" else samples,
+        batch=batch,
+        variant=variant,
+        threads=threads,
+        device=device,
+    )
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":
@@ -287,7 +300,7 @@ def replay(
         result = _with_others(result, link, tuple(interactions), *others)
     if visibility == "pairs":
         small = drop_small_faces
-        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
+        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable, only)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -395,6 +408,7 @@ def _by_pairs(
     loss: Loss | None,
     crowns: Crowns | None,
     usable: BoolArray | None,
+    only: BoolArray | None,
 ) -> Replay:
     """Each element pair with its own paths: every tower element is a source, every UAV element a pose."""
     names, arrays = list(link.tower_arrays), list(link.tower_arrays.values())
@@ -413,7 +427,7 @@ def _by_pairs(
         scene,
         sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
         usable=np.repeat(scene.usable if usable is None else usable[:, : len(scene.faces)], ports, axis=0),
-        excluded=np.repeat(scene.excluded, ports, axis=0),
+        excluded=np.repeat(scene.excluded if only is None else scene.excluded | ~only, ports, axis=0),
     )
     for element in range(len(uav)):
         spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)

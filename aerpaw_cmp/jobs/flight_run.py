@@ -8,14 +8,17 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
+from ..common.forked import beside, in_order
 from ..common.stages import Stages
-from ..compare.ladder import ladder_rows
+from ..compare.ladder import LadderRow, series_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
 from .audit_flight import audit_replays
-from .compare_flight import compare_flight
+from .compare_flight import FEWEST_SERIES, compare_flight
 from .ladder import FlightLadder, flight_ladder
 from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
 
@@ -81,16 +84,29 @@ def run_flight(
     """
     stages = stages or Stages()
     replays = replay_flight(data, stages)
-    with stages("compare"):
-        result = compare_flight(data, replays)
-    if audit:
-        with stages("audit"):
-            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
-    climbed = None
-    if ladder:
-        with stages("ladder"):
-            climbed = flight_ladder(data, replays, stages.progress)
-        if climbed is not None:
-            rows = ladder_rows(climbed.ladder, climbed.names, replicates=data.settings.rss.bootstrap)
-            result = dataclasses.replace(result, ladder=tuple(rows))
+    with ExitStack() as running:
+        # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
+        climb = running.enter_context(beside(partial(flight_ladder, data, replays))) if ladder else None
+        with stages("compare"):
+            result = compare_flight(data, replays)
+        if audit:
+            with stages("audit"):
+                result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
+        climbed = None
+        if climb is not None:
+            with stages("ladder"):
+                stages.progress("ladder of models")
+                climbed = climb()
+                if climbed is not None:
+                    rows = _ladder_rows(climbed, data.settings.rss.bootstrap)
+                    result = dataclasses.replace(result, ladder=tuple(rows))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
+
+
+def _ladder_rows(climbed: FlightLadder, replicates: int) -> list[LadderRow]:
+    """The rows of all series in their order, several series at a time where that is safe."""
+    calls = [
+        partial(series_rows, climbed.ladder, index, name, replicates=replicates)
+        for index, name in enumerate(climbed.names)
+    ]
+    return [row for rows in in_order(calls, fewest=FEWEST_SERIES) for row in rows]

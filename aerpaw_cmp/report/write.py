@@ -66,14 +66,18 @@ def write_report(
         If the folder cannot be written.
     """
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
-    written = []
+    written: list[Path] = []
     with stages("report"):
-        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
-            # written even without rows: a reader finds the same files in every report
-            written.append(write_file(folder / name, text))
         plates = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
-        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress)
+
+        def tables() -> None:
+            for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
+                # written even without rows: a reader finds the same files in every report
+                written.append(write_file(folder / name, text))
+            html.environment().get_template("report.html.jinja")  # compiled while others draw
+
+        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress, meanwhile=tables)
     written += paths
     if exports:
         with stages("exports"):

@@ -15,7 +15,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from aerpaw_cmp.report import canvas, drawing
+from aerpaw_cmp.common import forked
+from aerpaw_cmp.report import canvas
 
 linux = pytest.mark.skipif(
     not sys.platform.startswith("linux"), reason="figures are shared by forked processes on Linux only"
@@ -34,8 +35,8 @@ def plate(number: int) -> canvas.FigureSpec:
 @linux
 def test_bytes_and_order_are_those_of_one_process() -> None:
     draws = [partial(canvas.render, plate(n), ("svg", "png")) for n in range(5)]
-    alone = list(drawing.in_order(draws, 1))
-    shared = list(drawing.in_order(draws, 2))
+    alone = list(forked.in_order(draws, 1))
+    shared = list(forked.in_order(draws, 2))
     assert [p.name for p in shared] == [f"p{n}" for n in range(5)]
     for one, other in zip(alone, shared, strict=True):
         assert one.formats["png"] == other.formats["png"]
@@ -45,20 +46,20 @@ def test_bytes_and_order_are_those_of_one_process() -> None:
 @linux
 def test_they_run_elsewhere_and_one_that_dies_is_made_up_for() -> None:
     here = os.getpid()
-    assert here not in list(drawing.in_order([os.getpid] * 4, 2))
+    assert here not in list(forked.in_order([os.getpid] * 4, 2))
 
     def dies(number: int) -> int:
         if number == 2 and os.getpid() != here:
             os.kill(os.getpid(), signal.SIGKILL)
         return number
 
-    assert list(drawing.in_order([partial(dies, n) for n in range(5)], 2)) == list(range(5))
+    assert list(forked.in_order([partial(dies, n) for n in range(5)], 2)) == list(range(5))
 
 
 @linux
 def test_processes_end_with_a_killed_parent() -> None:
     code = (
-        "import os, time; from aerpaw_cmp.report.drawing import in_order\n"
+        "import os, time; from aerpaw_cmp.common.forked import in_order\n"
         "def draw():\n    os.write(1, f'{os.getpid()}\\n'.encode()); time.sleep(120)\n"
         "list(in_order([draw] * 4, 2))"
     )
@@ -87,23 +88,23 @@ def alive(process: int) -> bool:
 
 def test_a_fault_in_a_figure_comes_through() -> None:
     with pytest.raises(ZeroDivisionError):
-        list(drawing.in_order([lambda: 1 / 0] * 3, 2 if sys.platform.startswith("linux") else 1))
+        list(forked.in_order([lambda: 1 / 0] * 3, 2 if sys.platform.startswith("linux") else 1))
 
 
 def test_no_fork_where_it_is_unsafe_or_pays_nothing(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drawing.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
-    monkeypatch.setattr(drawing.sys, "platform", "linux")
+    monkeypatch.setattr(forked.os, "sched_getaffinity", lambda _: set(range(16)), raising=False)
+    monkeypatch.setattr(forked.sys, "platform", "linux")
     for name in ("drjit", "mitsuba"):
         monkeypatch.delitem(sys.modules, name, raising=False)
-    monkeypatch.setattr(drawing.threading, "active_count", lambda: 1)
-    assert drawing.usable_processes(drawing.FEWEST) == 4
-    assert drawing.usable_processes(drawing.FEWEST - 1) == 1
+    monkeypatch.setattr(forked.threading, "active_count", lambda: 1)
+    assert forked.usable_processes(forked.FEWEST) == 4
+    assert forked.usable_processes(forked.FEWEST - 1) == 1
     monkeypatch.setitem(sys.modules, "drjit", types.ModuleType("drjit"))
-    assert drawing.usable_processes(100) == 1
+    assert forked.usable_processes(100) == 1
     monkeypatch.delitem(sys.modules, "drjit")
-    monkeypatch.setattr(drawing.threading, "active_count", lambda: 2)
-    assert drawing.usable_processes(100) == 1
+    monkeypatch.setattr(forked.threading, "active_count", lambda: 2)
+    assert forked.usable_processes(100) == 1
     monkeypatch.undo()
     assert threading.active_count() >= 1
-    monkeypatch.setattr(drawing.sys, "platform", "darwin")
-    assert drawing.usable_processes(100) == 1
+    monkeypatch.setattr(forked.sys, "platform", "darwin")
+    assert forked.usable_processes(100) == 1

@@ -152,7 +152,7 @@ class _Prediction:
         return _Prediction(self.first, self.step, columns)
 
     def terms_at(self, t: FloatArray, *, slopes: bool = False) -> FloatArray:
-        """Free terms at t (..., n), a constant first (..., n, 1 + terms), or their slopes [1/s]; NaN as for :meth:`at`."""
+        """Terms at t (..., n), a constant first (..., n, 1 + terms), or their slopes [1/s]; NaN as for :meth:`at`."""
         place = (t - self.first) / self.step
         left = np.floor(place).astype(np.int64)
         inside = (left >= 0) & (left < len(self.terms) - 1)

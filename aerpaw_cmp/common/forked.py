@@ -8,6 +8,7 @@ worker among others, and has loaded neither Dr.Jit nor CUDA (whose own threads d
 from __future__ import annotations
 
 import ctypes
+import gc
 import os
 import pickle
 import signal
@@ -113,6 +114,7 @@ class _Shared(Generic[_Item]):
         self._found: dict[int, _Item] = {}
         self._ways: list[Connection] = []
         self._children: list[Any] = []
+        gc.freeze()  # a collection in a child would touch, and so copy, all that it shares with this process
         with warnings.catch_warnings():
             # Python 3.12 warns of any thread, also the sleeping ones of BLAS, which know about forks
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -129,6 +131,7 @@ class _Shared(Generic[_Item]):
                 _widen(here)
                 self._ways.append(here)
                 self._children.append(child)
+        gc.unfreeze()
         os.close(tickets)
 
     def __iter__(self) -> Iterator[_Item]:

@@ -7,7 +7,7 @@ field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResul
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -46,7 +46,11 @@ class FlightRun:
 
 
 def replay_flight(
-    data: FlightData, stages: Stages | None = None, *, clocks: Sequence[Clock | None] | None = None
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    clocks: Sequence[Clock | None] | None = None,
+    meanwhile: Callable[[], object] | None = None,
 ) -> FlightReplay:
     """Clocks and replay alone.
 
@@ -57,10 +61,12 @@ def replay_flight(
         Times "clocks" and "replay".
     clocks : sequence of Clock or None, optional
         One per RSS series, in place of what ``rss.lag`` asks for.
+    meanwhile : callable, optional
+        As for :func:`~aerpaw_cmp.jobs.replay.estimate_clocks`.
     """
     stages = stages or Stages()
     with stages("clocks"):
-        known = estimate_clocks(data, stages.progress) if clocks is None else clocks
+        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
     with stages("replay"):
         return FlightReplay(
             rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
@@ -68,7 +74,12 @@ def replay_flight(
 
 
 def run_flight(
-    data: FlightData, stages: Stages | None = None, *, audit: bool = True, ladder: bool = False
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    audit: bool = True,
+    ladder: bool = False,
+    meanwhile: Callable[[], object] | None = None,
 ) -> FlightRun:
     """Clocks, replay, comparison, audit and ladder.
 
@@ -81,9 +92,11 @@ def run_flight(
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
+    meanwhile : callable, optional
+        What this process may do while others estimate clocks.
     """
     stages = stages or Stages()
-    replays = replay_flight(data, stages)
+    replays = replay_flight(data, stages, meanwhile=meanwhile)
     with ExitStack() as running:
         # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
         climb = running.enter_context(beside(partial(flight_ladder, data, replays))) if ladder else None

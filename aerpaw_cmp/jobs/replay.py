@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from hashlib import sha256
@@ -122,10 +122,13 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+def estimate_clocks(
+    data: FlightData, progress: Progress = silent, meanwhile: Callable[[], object] | None = None
+) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
-    Predictions are the image engine's RSS along the track with at most one reflection.
+    Predictions are the image engine's RSS along the track with at most one reflection. ``meanwhile`` is what this
+    process may do while others estimate; it is not called where there is nothing to estimate.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
@@ -138,6 +141,8 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
     # on a long flight the estimates are made here, one after the other: each of them holds as much as all else
     processes = None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
     with ahead(calls, processes) as estimates:
+        if meanwhile is not None:
+            meanwhile()
         for tower in towers:
             progress(f"clock {tower}")
             found[tower] = next(estimates)

@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -190,8 +191,8 @@ def run_report(
     """
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
-    from ..report.exports.write import chosen_formats
-    from ..report.write import FIGURES, STYLES, write_report
+    from ..report.exports.formats import chosen_formats
+    from ..report.write import FIGURES, STYLES, prepare_report, write_report
     from .later_audit import refuse_changed, with_later_audit
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
@@ -208,7 +209,7 @@ def run_report(
             _beside(recommend, flight, logs_root)
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
-        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages, partial(prepare_report, figures))
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
@@ -316,7 +317,9 @@ def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> lis
     return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
-def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
+def _replayed_and_compared(
+    settings: Any, flight: Path, logs_root: Path | None, stages: Stages, meanwhile: Callable[[], object]
+) -> Any:
     """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
     from ..flight.data import gather, read_logs
 
@@ -326,7 +329,7 @@ def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, 
     from .flight_run import run_flight
     from .what_if import foliage_notes
 
-    found = run_flight(data, stages, ladder=True)
+    found = run_flight(data, stages, ladder=True, meanwhile=meanwhile)
     replays = found.replays.all
     speed: tuple[Any, ...] = ()
     if settings.report.speed_table and settings.rt.audit_links and settings.report.audit == "now":
@@ -792,7 +795,7 @@ def run_campaign(
 
     from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
-    from ..report.exports.write import chosen_formats
+    from ..report.exports.formats import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
     from .season import find_reports, with_season

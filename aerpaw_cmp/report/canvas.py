@@ -229,8 +229,7 @@ def write_figures(
     drawn: list[Picture] = []
     written: list[Path] = []
     if plates:
-        import matplotlib.backends.backend_agg
-        import matplotlib.figure  # noqa: F401  once, before further processes are made
+        load_matplotlib()
     with ahead([partial(render, plate, formats, kind) for plate in plates], fewest=_FEWEST) as pictures:
         if meanwhile is not None:
             meanwhile()
@@ -241,6 +240,12 @@ def write_figures(
     if plates:
         progress("figures", 1.0)
     return drawn, written
+
+
+def load_matplotlib() -> None:
+    """Import what every figure needs: once, before further processes are made."""
+    import matplotlib.backends.backend_agg
+    import matplotlib.figure  # noqa: F401
 
 
 _FEWEST = 4

@@ -12,7 +12,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-import math
 import os
 import sys
 from collections.abc import Callable
@@ -22,6 +21,7 @@ from typing import Any
 import field_held_out
 import field_models
 import numpy as np
+from field_held_out import num
 
 from aerpaw_cmp.common.jsonable import json_safe
 from aerpaw_cmp.common.versions import versions
@@ -265,11 +265,6 @@ def k_figure(panels: dict[tuple[str, str], Any]) -> Any:
 
 
 # --- the page -------------------------------------------------------------------------------------------------------
-
-
-def num(value: Any, digits: int = 2) -> str:
-    """A number, or a dash."""
-    return "-" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"
 
 
 def between(bounds: Any, digits: int = 2) -> str:

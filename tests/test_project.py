@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import ast
+import itertools
 import re
 import stat
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -131,3 +134,74 @@ def test_layers_stand_one_above_the_other() -> None:
     assert [contract["type"] for contract in contracts][:2] == ["layers", "acyclic_siblings"]
     assert "ignore_imports" not in contracts[0]
     assert "ignore_imports" not in contracts[1]
+
+
+def sections(docstring: str) -> dict[str, list[str]]:
+    """Lines of each section of a NumPy docstring."""
+    found: dict[str, list[str]] = {}
+    lines = docstring.splitlines()
+    for title, line in itertools.pairwise([*lines, ""]):
+        if re.fullmatch(r"-{3,}", line) and title[:1].strip():
+            found[title] = []
+        elif found:
+            found[list(found)[-1]].append(line)
+    return found
+
+
+def public_functions(body: list[ast.stmt], home: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+    for node in body:
+        if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+            yield from public_functions(node.body, f"{home}.{node.name}")
+        elif isinstance(node, ast.FunctionDef) and not node.name.startswith("_"):
+            yield f"{home}.{node.name}", node
+
+
+def lacking(function: ast.FunctionDef) -> list[str]:
+    """Parameters that the docstring does not describe, and what it returns, where there are four or more."""
+    a = function.args
+    given = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
+    names = [one.arg for one in given if one.arg not in ("self", "cls")]
+    if len(names) < 4:
+        return []
+    parts = sections(ast.get_docstring(function) or "")
+    heads = [line.split(" : ")[0] for line in parts.get("Parameters", []) if line[:1].strip()]
+    described = {name.strip().lstrip("*") for head in heads for name in head.split(",")}
+    gives = function.returns is None or ast.unparse(function.returns) != "None"
+    unsaid = ["Returns"] if gives and not {"Returns", "Yields"} & set(parts) else []
+    return [name for name in names if name not in described] + unsaid
+
+
+def test_functions_of_four_parameters_describe_each_and_what_they_return() -> None:
+    """Every public function of a public module; those of the command line describe themselves in ``--help``."""
+    found, seen = {}, 0
+    for path in sorted([*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers" / "aerpaw_parsers").rglob("*.py")]):
+        inside = path.relative_to(ROOT)
+        if inside.parts[1] == "cli" or inside.stem.startswith("_"):
+            continue
+        for name, function in public_functions(ast.parse(path.read_text()).body, inside.as_posix()):
+            seen += 1
+            if missing := lacking(function):
+                found[name] = missing
+    assert found == {}
+    assert seen > 1000
+
+
+def test_a_parameter_without_a_word_is_found() -> None:
+    source = '''
+def f(a, b, *, c, d) -> int:
+    """One line.
+
+    Parameters
+    ----------
+    a, b : int
+    d : int
+        Of c : nothing is said.
+
+    Notes
+    -----
+    c : int is none of a section of parameters.
+    """
+'''
+    (function,) = ast.parse(source).body
+    assert isinstance(function, ast.FunctionDef)
+    assert lacking(function) == ["c", "Returns"]

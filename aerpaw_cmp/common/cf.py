@@ -50,6 +50,11 @@ def write_text(book: Any, name: str, dimensions: tuple[str, ...], values: AnyArr
     values : ndarray of str
     meaning : str
         ``long_name``.
+
+    Returns
+    -------
+    netCDF4.Variable
+        Of ``S1``, its last dimension ``<name>_length``.
     """
     import numpy as np
 

@@ -583,6 +583,17 @@ def column_forms(
         The columns X of one series, (bins, width).
     width : int
         Number of columns.
+
+    Returns
+    -------
+    (width, width)
+        Symmetric, positive semidefinite [squared unit of the columns per dB^2].
+
+    Notes
+    -----
+    ``Sigma = N + D S S D'``: N has a block per series (offset, nuisance over distance, noise), D is the design of the
+    gains and S the standard deviation of their prior. It is inverted by Woodbury's identity: no matrix is larger than
+    a series or than the number of gains.
     """
     from scipy.linalg import cholesky, solve_triangular
 

@@ -264,6 +264,11 @@ def repeat_ceiling(
     within_m : float
         Farther reports do not count.
 
+    Returns
+    -------
+    RepeatCeiling
+        NaN where no report of the second flight has one of the first near it.
+
     Examples
     --------
     >>> at = np.array([[0.0, 0.0, 0.0], [100.0, 0.0, 0.0]])

@@ -168,6 +168,11 @@ def held_out_error_db(
     blocks : int
         Stretches of equal length.
 
+    Returns
+    -------
+    (n,)
+        Errors [dB].
+
     Examples
     --------
     >>> held_out_error_db(np.array([1.0, 1.0, 3.0, 3.0]), np.zeros(4), np.ones(4, bool), blocks=2).tolist()

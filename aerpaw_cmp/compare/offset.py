@@ -229,8 +229,12 @@ def trimmed_offset(
 
     Parameters
     ----------
+    measured_db, simulated_db : array_like, (n,)
+        Pairs of levels [dB]; pairs with NaN do not count.
     keep : float
         Share of pairs that counts, above 0.5 and up to 1 (at 1 it is :func:`grid_offset`).
+    step_db, span_db : float, (float, float)
+        Grid of the search [dB].
 
     Returns
     -------
@@ -284,6 +288,8 @@ def censored_offset(
         The receiver reports nothing lower; levels at or below it are "below" [dB, unit of the measurement].
     simulated_floor_db : float
         The simulation tells nothing about levels lower than this [dB, unit of the simulation].
+    step_db, span_db : float, (float, float)
+        Grid of the offset [dB].
 
     Returns
     -------
@@ -364,6 +370,8 @@ def pooled_offsets(
         All sequences.
     per : {"link", "tower", "channel", "flight", "all"}
         Which sequences share an offset.
+    step_db, span_db : float, (float, float)
+        Grid of the search [dB].
 
     Returns
     -------
@@ -490,6 +498,11 @@ def reference_power_dbm(
         Carrier; between the columns of the table powers are interpolated.
     amplifier : bool
         Whether the power amplifier was on.
+
+    Returns
+    -------
+    float
+        [dBm]
     """
     wanted = (node.lower(), category, channel.lower(), amplifier)
     rows = [row for row in table if (row.node, row.category, row.channel, row.amplifier) == wanted]

@@ -200,7 +200,16 @@ class PassTable:
                     partners.setdefault(entry.one.link, []).append((number, entry))
                 for number, here in self._flights[first]:
                     for other, there in partners.get(here.one.link, ()):
-                        yield _pair(number, here, other, there, self._places, found, shared, rule)
+                        yield _pair(
+                            first=number,
+                            here=here,
+                            second=other,
+                            there=there,
+                            places=self._places,
+                            found=found,
+                            shared=shared,
+                            rule=rule,
+                        )
 
 
 def pass_pairs(
@@ -275,6 +284,13 @@ def cell_means(
         Samples that count.
     cell_m : float
         Side of a square [m].
+
+    Returns
+    -------
+    cells : (c, 2) int
+        Numbers of the squares, east and north, ascending.
+    residual_db, height_m : (c,)
+        Means over the samples of each square.
     """
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
     found, which = np.unique(cells, axis=0, return_inverse=True)

@@ -379,6 +379,10 @@ class KCurve:
     at_edge: bool
 
 
+_CELLS_AT_ONCE = 2_000_000
+"""Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit."""
+
+
 def k_curve(
     measured: ArrayLike,
     sigma: ArrayLike,
@@ -399,6 +403,11 @@ def k_curve(
         Grid of K, by default :func:`k_grid`.
     replicates, seed : int
         Block bootstrap for the intervals of the best K.
+
+    Returns
+    -------
+    KCurve
+        Agreement and total variation by K; NaN where no pose has both ranks.
     """
     grid = k_grid() if k is None else np.asarray(k, dtype=np.float64)
     ri = _ranks(measured)
@@ -417,17 +426,22 @@ def k_curve(
             best_k_total_variation_interval=NO_INTERVAL,
             at_edge=False,
         )
-    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
-    equal = (ranks == ri[:, None]).astype(np.float64)
+    ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
+    equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))
-    length = known.block_length
     agree = equal.mean(axis=0)
-    drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
-    vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
-    for rank in range(1, MAX_RANK + 1):  # the same seed draws the same blocks each time
-        apart = (ranks == rank).astype(np.float64) - (ri == rank)[:, None]
-        vary += 0.5 * np.abs(apart.mean(axis=0))
-        varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
+    drawn, vary, varied = np.zeros((replicates, len(grid))), np.zeros(len(grid)), np.zeros((replicates, len(grid)))
+    width = max(1, _CELLS_AT_ONCE // len(ri))
+
+    def resampled(columns: BoolArray | IntArray) -> FloatArray:  # the same seed draws the same blocks each time
+        return bootstrap_means(columns.astype(np.float64), known.block_length, replicates=replicates, seed=seed)
+
+    for some in (slice(start, start + width) for start in range(0, len(grid), width)):
+        drawn[:, some] = resampled(equal[:, some])
+        for rank in range(1, MAX_RANK + 1):
+            apart = (ranks[:, some] == rank).astype(np.int8) - (ri == rank)[:, None]
+            vary[some] += 0.5 * np.abs(apart.mean(axis=0))
+            varied[:, some] += 0.5 * np.abs(resampled(apart))
     best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
     return KCurve(
         k=grid,
@@ -745,6 +759,16 @@ def compare_rank(
         Further numbers of the report, to recognise stale RI (``sinr_db`` takes part by itself).
     replicates, seed : int
         Bootstrap.
+
+    Returns
+    -------
+    RankComparison
+        Histograms, agreement and distances per K and rule, the curve over K, and what was stale.
+
+    Raises
+    ------
+    ValueError
+        A measured rank of 0; an H of another shape or length.
     """
     ri = _ranks(measured)
     if np.any(ri == 0):
@@ -799,6 +823,11 @@ def compare_ranks(
         Ranks of the same samples: NaN unknown, 0 no channel.
     replicates, seed : int
         Of the bootstrap and the permutation test.
+
+    Returns
+    -------
+    RankFit
+        Agreement, kappa and distances with their 95 % intervals and permutation tests.
     """
     one, two = _ranks(measured), _ranks(simulated)
     bars_one, bars_two = histogram(one), histogram(two)
@@ -897,6 +926,11 @@ def repeat_rank(
         As in :func:`~aerpaw_cmp.compare.statistics.same_places`.
     replicates, seed : int
         Bootstrap; with 0 replicates the interval is in closed form, to first order.
+
+    Returns
+    -------
+    RankRepeat
+        Kappa, its interval, agreement and the number of pairs; NaN without pairs.
     """
     one, two = _ranks(rank), _ranks(other_rank)
     known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)

@@ -166,6 +166,11 @@ def fit_receiver(
     penalties : sequence of float
         To choose from.
 
+    Returns
+    -------
+    Receiver
+        Fitted to all training samples with the penalty of least log loss on those left out.
+
     Raises
     ------
     InputError
@@ -226,6 +231,17 @@ def out_of_group(x: FloatArray, rank: IntArray, groups: IntArray, penalty: float
     ----------
     x : (..., n, features)
         Leading axes are further sets of features of the same samples, fitted at once.
+    rank : (n,) int
+        1 to :data:`~aerpaw_cmp.compare.rank.MAX_RANK`.
+    groups : (n,) int
+        Each is left out once.
+    penalty : float
+        Of the squared coefficients (ridge).
+
+    Returns
+    -------
+    (..., n, ranks)
+        Probabilities; they sum to 1 over the last axis.
     """
     mean, scale = _standard(x)
     z = (x - mean[..., None, :]) / scale[..., None, :]
@@ -372,6 +388,11 @@ def fit_mixture(
     rank, groups, penalties
         As :func:`fit_receiver`.
 
+    Returns
+    -------
+    ReceiverMixture
+        One receiver per geometry, in order, and their common decision.
+
     Raises
     ------
     InputError
@@ -441,6 +462,13 @@ def choose_features(
     finalists : int
         Only those with the best likelihood on the training samples themselves are cross-validated: all candidates have
         equally many coefficients, and a fit costs a tenth of a cross-validation.
+    replicates, seed : int
+        Of the bootstrap that says which candidates are no worse than the best.
+
+    Returns
+    -------
+    FeatureChoice
+        The best candidate, those tied with it, and the finalists by their log score.
 
     Raises
     ------

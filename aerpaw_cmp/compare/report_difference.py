@@ -133,6 +133,11 @@ def level_difference(
         Fitted offset of each [dB].
     replicates : int
         Of the bootstrap.
+
+    Returns
+    -------
+    LevelDifference
+        How far levels, offset, RMSE and mean absolute error moved, with intervals.
     """
     moved = _apart(first[1], second[1])
     both = np.isfinite(first[2]) & np.isfinite(second[2])
@@ -176,6 +181,11 @@ def mae_difference(
         Errors of the first and of the second model on the same samples in time order, without NaN [dB].
     replicates, seed : int
         Of the bootstrap.
+
+    Returns
+    -------
+    Changed
+        Mean absolute errors [dB], second minus first, and its interval.
 
     Examples
     --------
@@ -266,6 +276,11 @@ def rank_difference(
         Reported and simulated rank of each report on the common samples in time order; NaN: none, 0: no path.
     replicates, seed : int
         Of the bootstrap.
+
+    Returns
+    -------
+    RankDifference
+        Samples whose rank changed, and the change of agreement and kappa with intervals.
     """
     pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
     usable = np.column_stack([*pairs])

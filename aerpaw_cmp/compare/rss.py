@@ -349,6 +349,8 @@ def averaged_fits(
         Such as ``{"coherent": ..., "power_sum": ..., "local_mean": ...}`` [dB].
     windows_s : sequence of float
         Averaging windows [s] applied to both sides, over the samples that both sides have.
+    step_db, span_db : float, (float, float)
+        Of the offset search [dB].
 
     Returns
     -------
@@ -393,6 +395,11 @@ def path_averaged_fits(
         Lengths of the stretches.
     step_db, span_db : float, (float, float)
         Of the offset search [dB].
+
+    Returns
+    -------
+    dict
+        ``result[name][length_m]``: offset and RMSE.
     """
     measured = _levels(measured_db)
     result: dict[str, dict[float, OffsetFit]] = {name: {} for name in simulations}
@@ -421,8 +428,8 @@ def link_geometry(
 
     Parameters
     ----------
-    tower_m : (3,)
-        Array centre, east-north-up [m].
+    tower_m : (3,), (1, 3) or (n, 3)
+        Array centre, east-north-up, of a tower that moves at every pose [m].
     position_m : (n, 3)
         UAV [m].
     rotation : (n, 3, 3), optional
@@ -626,6 +633,13 @@ def error_spans(
         The residual is averaged over this window before it is judged [s].
     threshold_db : float, optional
         A span is where the average exceeds this; by default 1.5 times the RMSE.
+    largest : int
+        Spans that are given at most.
+
+    Returns
+    -------
+    list of ErrorSpan
+        Worst first.
     """
     time, residual = seconds(time_s), _levels(residual_db)
     ok = np.flatnonzero(np.isfinite(residual) & np.isfinite(time))
@@ -760,6 +774,11 @@ def channel_difference(
         Difference beyond which they part, after their mean difference.
     window_s : float
         Averaging of the difference before its spans are sought.
+
+    Returns
+    -------
+    ChannelDifference
+        Mean and spread of first minus second [dB], their correlation, and the spans where they part; NaN without pairs.
     """
     one, two = _levels(first_db), _levels(second_db)
     ok = np.isfinite(one) & np.isfinite(two)

@@ -76,6 +76,11 @@ def error_at_offset(
     mean_db : array_like
         Mean of simulated minus measured.
 
+    Returns
+    -------
+    ndarray
+        RMSE [dB], of the broadcast shape.
+
     Notes
     -----
     RMSE^2(o) = variance + (o - mean)^2, with the variance from the known point.

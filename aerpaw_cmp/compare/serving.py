@@ -91,10 +91,17 @@ def at_times(time_s: ArrayLike, of_s: ArrayLike, values: ArrayLike, *, within_s:
     Parameters
     ----------
     time_s : array_like, (n,)
+        Times asked for [s].
     of_s : array_like, (m,)
-        Ascending.
+        Times of the values, ascending [s].
     values : array_like, (m,)
     within_s : float
+        Farther samples do not count [s].
+
+    Returns
+    -------
+    (n,)
+        In the unit of ``values``.
     """
     wanted, known = np.asarray(time_s, dtype=np.float64), np.asarray(of_s, dtype=np.float64)
     column = np.asarray(values, dtype=np.float64)

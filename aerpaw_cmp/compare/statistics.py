@@ -386,6 +386,13 @@ def error_intervals(
     ----------
     measured_db, simulated_db : (n,)
         Pairs in time order, without NaN [dB].
+    replicates, seed : int
+        Of the bootstrap.
+
+    Returns
+    -------
+    ErrorIntervals
+        Offset [dB], RMSE [dB], correlation, and the autocorrelation that sets the length of the blocks.
     """
     if not len(measured_db):
         return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, autocorrelation(measured_db))
@@ -691,6 +698,8 @@ def same_places(
         A sample pairs with the nearest one of the other pass within this distance [m].
     heading_deg, other_heading_deg : (n,), (m,), optional
         Where given, the headings of a pair agree within ``heading_within_deg``.
+    heading_within_deg : float
+        Largest difference of the headings of a pair [deg].
 
     Returns
     -------
@@ -740,6 +749,11 @@ def repeatability(
         Headings; given both, those of a pair have to agree.
     heading_within_deg : float
         Within this.
+
+    Returns
+    -------
+    Repeatability
+        Standard deviation and mean of the difference (other minus first) [dB], number of pairs, interval.
     """
     known, other_known = np.flatnonzero(np.isfinite(level_db)), np.flatnonzero(np.isfinite(other_level_db))
     here, there = same_places(

@@ -142,6 +142,11 @@ def drafts(
         Of relative times.
     mapping : mapping, optional
         Keys of a log that ``--map`` gave.
+
+    Returns
+    -------
+    list of Draft
+        At least one; its remarks say what is left to check.
     """
     found = [flight for flight in flights(files) if flight.complete]
     options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}

@@ -291,6 +291,16 @@ def sample(
         Step of the prediction [s].
     origin_ns : int, optional
         Zero of the seconds; by default the first instant.
+
+    Returns
+    -------
+    Sampled or str
+        Why there is nothing to fit, where it is a text.
+
+    Raises
+    ------
+    ValueError
+        As many times as levels, or as many predictions as instants, are not there.
     """
     stamp, levels = nanoseconds(times).ravel(), np.asarray(measured_db, dtype=np.float64).ravel()
     if stamp.shape != levels.shape:
@@ -339,6 +349,11 @@ def no_lag(reason: str, n: int, window_s: float, lags: FloatArray) -> LagFit:
         Largest lag [s]: all the interval says.
     lags : (m,)
         Lags that would have been tried [s].
+
+    Returns
+    -------
+    LagFit
+        With the verdict "failed".
     """
     nan = float("nan")
     return LagFit(
@@ -481,6 +496,11 @@ def fit_lag(
         Largest lag [s].
     drifting : bool
         Fit a drift, too.
+
+    Returns
+    -------
+    LagFit
+        The lag (radio minus telemetry) [s], its interval, the drift, and the verdict.
     """
     middle = 0.5 * float(t[0] + t[-1])
     few = slice(None, None, -(-len(t) // _SCANNED))

@@ -127,6 +127,11 @@ def telemetry_frame(
         Between rows [s].
     frame : SiteFrame
         Local to geographic.
+
+    Returns
+    -------
+    DataFrame
+        Columns of a telemetry stream (:mod:`aerpaw_cmp.logs.records`), a row per instant.
     """
     time_s = np.arange(0.0, trajectory.duration_s + 1e-9, interval_s)
     position = trajectory.position_at(time_s)
@@ -242,6 +247,13 @@ class FlightSimulator:
             Files that must not be replaced: the flight file and what it names.
         force : bool
             Replace logs that truth.json does not list as synthetic, too.
+        progress : Progress
+            Gets the path of each log.
+
+        Returns
+        -------
+        list of Path
+            Logs in the order of the flight file, then truth.json.
 
         Raises
         ------

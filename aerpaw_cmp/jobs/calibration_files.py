@@ -110,6 +110,11 @@ def record_of(
         The settings to copy into a flight file.
     stages_s : mapping of str to float
         Time of each stage [s].
+
+    Returns
+    -------
+    CalibrationData
+        As :func:`aerpaw_cmp.report.calibration_html.write_calibration` takes it.
     """
     model = found.learned.choice.model
     mounts = {
@@ -169,6 +174,12 @@ def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[s
         Of the folder, as the settings name its files.
     stages_s : mapping of str to float
         Time of each stage [s].
+
+    Returns
+    -------
+    record : CalibrationData
+    text : str
+        calibrated.yaml.
     """
     maps = antenna_maps(found)
     carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)

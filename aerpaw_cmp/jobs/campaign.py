@@ -24,7 +24,7 @@ from ..common.yamlfile import load_yaml, nearest
 from ..compare.heldout import rmse
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
-from ..report.campaign_data import CampaignData, Failure, RankHeldOutFold, RssRow
+from ..report.campaign_data import CampaignData, Failure, RankHeldOutFold, RankRow, RssRow
 from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
@@ -146,6 +146,11 @@ def run(
     stage, progress : callable
         A context manager per named stage; lines of progress.
 
+    Returns
+    -------
+    CampaignData
+        Rows of every flight and setting, pooled offsets, repeats, folds; a flight that failed is among ``failures``.
+
     Raises
     ------
     UsageError
@@ -186,8 +191,8 @@ def run(
                     if campaign.held_out.criterion == "rmse":
                         folds = _held_out(campaign.held_out, tasks, rows, crew, progress)
                     else:
-                        ranked = {row.flight for o in results for row in o.rank}
-                        rank_folds = _held_out_rank(campaign.held_out, tasks, ranked, progress)
+                        given = [row for o in results for row in o.rank]
+                        rank_folds = _held_out_rank(campaign.held_out, tasks, given, progress)
                 except AerpawCmpError as error:
                     trouble = str(error)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
@@ -254,9 +259,7 @@ def _held_out(
     settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], workers: Workers, progress: Progress
 ) -> list[Any]:
     """Fit under one setting on the flights that gave RSS under it."""
-    label = settings.setting or tasks[0].setting if tasks else ""
-    with_rss = {row.flight for row in rows if row.setting == label}
-    of = {task.flight: task for task in tasks if task.setting == label and task.flight in with_rss}
+    label, of = _tasks_of_fit(settings, tasks, rows)
     return fit_all(
         {flight: flight_data(task) for flight, task in of.items()},
         {key: [float(v) for v in values if not isinstance(v, list)] for key, values in settings.fit.items()},
@@ -269,15 +272,23 @@ def _held_out(
     )
 
 
-def _held_out_rank(
-    settings: HeldOutSettings, tasks: Sequence[Task], ranked: set[str], progress: Progress
-) -> list[RankHeldOutFold]:
-    """Fit rank parameters under one setting on the flights that gave rank."""
-    assert settings.criterion != "rmse"
+def _tasks_of_fit(
+    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow] | Sequence[RankRow]
+) -> tuple[str, dict[str, Task]]:
+    """Label of the setting that a fit starts from, and the task of each flight that gave rows under it."""
     label = settings.setting or tasks[0].setting if tasks else ""
-    flights = {t.flight: flight_data(t) for t in tasks if t.setting == label and t.flight in ranked}
+    gave = {row.flight for row in rows if row.setting == label}
+    return label, {task.flight: task for task in tasks if task.setting == label and task.flight in gave}
+
+
+def _held_out_rank(
+    settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RankRow], progress: Progress
+) -> list[RankHeldOutFold]:
+    """Fit rank parameters under one setting on the flights that gave rank under it."""
+    assert settings.criterion != "rmse"
+    label, of = _tasks_of_fit(settings, tasks, rows)
     return fit_rank_all(
-        flights,
+        {flight: flight_data(task) for flight, task in of.items()},
         settings.fit,
         settings.fit_on,
         criterion=settings.criterion,

@@ -18,7 +18,7 @@ from ..compare.heldout import fit_held_out, goes_round, rmse
 from ..compare.offset import grid_offset
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RssSettings
 from ..report.campaign_data import HeldOutFold, HeldOutRow
 from .levels import levels_of
 from .replay import Clock, estimate_clocks, replay_rss
@@ -84,7 +84,7 @@ class Bench:
         if known is not None:
             return np.array([known])
         pairs = zip(self.measured_db, self.simulated(point), strict=True)
-        return np.concatenate([own_residual_db(m, s, self.data.settings) for m, s in pairs])
+        return np.concatenate([own_residual_db(m, s, self.data.settings.rss) for m, s in pairs])
 
     def thinned(self, samples: int) -> Bench:
         """Evenly spread samples of every series."""
@@ -111,9 +111,9 @@ def _combinations(grids: Mapping[str, Sequence[float]]) -> int:
     return prod(len(values) for values in grids.values())
 
 
-def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, settings: FlightFile) -> FloatArray:
+def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, rules: RssSettings) -> FloatArray:
     """Measured minus simulated after the best offset of these very samples (n,)."""
-    fit = grid_offset(measured_db, simulated_db, step_db=settings.rss.step_db, span_db=settings.rss.span_db)
+    fit = grid_offset(measured_db, simulated_db, step_db=rules.step_db, span_db=rules.span_db)
     return measured_db + fit.offset_db - simulated_db
 
 
@@ -125,6 +125,25 @@ def bench_of(data: FlightData) -> Bench:
     replays = zip(data.rss, replay_rss(data, silent, clocks), strict=True)
     measured = [levels_of(series, replayed, settings).measured_db for series, replayed in replays]
     return Bench(data, clocks, measured)
+
+
+def training_sets(names: Sequence[str], fit_on: Sequence[str] | None, kind: str) -> list[list[str]]:
+    """Flights of each fit: those that are named and gave ``kind`` (RSS, rank), or all but one, each in turn.
+
+    Raises
+    ------
+    UsageError
+        No flight to fit on, or too few to leave one out.
+    """
+    if fit_on is None:
+        if len(names) < 2:
+            raise UsageError(f"{len(names)} flights with {kind}", expected="two or more, to leave one out at a time")
+        return [[name for name in names if name != left] for left in names]
+    chosen = [name for name in fit_on if name in names]
+    if not chosen:
+        known = ", ".join(names) or "none has"
+        raise UsageError(f"no flight of held_out.fit_on gave {kind}", expected=f"a flight that has {kind}: {known}")
+    return [chosen]
 
 
 def fit_all(
@@ -156,6 +175,13 @@ def fit_all(
         Search between the values, too.
     spread : callable, optional
         Computes the errors of all combinations of values, flight by flight, on workers: the same numbers, sooner.
+    progress : Progress
+        Gets what is fitted.
+
+    Returns
+    -------
+    list of HeldOutFold
+        One with ``fit_on``, else one per flight, which is left out of it.
 
     Raises
     ------
@@ -164,13 +190,7 @@ def fit_all(
     InputError
         A flight of the fit has no sample that could be compared.
     """
-    names = list(flights)
-    chosen = None if fit_on is None else [name for name in fit_on if name in names]
-    if chosen == []:
-        known = ", ".join(names) or "none has"
-        raise UsageError("no flight of held_out.fit_on gave RSS", expected=f"a flight that has RSS: {known}")
-    if chosen is None and len(names) < 2:
-        raise UsageError(f"{len(names)} flights with RSS", expected="two or more, to leave one out at a time")
+    names, trainings = list(flights), training_sets(list(flights), fit_on, "RSS")
     full = {}
     for name, data in flights.items():
         progress(f"held-out: prepare {name}")
@@ -179,10 +199,12 @@ def fit_all(
     if spread is not None and _combinations(grids) <= LARGEST_PRODUCT:
         progress(f"held-out: {_combinations(grids)} combinations of values on the workers")
         points = [dict(zip(grids, map(float, values), strict=True)) for values in product(*grids.values())]
-        for name, errors in spread(dict.fromkeys(chosen or names, points)).items():
+        for name, errors in spread(
+            dict.fromkeys(dict.fromkeys(n for train in trainings for n in train), points)
+        ).items():
             few[name].known.update(zip(map(_named, points), errors, strict=True))
     folds = []
-    for train in [chosen] if chosen is not None else [[n for n in names if n != left] for left in names]:
+    for train in trainings:
         progress("held-out: fit on " + ", ".join(train))
         test = [name for name in names if name not in train]
         try:
@@ -240,6 +262,11 @@ def search(
         Names of the flights to fit on.
     refine : bool
         Search between the values, too (where all combinations are tried).
+
+    Returns
+    -------
+    Search
+        The best values, those at the end of their list, and how many points were looked at.
     """
 
     def objective(point: Mapping[str, float], flight: str) -> FloatArray:
@@ -298,8 +325,8 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
                     channel=series.channel,
                     fitted_here=name in train,
                     n=int((np.isfinite(measured) & np.isfinite(fitted)).sum()),
-                    start_rmse_db=rmse(own_residual_db(measured, start, bench.data.settings)),
-                    rmse_db=rmse(own_residual_db(measured, fitted, bench.data.settings)),
+                    start_rmse_db=rmse(own_residual_db(measured, start, bench.data.settings.rss)),
+                    rmse_db=rmse(own_residual_db(measured, fitted, bench.data.settings.rss)),
                     transferred_offset_db=offset,
                     transferred_rmse_db=rmse(measured + offset - fitted),
                     own=("offset_db", *_own_lag(bench.clocks[i], point)),

@@ -99,6 +99,11 @@ def campaign_status(
         Folder or URL of the outcomes; None where nothing is kept.
     workers : int
         Tasks side by side, for the time.
+
+    Returns
+    -------
+    CampaignStatus
+        A state per task, and the time that what is left may take [s].
     """
     states = [TaskState(task=task, key=None) for task in tasks] if keep is None else task_states(tasks, keep)
     by_setting: dict[str, list[float]] = {}
@@ -243,7 +248,20 @@ def kept_outcomes(
 def compute(
     tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, found: dict[int, Outcome]
 ) -> None:
-    """Let the workers do what is to do; each outcome is put into ``found``."""
+    """Let the workers do what is to do; each outcome is put into ``found``.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+        All of the campaign.
+    orders : mapping of int to Order
+        What is to do, by the number of its task.
+    workers : Workers
+    progress : Progress
+        Tasks done, and the time left.
+    found : dict of int to Outcome
+        Outcomes by the number of the task; gets the new ones.
+    """
     if not orders:
         return
     numbers = list(orders)

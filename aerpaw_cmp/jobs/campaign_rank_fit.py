@@ -11,7 +11,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..common.errors import InputError, UsageError
+from ..common.errors import InputError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray, IntArray
 from ..compare import rank as ranks
@@ -20,6 +20,7 @@ from ..compare.statistics import paired_difference
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..report.campaign_data import RankHeldOutFold, RankHeldOutRow
+from .campaign_fit import LARGEST_PRODUCT, training_sets
 from .replay import replay_rank
 
 Criterion = Literal["kappa", "log_score", "total_variation"]
@@ -27,9 +28,6 @@ Point = Mapping[str, Any]
 
 K_KEY = "rank.k"
 """The one key of the fit that is no key of a replay: a single singular-value ratio."""
-
-LARGEST_PRODUCT = 500
-"""Combinations that are all tried; of more, one parameter after the other is searched."""
 
 SWEEPS = 4
 """Rounds over all parameters, at most."""
@@ -155,6 +153,11 @@ def fit_rank_all(
         Evenly spread reports per series that the search looks at; all are scored.
     progress : Progress
 
+    Returns
+    -------
+    list of RankHeldOutFold
+        One with ``fit_on``, else one per flight, which is left out of it.
+
     Raises
     ------
     UsageError
@@ -162,16 +165,11 @@ def fit_rank_all(
     InputError
         No report could be compared under any of the values.
     """
-    names = list(flights)
-    chosen = None if fit_on is None else [name for name in fit_on if name in names]
-    if chosen == []:
-        raise UsageError("no flight of held_out.fit_on gave rank", expected=", ".join(names) or "a flight with rank")
-    if chosen is None and len(names) < 2:
-        raise UsageError(f"{len(names)} flights with rank", expected="two or more, to leave one out at a time")
+    trainings = training_sets(list(flights), fit_on, "rank")
     full = {name: RankBench(data) for name, data in flights.items()}
     few = {name: bench.thinned(samples) for name, bench in full.items()}
     folds = []
-    for train in [chosen] if chosen is not None else [[n for n in names if n != left] for left in names]:
+    for train in trainings:
         progress("held-out rank: fit on " + ", ".join(train))
         found = search([few[name] for name in train], grids, criterion)
         if not np.isfinite(found.loss):

@@ -365,6 +365,11 @@ def make_maps(
         Share the pieces of the grid.
     name : str
         The site as workers load it.
+
+    Returns
+    -------
+    MapOutcome
+        Maps by foliage mode; no study yet.
     """
     outcome = MapOutcome(site, settings)
     grid = Grid.over_area(site.area_m, settings.spacing_m)
@@ -461,6 +466,10 @@ def maps_record(
         Seconds per stage.
     paper : iterable of PaperRow
         The table of what the paper states.
+
+    Returns
+    -------
+    MapsData
     """
     s, result = outcome.settings, outcome.shown
     rss = tuple(one for mode, maps in outcome.ordered() for one in _rss_maps(maps, mode))

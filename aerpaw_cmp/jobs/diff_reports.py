@@ -65,6 +65,11 @@ def run_diff(
     force : bool
         Write into a folder that holds files of others.
 
+    Returns
+    -------
+    ReportDiff
+        What differs in settings, inputs, levels and ranks, and by how much.
+
     Raises
     ------
     UsageError

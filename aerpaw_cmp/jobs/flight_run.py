@@ -94,6 +94,11 @@ def run_flight(
         Also score simpler and richer models of the RSS on stretches left out.
     meanwhile : callable, optional
         What this process may do while others estimate clocks.
+
+    Returns
+    -------
+    FlightRun
+        Replays, numbers of the comparison, and the ladder where it was asked for.
     """
     stages = stages or Stages()
     replays = replay_flight(data, stages, meanwhile=meanwhile)

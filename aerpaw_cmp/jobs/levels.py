@@ -55,6 +55,11 @@ def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, sett
         At the replayed poses [dB].
     settings : RssSettings
         ``field`` and ``window_s``.
+
+    Returns
+    -------
+    (n,)
+        [dB]; NaN where no pose is known.
     """
     level = replayed.spread(level_db)
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
@@ -67,7 +72,7 @@ def gain_sd_db(site: Site, tower: str, replayed: Replayed) -> FloatArray | None:
     None where neither antenna states one.
     """
     link, poses = replayed.link, replayed.poses
-    ray = poses.position_m - site.towers[tower].position_m
+    ray = poses.position_m - replayed.source_m(site)
     at_uav = np.einsum("nji,nj->ni", poses.rotation, -ray)
     square = np.zeros(len(ray))
     stated = False

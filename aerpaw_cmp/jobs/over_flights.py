@@ -119,6 +119,11 @@ def repeats(
         Share many pairs; the same numbers.
     place : str, optional
         Folder or URL that the workers reach, for the series; by default a folder of this machine.
+
+    Returns
+    -------
+    list of Repeat
+        By the rows of the two passes, ascending.
     """
     passes = [
         Pass(

@@ -19,9 +19,10 @@ from ..common.errors import UsageError
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..flight.data import FlightData
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses, single_element
 from ..propagation.tracer import replay
+from ..site.site import Site
 from ..site.siteyaml import load_site
 
 MEASURED = {
@@ -147,16 +148,21 @@ def report_plan(
         As for the report.
     force : bool
 
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
     Raises
     ------
     UsageError, InputError
         What the report itself would raise of its settings, logs and output.
     """
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
 
     OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
     start = time.process_time()
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
@@ -199,33 +205,33 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
     groups: dict[tuple[str, str], list[Any]] = {}
     for series in data.rss:
         groups.setdefault((series.tower, series.settings_key), []).append(series)
-    rss, rank, attitude = [], [], data.settings.rt.attitude
+    rss, rank, site, rt = [], [], data.site, data.settings.rt
     for (tower, _), members in groups.items():
         assert data.track is not None
         track = data.track.pose_at(np.concatenate([series.time for series in members]))
-        poses = Poses(track.position_m[track.valid], attitude_rotation(track, attitude)[track.valid])
+        poses = Poses(track.position_m[track.valid], attitude_rotation(track, rt.attitude)[track.valid])
         name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
-        rss.append(_tried(data, name, members[0].link.build([tower], data.folder), poses))
+        rss.append(_tried(site, rt, name, members[0].link.build([tower], data.folder), poses))
     for one in data.rank:
         position, valid = rank_positions(one, data.track)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         link = data.settings.link.rank.build([one.tower], data.folder)
-        rank.append(_tried(data, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
+        rank.append(_tried(site, rt, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
     return rss, rank
 
 
-def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStage:
+def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> PlannedStage:
     """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
     from .replay import replay_poses
 
-    work, n = f"{len(poses)} poses, engine {data.settings.rt.engine}", len(poses)
-    if data.settings.rt.engine != "image" or n == 0:
+    work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
+    if rt.engine != "image" or n == 0:
         return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
         some = Poses(poses.position_m[few], np.ascontiguousarray(poses.rotation[few]))
-        return _cpu_seconds(lambda: replay_poses(data.site, data.settings.rt, link, some))
+        return _cpu_seconds(lambda: replay_poses(site, rt, link, some))
 
     few, more = TRIED_POSES
     if n <= more:
@@ -251,6 +257,16 @@ def map_plan(
     flight : Path, optional
         Whose track trains the test "along a flight".
     force : bool
+
+    Returns
+    -------
+    Plan
+        Stages with their work and time [s].
+
+    Raises
+    ------
+    UsageError
+        There is no such flight file; the output is an input, or holds files of others.
     """
     from ..maps.grid import Grid
     from .coverage_map import make_maps

@@ -71,6 +71,16 @@ def run_ingest(
     force : bool
     options
         Fields of :class:`aerpaw_cmp.logs.readers.ReadOptions`.
+
+    Returns
+    -------
+    dict
+        What :func:`aerpaw_cmp.logs.ingest.summary` says; with a draft also ``draft`` and ``drafts``.
+
+    Raises
+    ------
+    UsageError, InputError, OutputError
+        With what was found, expected, and the likely cause.
     """
     from ..logs.flight_file import flight_bytes, is_flight_file
     from ..logs.ingest import ingest, summary
@@ -123,6 +133,16 @@ def run_simulate(
     force : bool
     progress : Progress
         Gets the name of each log.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    UsageError, OutputError
+        As :meth:`aerpaw_cmp.flight.simulate.FlightSimulator.run`.
     """
     from ..flight.data import choose_site
     from ..flight.settings import load_flight
@@ -184,16 +204,25 @@ def run_report(
         ``inputs`` of the metrics.json of an earlier report: nothing is written if one of them has changed since.
     progress : Progress
 
+    Returns
+    -------
+    ReportOutcome
+
     Raises
     ------
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
+    from ..flight.data import load_data
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
     from ..report.write import FIGURES, STYLES, prepare_report, write_report
+    from .flight_run import run_flight
+    from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
+    from .manifest import other_inputs
+    from .report_record import report_record
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
@@ -202,22 +231,24 @@ def run_report(
     formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
+    if recommend is not None:
+        _beside(recommend, flight, logs_root)
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
         target = None
         if recommend is not None:
-            _beside(recommend, flight, logs_root)
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
-        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages, partial(prepare_report, figures))
+        with stages("read"):
+            data = load_data(settings, flight.parent, logs_root)
+        found = run_flight(data, stages, ladder=True, meanwhile=partial(prepare_report, figures))
+        record = report_record(found, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
-            refuse_changed(same_inputs, record)
+            refuse_changed(same_inputs, record.inputs)
         if target is not None:
-            from .ladder import recommended_text
-
-            target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight), found.ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
@@ -234,7 +265,26 @@ def plan_report(
     figures: str = "page",
     force: bool = False,
 ) -> Any:
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing."""
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a report: what :func:`run_report` would do; writes nothing.
+
+    Parameters
+    ----------
+    flight : Path
+    out, logs_root : Path, optional
+    engine, audit : str, optional
+    figures : str
+    force : bool
+        As for :func:`run_report`.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    UsageError, InputError
+        What the report itself would raise of its settings, logs and output.
+    """
     from ..flight.settings import load_flight
     from .plan import report_plan
 
@@ -274,6 +324,11 @@ def run_audit(
     force : bool
         Replace also what was changed in the folder by hand.
     progress : Progress
+
+    Returns
+    -------
+    ReportOutcome
+        Of the report made anew.
 
     Raises
     ------
@@ -315,42 +370,6 @@ def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> lis
 
     roots = [path.parent] if logs_root is None else [logs_root, path.parent]
     return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
-
-
-def _replayed_and_compared(
-    settings: Any, flight: Path, logs_root: Path | None, stages: Stages, meanwhile: Callable[[], object]
-) -> Any:
-    """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
-    from ..flight.data import gather, read_logs
-
-    with stages("read"):
-        files = read_logs(settings, flight.parent, logs_root)
-        data = gather(settings, flight.parent, files, logs_root)
-    from .flight_run import run_flight
-    from .what_if import foliage_notes
-
-    found = run_flight(data, stages, ladder=True, meanwhile=meanwhile)
-    replays = found.replays.all
-    speed: tuple[Any, ...] = ()
-    if settings.report.speed_table and settings.rt.audit_links and settings.report.audit == "now":
-        with stages("speed"):
-            from .speed_table import speed_rows
-
-            speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
-    from ..report.build import report_data
-    from .manifest import other_inputs
-    from .pose_paths import pose_paths
-
-    notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    record = report_data(
-        data,
-        found.result,
-        speed=speed,
-        notes=notes,
-        other_inputs=other_inputs(settings, flight, logs_root),
-        paths=pose_paths(data, found.replays),
-    )
-    return record, found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -467,6 +486,16 @@ def run_site_import(
         What areas without a tag are: building, forest or geofence.
     force : bool
         Replace a file that this tool did not write.
+
+    Returns
+    -------
+    list of str
+        A line per thing that was done.
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
     """
     from ..site.footprints import import_site, site_yaml
 
@@ -507,6 +536,16 @@ def run_site_show(
         Also the scene as PLY and Mitsuba XML.
     force : bool
         Replace files that this tool did not write.
+
+    Returns
+    -------
+    list of Path
+        Files written.
+
+    Raises
+    ------
+    UsageError
+        A pose without a flight, or one that the track does not have.
     """
     from ..report.site_view import write_site_view
     from ..site.siteyaml import load_site
@@ -529,10 +568,10 @@ def run_site_show(
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")
         else:
-            from ..flight.data import gather, read_logs
+            from ..flight.data import load_data
             from ..report.build import track_of
 
-            data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+            data = load_data(settings, flight.parent, logs_root)
             place, track = data.site, track_of(data)
             if pose is not None:
                 paths = _paths_of_pose(settings, place, track, pose)
@@ -646,10 +685,25 @@ def run_map(
         A coarse map; what ``options`` state still counts.
     flight : Path, optional
         flight.yaml whose track trains the test "along a flight".
+    logs_root : Path, optional
+        Folder against which its logs resolve.
     workers, scheduler
         Who evaluates the pieces of the grid: workers of this machine, or of a Dask scheduler.
+    force : bool
+        Write into a folder that holds files of others.
+    progress : Progress
+        Stage and share done.
     options
         Fields of :class:`aerpaw_cmp.jobs.coverage_map.MapSettings`; None leaves the default.
+
+    Returns
+    -------
+    MapsOutcome
+
+    Raises
+    ------
+    UsageError, InputError
+        With what was found, expected, and the likely cause.
     """
     from ..common.versions import versions
     from ..report.maps_html import maps_metrics, write_maps
@@ -709,7 +763,25 @@ def plan_map(
     site: str, *, out: Path | None = None, quick: bool = False, flight: Path | None = None, force: bool = False,
     **options: Any,
 ) -> Any:  # fmt: skip
-    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing."""
+    """The :class:`~aerpaw_cmp.jobs.plan.Plan` of a map: what :func:`run_map` would do; writes nothing.
+
+    Parameters
+    ----------
+    site : str
+    out, flight : Path, optional
+    quick, force : bool
+    options
+        As for :func:`run_map`.
+
+    Returns
+    -------
+    Plan
+
+    Raises
+    ------
+    UsageError
+        What the map itself would raise of its settings and output.
+    """
     from .plan import map_plan
 
     inputs = [Path(site), *([] if flight is None else [flight])]
@@ -721,12 +793,12 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
     """East and north (n, 2) [m] of a flight, and its name."""
     import numpy as np
 
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
     from ..flight.settings import load_flight
     from ..report.build import track_of
 
     settings = load_flight(flight)
-    track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
+    track = track_of(load_data(settings, flight.parent, logs_root))
     if track is None:
         raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
     line = np.column_stack([track.east_m, track.north_m])
@@ -785,6 +857,10 @@ def run_campaign(
     export : sequence of str
         Formats of the samples of the first setting, besides those that campaign.yaml names.
     progress : Progress
+
+    Returns
+    -------
+    CampaignOutcome
 
     Raises
     ------
@@ -857,7 +933,30 @@ def write_tracebacks(failures: Sequence[Any], folder: Path) -> None:
 def campaign_status(
     path: Path, *, logs_root: Path | None = None, keep: str | None = None, fresh: bool = False, workers: int = 1
 ) -> Any:
-    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`)."""
+    """What of a campaign is kept and what is to do (:class:`~aerpaw_cmp.jobs.campaign_plan.CampaignStatus`).
+
+    Parameters
+    ----------
+    path : Path
+        campaign.yaml.
+    logs_root : Path, optional
+        Folder against which logs resolve.
+    keep : str, optional
+        Folder or URL of the outcomes, in place of what campaign.yaml says.
+    fresh : bool
+        As though nothing were kept.
+    workers : int
+        Tasks side by side, for the time.
+
+    Returns
+    -------
+    CampaignStatus
+
+    Raises
+    ------
+    UsageError
+        A campaign.yaml that is wrong.
+    """
     from . import campaign_plan
     from .campaign import campaign_tasks, load_campaign
 
@@ -902,6 +1001,10 @@ def run_calibrate(
         Replace also what this tool did not write; never an input.
     progress : Progress
         Stage and share done.
+
+    Returns
+    -------
+    CalibrateOutcome
 
     Raises
     ------

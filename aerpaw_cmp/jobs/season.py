@@ -40,7 +40,7 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     data = dataclasses.replace(data, rss=tuple(rows))
     if not rows:
         return dataclasses.replace(data, season=Season(reports=dict(reports or {})))
-    started = started_of(data)
+    started = started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
     links = list(dict.fromkeys(row.link for row in rows))
     ranking = rank_settings(rows, list(data.settings), order, "")
@@ -60,10 +60,10 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     )
 
 
-def started_of(data: CampaignData) -> dict[str, int]:
+def started_of(rows: Iterable[RssRow]) -> dict[str, int]:
     """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
     found: dict[str, int] = {}
-    for row in data.rss:
+    for row in rows:
         if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
             found[row.flight] = min(row.start_ns, found.get(row.flight, row.start_ns))
     return found
@@ -115,7 +115,23 @@ def error_of(row: RssRow) -> float:
 def rank_settings(
     rows: Iterable[RssRow], settings: Sequence[str], flights: Sequence[str], link: str
 ) -> list[SettingRank]:
-    """Settings by their mean error over flights, and their difference to the first on the same flights and links."""
+    """Settings by their mean error over flights, and their difference to the first on the same flights and links.
+
+    Parameters
+    ----------
+    rows : iterable of RssRow
+    settings : sequence of str
+        Labels; ties keep their order.
+    flights : sequence of str
+        Those that are compared.
+    link : str
+        What the rows are of, for the record.
+
+    Returns
+    -------
+    list of SettingRank
+        Least mean error first; settings without a finite error are left out.
+    """
     table: dict[str, dict[str, dict[str, float]]] = {name: {} for name in settings}
     for row in rows:
         if np.isfinite(error_of(row)):

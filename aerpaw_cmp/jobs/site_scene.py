@@ -64,6 +64,11 @@ def run_scene_import(
     force : bool
         Replace a file that this tool did not write.
 
+    Returns
+    -------
+    list of str
+        A line per thing that was done.
+
     Raises
     ------
     UsageError
@@ -187,6 +192,11 @@ def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = F
         Crowns and trunks too.
     force : bool
         Replace files that this tool did not write.
+
+    Returns
+    -------
+    list of Path
+        Files written.
     """
     with OutputFolder(out, job="site export", inputs=[Path(site)], force=force) as output, output.filling() as folder:
         written = export_scene(load_site(site), folder, trees=trees)

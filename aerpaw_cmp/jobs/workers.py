@@ -285,6 +285,11 @@ def open_workers(
     progress : Progress
         Where the workers are, and the address of the dashboard.
 
+    Yields
+    ------
+    Workers
+        Closed at the end of the block.
+
     Raises
     ------
     UsageError

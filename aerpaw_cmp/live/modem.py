@@ -139,6 +139,10 @@ def number(name: str, text: str | None, flags: list[str], *, prefix: str = "") -
     prefix : str
         Before the field in the flag.
 
+    Returns
+    -------
+    int or None
+
     Examples
     --------
     >>> flags = []
@@ -278,6 +282,12 @@ def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: 
         Receives what was odd.
     command, kind : str
         Such as ``+QRSRP``; the field that its values get.
+
+    Returns
+    -------
+    dict
+        By radio access technology: ``{kind: [level of each receiver, None where not known]}`` [dBm or dB], and
+        ``extra`` fields.
     """
     values: Values = {}
     for line in lines:
@@ -311,6 +321,11 @@ def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Seq
         Such as ``+QCAINFO``.
     names : sequence of str
         Of the fields, in order.
+
+    Returns
+    -------
+    dict
+        ``{"rows": [{name: text or None}, ...]}``.
     """
     rows: list[Values] = []
     for line in lines:

@@ -125,6 +125,16 @@ def format_power_log(
         Write od's closing offset, as a sounder that ends by itself does. Always written where the log ends inside
         a run of equal samples, whose length would be lost otherwise.
 
+    Returns
+    -------
+    bytes
+        The file.
+
+    Raises
+    ------
+    ValueError
+        Times and levels of different lengths.
+
     Notes
     -----
     Samples equal to the one before are suppressed: one ``*`` for the run, as ``od`` does without ``-v``.
@@ -167,6 +177,11 @@ def format_quectel_csv(
         Zone of the logger's clock.
     mcs, cqi : array, shape (n,), optional
         As reported; by default those of a good link (27, 15).
+
+    Returns
+    -------
+    bytes
+        The file.
     """
     ri = _ri(rank)
     some = ri > 0

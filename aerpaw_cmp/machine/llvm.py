@@ -252,6 +252,11 @@ def try_library(
         What it runs: prints one JSON line.
     timeout_s : float
         After it the child is ended and the trial has failed [s].
+
+    Returns
+    -------
+    Trial
+        Whether it works, and why not.
     """
     if reason := _too_old(library.version):
         return Trial(library, False, reason)

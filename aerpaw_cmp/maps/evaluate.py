@@ -131,6 +131,10 @@ def blocked(model: Predictor, points_m: ArrayLike, values: ArrayLike, block_m: f
     block_m : float
         Side of a block.
 
+    Returns
+    -------
+    Score
+
     Raises
     ------
     UsageError
@@ -158,6 +162,10 @@ def grouped(model: Predictor, points_m: ArrayLike, values: ArrayLike, group: Int
     values : array_like, (n, ...)
     group : (n,) int
         Positions of one number are left out together.
+
+    Returns
+    -------
+    Score
     """
     data = np.asarray(values, dtype=np.float64)
     estimate = np.full_like(data, np.nan)
@@ -215,6 +223,11 @@ def along_trajectory(model: Predictor, grid: Grid, values: ArrayLike, trajectory
     trajectory_m : (samples, 2+)
         East, north [m] of the flight; samples outside the map do not count.
 
+    Returns
+    -------
+    Score
+        On the cells that were not crossed.
+
     Raises
     ------
     UsageError
@@ -266,6 +279,16 @@ def interval_coverage(
         True values, predictions, and the variances claimed for them; NaN takes no part.
     levels : sequence of float
         Probabilities of the intervals.
+
+    Returns
+    -------
+    IntervalCoverage
+        Share inside per level (to compare with the level), mean squared standardised error, number of values.
+
+    Notes
+    -----
+    A value is inside the interval of probability p where ``|z| <= Phi^-1((1 + p) / 2)`` with
+    ``z = (estimate - value) / sqrt(variance)``.
     """
     from scipy.stats import norm
 
@@ -301,6 +324,11 @@ def learning_curve(
         Numbers of samples, each below n.
     repeats, seed : int
         Random orders of the positions, and of their generator.
+
+    Returns
+    -------
+    (sizes, ...)
+        MAE in the unit of the values; NaN where nothing could be predicted.
 
     Raises
     ------

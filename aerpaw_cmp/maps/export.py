@@ -47,6 +47,11 @@ def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[L
         From local metres to latitude and longitude.
     layers : sequence of Layer
         Values in index order, (positions,), NaN out of coverage.
+
+    Returns
+    -------
+    Path
+        The file.
     """
     import pandas as pd
 
@@ -84,6 +89,11 @@ def write_json(
         Values in index order, (positions,), NaN out of coverage.
     summary : mapping, optional
         Anything that JSON can hold, once NaN is null.
+
+    Returns
+    -------
+    Path
+        The file.
     """
     _check(grid, layers)
     content = {
@@ -131,6 +141,11 @@ def write_geojson(
         Positions of the towers, east, north, up.
     borders : sequence of Border
         Lines between the areas that two towers serve.
+
+    Returns
+    -------
+    Path
+        The file.
     """
     _check(grid, layers)
     rings = _cell_corners(grid, frame)
@@ -210,6 +225,11 @@ def write_kmz(
         Lines between the areas that two towers serve.
     title : str
         Name of the document.
+
+    Returns
+    -------
+    Path
+        The file.
     """
     _check(grid, layers)
     box = _bounding_box(grid, frame)
@@ -371,6 +391,11 @@ def write_geotiff(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequen
         From local metres to latitude and longitude.
     layers : sequence of Layer
         Values in index order, (positions,), NaN out of coverage.
+
+    Returns
+    -------
+    Path
+        The file.
 
     Raises
     ------

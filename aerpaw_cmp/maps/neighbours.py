@@ -153,6 +153,11 @@ def random_within(
         Sample that is not to be taken for a target (leave-one-out).
     chunk : int
         Targets at a time: bounds the memory and does not change the draw.
+
+    Returns
+    -------
+    Neighbours
+        Indices (t, m), -1 where there are fewer, and distances (t, m) [m].
     """
     from scipy.spatial import cKDTree
 

@@ -105,6 +105,10 @@ def rank_study(
         Which M samples within r0 count.
     seed : int
         Of the random selection.
+
+    Returns
+    -------
+    Study
     """
     _, rank = rank_fields(result, lowest_altitude_m, out_of_coverage)
     return interpolation_study(
@@ -134,6 +138,11 @@ def interpolation_study(
         For the serving-tower mean.
     neighbours, radius_m, selection, seed
         M, r0 and the choice of samples, the same for every local interpolator.
+
+    Returns
+    -------
+    Study
+        The correlation and its fit, scores of every interpolator, coverage of Kriging's intervals.
     """
     points = grid.points_m
     correlation = vector_correlation(points, values, width_m=grid.spacing_m, missing="pairwise")
@@ -234,6 +243,11 @@ def held_out_study(
         Those not below the number of positions are left out.
     neighbours, seed
         M; seed of the learning curve.
+
+    Returns
+    -------
+    HeldOutStudy
+        Scores by block, by altitude and along the flight, and the learning curve.
     """
     points = grid.points_m
     wide = OrdinaryKriging(fit, neighbours, outside="nearest")

@@ -144,6 +144,10 @@ def field_correlation(
         Values at the positions, NaN unknown.
     width_m, maximum_m : float
         Width of the bins of distance, and the largest distance.
+
+    Returns
+    -------
+    BinnedCorrelation
     """
     points, data = _points_and_vectors(points_m, fields)
     present = np.isfinite(data)
@@ -172,6 +176,11 @@ def semivariance(
         NaN takes no part.
     width_m, maximum_m : float
         Width of the bins of distance, and the largest distance.
+
+    Returns
+    -------
+    BinnedCorrelation
+        With gamma [squared unit of the values] in place of the correlation.
 
     Notes
     -----

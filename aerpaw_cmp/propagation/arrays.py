@@ -202,6 +202,11 @@ def uav_comparison_array(
         Polarisation of each port from vertical [deg].
     pattern : Pattern, optional
         Of every element; isotropic by default.
+
+    Returns
+    -------
+    Array
+        Of four ports.
     """
     half = wavelength_m / 4
     positions = np.array([[0, half, half], [0, half, -half], [0, -half, half], [0, -half, -half]])
@@ -225,6 +230,11 @@ def linear_array(elements: int, spacing_m: float, yaw_deg: float = 90.0, pattern
         Of the boresight, counter-clockwise from east; the line is across it [deg].
     pattern : Pattern, optional
         Of every element; isotropic by default.
+
+    Returns
+    -------
+    Array
+        Centred on its position, boresight horizontal.
     """
     along = np.arange(elements, dtype=np.float64) * spacing_m
     return Array(

@@ -244,6 +244,12 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
         Rows of ``replay`` that the reference has, in its order.
     ks : sequence of float
         Singular-value ratios at which ranks are compared.
+
+    Returns
+    -------
+    Difference
+        Paths that one has and the other lacks, errors of the level [dB], links in coverage of one alone, and ranks
+        that differ.
     """
     # numbered together: the facets of crowns that a replay lists depend on its poses
     plane = np.split(planes_of(joined(replay.faces, reference.faces)), [len(replay.faces)])

@@ -84,7 +84,21 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
-    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many."""
+    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many.
+
+    Parameters
+    ----------
+    tree : BoxTree
+    low, high : (3,)
+        Corners of the box [m].
+    found : (items,) int
+        Gets the items; has room for all of the tree.
+
+    Returns
+    -------
+    int
+        How many there are.
+    """
     lower, upper, child, start, count, items = tree
     todo = np.empty(DEEPEST, np.int64)
     todo[0] = 0
@@ -113,6 +127,21 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
+
+    Parameters
+    ----------
+    tree : BoxTree
+    planes : (most, 4)
+        Normals pointing inwards, and offsets [m].
+    many : int
+        How many of them count.
+    found : (items,) int
+        Gets the items; has room for all of the tree.
+
+    Returns
+    -------
+    int
+        How many there are.
     """
     lower, upper, child, start, count, items = tree
     todo = np.empty(DEEPEST, np.int64)
@@ -135,7 +164,24 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
-    """Whether a box lies wholly outside one of the planes."""
+    """Whether a box lies wholly outside one of the planes.
+
+    Parameters
+    ----------
+    lower, upper : (nodes, 3)
+        Corners of the boxes of a tree [m].
+    node : int
+        Which box.
+    planes : (most, 4)
+        Normals pointing inwards, and offsets [m].
+    many : int
+        How many of them count.
+
+    Returns
+    -------
+    bool
+        False may also be said of a box that only the planes together leave outside.
+    """
     for p in range(many):
         a, b, c = planes[p, 0], planes[p, 1], planes[p, 2]
         best = planes[p, 3]
@@ -149,7 +195,23 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
 
 @njit(cache=True, nogil=True, error_model="numpy")
 def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
-    """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box."""
+    """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
+
+    Parameters
+    ----------
+    lower, upper : (nodes, 3)
+        Corners of the boxes of a tree [m].
+    node : int
+        Which box.
+    a : (3,)
+        Start of the segment [m].
+    inverse : (3,)
+        One over each component of its vector [1/m]; 1e300 where that is 0.
+
+    Returns
+    -------
+    bool
+    """
     enter, leave = 0.0, 1.0
     for axis in range(3):
         one = (lower[node, axis] - a[axis]) * inverse[axis]

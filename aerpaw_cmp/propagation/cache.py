@@ -70,6 +70,11 @@ class PathCache:
             Engine, depth, samples and the rest.
         others : OtherSearch, optional
             Of an entry that holds paths with these interactions.
+
+        Returns
+        -------
+        str
+            SHA-256, in hexadecimal.
         """
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]

@@ -336,6 +336,11 @@ def reflection_coefficients(
     wavelength : float
         In air [m].
 
+    Returns
+    -------
+    te, tm : (...) complex
+        Of the electric field across and in the plane of incidence.
+
     Notes
     -----
     ITU-R P.2040-3 eq. (37) for the half-space and (43)-(44) for the slab.

@@ -17,7 +17,7 @@ from .arrays import Array, Link, Pattern, Poses
 from .compiled import column, in_threads
 from .paths import Faces, PathSet
 
-PATHS_PER_CHUNK = 8192
+PATHS_PER_CHUNK = 4096
 """Paths of a call of the kernel: some milliseconds of work for a thread."""
 
 
@@ -102,6 +102,13 @@ def evaluate(
     threads : int, optional
     device : {"cpu", "cuda"}
         "cuda" where patterns are formulas; links with other patterns are evaluated on the CPU.
+
+    Returns
+    -------
+    h : (poses, towers, n_rx, n_tx) complex
+        Coherent sum over paths; zero without a path.
+    power : (paths,)
+        Mean over element pairs of ``|h|^2`` of each path alone.
 
     Raises
     ------

@@ -47,6 +47,11 @@ def find(
     max_depth : int
     hiding : Occlusion
     threads : int, optional
+
+    Returns
+    -------
+    list of PathSet
+        One per run of :data:`POSES_PER_CHUNK` poses.
     """
     known: dict[str, Any] = {
         "targets_m": column(targets_m),

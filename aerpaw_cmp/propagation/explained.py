@@ -115,6 +115,10 @@ def explain_paths(
         With that tower alone.
     further_db : dict of str to (paths,)
         Losses besides the field's own, by name; positive.
+
+    Returns
+    -------
+    tuple of ExplainedPath
     """
     seen: list[tuple[str, AnyArray]] = []
     rows = np.arange(len(paths))
@@ -223,7 +227,23 @@ def power_sum_dbm(found: tuple[ExplainedPath, ...]) -> float:
 def why_not(
     faces: Faces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray, surfaces: Surfaces | None = None
 ) -> str:
-    """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one."""
+    """Why a sequence of faces (depth,) makes no path between two points; "" where it makes one.
+
+    Parameters
+    ----------
+    faces : Faces
+    source_m, target_m : (3,)
+        The two points [m].
+    sequence : (depth,) int
+        Faces from the source on; -1 is none.
+    surfaces : Surfaces, optional
+        The triangles, where the site is a scene of them.
+
+    Returns
+    -------
+    str
+        The first reason that was met.
+    """
     if surfaces is not None:
         return why_not_there(surfaces, source_m, target_m, sequence)
     sequence = sequence[sequence >= 0]
@@ -291,7 +311,22 @@ def near_an_edge(
     path: ExplainedPath,
     surfaces: Surfaces | None = None,
 ) -> bool:
-    """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face."""
+    """Whether float32 may decide a path otherwise: a reflection point within :data:`EDGE_M` of an edge of its face.
+
+    Parameters
+    ----------
+    faces : Faces
+    source_m, target_m : (3,)
+        Ends of the path [m].
+    path : ExplainedPath
+    surfaces : Surfaces, optional
+        The triangles, where the site is a scene of them.
+
+    Returns
+    -------
+    bool
+        Also where a segment runs that near to another building.
+    """
     points = np.array([[b.east_m, b.north_m, b.up_m] for b in path.bounces]).reshape(-1, 3)
     if surfaces is not None:  # moved by that much in any direction it meets a triangle
         moves = EDGE_M * np.concatenate([np.eye(3), -np.eye(3)])

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -59,9 +60,7 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
     grounds = sorted({site.towers[name].ground_m for name in (towers or site.towers)}) or [0.0]
     faces = [_ground(height, site.ground_material, len(grounds) > 1) for height in grounds]
     for index, building in enumerate(site.buildings):
-        for part in _parts(building.footprint):
-            faces.extend(_walls(building, part, index))
-            faces.append(_roof(building, part, index))
+        faces.extend(_building_faces(building, index))
     return Faces(
         normal=np.array([f.normal for f in faces]),
         offset_m=np.array([f.offset_m for f in faces]),
@@ -74,6 +73,15 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
         polygon=tuple(f.polygon for f in faces),
         solid=np.array([f.solid for f in faces], dtype=np.int64),
     )
+
+
+@lru_cache(maxsize=4096)
+def _building_faces(building: Building, solid: int) -> tuple[_Face, ...]:
+    """Walls and roof; kept, for a replay in parts asks again with each part."""
+    found: list[_Face] = []
+    for part in _parts(building.footprint):
+        found += [*_walls(building, part, solid), _roof(building, part, solid)]
+    return tuple(found)
 
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:
@@ -291,6 +299,8 @@ def smaller_than_fresnel_zone(
     sources_m, targets_m : (s, 3), (n, 3)
         Ends of the links [m].
     frequency_hz : float
+    area_m2 : (faces,), optional
+        Areas of the faces [m^2].
 
     Returns
     -------

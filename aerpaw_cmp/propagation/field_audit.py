@@ -371,6 +371,11 @@ def against_sionna(
         Of Sionna's search.
     complete : bool
         Ask for the explicit arrays at short range, too.
+
+    Returns
+    -------
+    FieldAudit
+        Counts and largest errors over the paths that both have.
     """
     from .sionna import own_coefficients
 
@@ -409,6 +414,11 @@ def per_pair(
     ks : sequence of float
     settings
         ``max_depth``, ``loss``, ``crowns`` of the replay.
+
+    Returns
+    -------
+    FieldAudit
+        Links that differ, the largest change of level [dB], and ranks that change.
     """
     from ..compare.rank import channel_rank
 

@@ -170,6 +170,15 @@ def foliage_model(
         Season of the tables.
     gamma_db_per_m, maximum_db : float, optional
         Specific attenuation [dB/m] and largest loss [dB] in place of P.833's table.
+
+    Returns
+    -------
+    FoliageModel
+
+    Raises
+    ------
+    UsageError
+        An unknown name; gamma or A_m for a model that has neither.
     """
     if name in ("attenuating", "p833"):
         table = P833.at(frequency_hz, in_leaf=in_leaf)
@@ -254,6 +263,11 @@ def foliage_depth_m(
     trees : Trees or CrownIndex
     bounced : (paths, depth) int, optional
         Tree whose crown reflects at each vertex, -1 for none.
+
+    Returns
+    -------
+    (paths,)
+        [m]; NaN where an end is not finite.
     """
     source, target = np.asarray(source_m, dtype=np.float64), np.asarray(target_m, dtype=np.float64)
     vertices = np.asarray(vertices_m, dtype=np.float64)

@@ -81,6 +81,10 @@ def every_geometry(
         Strength of the ground reflection against Fresnel's.
     sums : sequence of {"power_sum", "coherent", ...}
         How the two rays add up.
+
+    Returns
+    -------
+    tuple of Geometry
     """
     return tuple(
         Geometry(
@@ -126,6 +130,11 @@ def singular_values_of(
     carrier_hz : float
     material : str
         Of the ground.
+
+    Yields
+    ------
+    (n, ports)
+        Of the next geometry.
 
     Notes
     -----
@@ -176,6 +185,10 @@ def basis_fields(
     carrier_hz : float
     material : str
         Of the ground.
+
+    Returns
+    -------
+    direct, bounced : (n, 2 uav ports, 2 tower ports) complex
     """
     link = Link(carrier_hz, {"tower": _both_slants(tower)}, _both_slants(uav), uav_transmits=False)
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (material,), ("ground",))

@@ -431,6 +431,29 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
 
     ``before`` and ``after`` are unit normals of mirrors at the ends, zero for an antenna: there a surface within the
     clearance of the mirror's plane, or of the antenna, cuts nothing. Moeller and Trumbore (1997), edges included.
+
+    Parameters
+    ----------
+    corners : (triangles, 3, 3)
+        [m]
+    tree : BoxTree
+        Over the triangles.
+    a, b : (3,)
+        Ends of the segment [m].
+    before, after : (3,)
+        Unit normals of the mirrors at ``a`` and ``b``, or zeros.
+    before_offset, after_offset : float
+        Offsets of their planes [m].
+    rules : tuple
+        A ``_Rules``: clearance, reach of an antenna, and the margin with which a triangle has to be met.
+
+    Returns
+    -------
+    bool
+
+    Notes
+    -----
+    Moeller and Trumbore, Fast, Minimum Storage Ray/Triangle Intersection (1997), doi:10.1080/10867651.1997.10487468.
     """
     lower, upper, child, start, count, items = tree
     clearance, end, margin = rules[1], rules[2], rules[3]

@@ -45,6 +45,9 @@ TESTS_PER_PAIR = 20
 CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
 
+TARGETS_AT_ONCE = 1024
+"""Targets whose heights over all faces stay in the cache of a core."""
+
 Progress = Callable[[float], None]
 
 
@@ -108,15 +111,16 @@ def find_paths(
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
     alive = _alive(sources_m, targets_m, excluded)
+    ends = _Ends.of(faces, targets_m, np.asarray(alive.any(axis=0)), tolerance_m)
 
     def sequences(tower: int) -> list[Sequences]:
         usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
-        targets = targets_m[alive[tower]]
-        if not len(targets):
+        if not alive[tower].any():
             return []
-        return Sequences.of(faces, box, facing, sources_m[tower], targets, usable_faces, max_depth, budget, tolerance_m)
+        return Sequences.of(faces, box, facing, sources_m[tower], ends, usable_faces, max_depth, budget, tolerance_m)
 
     found: list[PathSet] = []
+    in_order = False
     for group, levels in _groups(sequences, len(sources_m)):
         tests = sum(
             int(alive[t].sum()) * sum(len(x.faces) for x in tree) for t, tree in zip(group, levels, strict=True)
@@ -130,7 +134,8 @@ def find_paths(
             pieces = find(
                 compiled_code, faces, plain, sources_m[some], targets_m, alive[some], max_depth, hiding, threads
             )
-            found += [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
+            in_order = len(group) == len(sources_m)
+            found += pieces if in_order else [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
         else:
             for tower, tree in zip(group, levels, strict=True):
                 poses, source = np.flatnonzero(alive[tower]), sources_m[tower]
@@ -138,13 +143,17 @@ def find_paths(
                     found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((group[-1] + 1) / len(sources_m))
-    return merge(found, max_depth, faces)
+    return merge(found, max_depth, faces, in_order=in_order, threads=threads)
 
 
 def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:
     """Links (towers, poses) that may have paths."""
-    gap = np.stack([np.linalg.norm(targets_m - source, axis=1) for source in sources_m.reshape(-1, 3)])
-    alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
+    alive = np.empty((len(sources_m), len(targets_m)), dtype=np.bool_)
+    with np.errstate(invalid="ignore"):
+        for tower, source in enumerate(sources_m.reshape(-1, 3)):
+            apart = targets_m - source
+            gap2 = np.einsum("ij,ij->i", apart, apart)
+            alive[tower] = (gap2 >= MINIMUM_LENGTH_M**2) & (gap2 < np.inf)
     return np.asarray(alive if excluded is None else alive & ~excluded)
 
 
@@ -163,6 +172,36 @@ def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
     """Absolute tolerance [m] of side tests in this scene."""
     sizes = [np.nanmax(np.abs(p), initial=0.0, where=np.isfinite(p)) for p in (*points_m, faces.lower, faces.upper)]
     return RELATIVE_TOLERANCE * max(1.0, *(float(s) for s in sizes))
+
+
+@dataclass(frozen=True, slots=True)
+class _Ends:
+    """What the growth of sequences asks of the targets, of all towers at once: no path is lost by one too many.
+
+    Parameters
+    ----------
+    lit : (faces,) bool
+        Faces with a target in front.
+    hull_m : (8, 3)
+        Corners of the box of the targets.
+    """
+
+    lit: BoolArray
+    hull_m: FloatArray
+
+    @classmethod
+    def of(cls, faces: Faces, targets_m: FloatArray, some: BoolArray, tolerance_m: float) -> _Ends:
+        targets = targets_m if some.all() else targets_m[some]
+        if not len(targets):
+            return cls(np.zeros(len(faces), dtype=np.bool_), np.zeros((8, 3)))
+        highest = np.full(len(faces), -np.inf)
+        for start in range(0, len(targets), TARGETS_AT_ONCE):
+            height = faces.normal @ targets[start : start + TARGETS_AT_ONCE].T
+            height -= faces.offset_m[:, None]
+            np.maximum(highest, height.max(axis=1), out=highest)
+        low, high = targets.min(axis=0), targets.max(axis=0)
+        hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
+        return cls(highest >= -tolerance_m, hull)
 
 
 @dataclass(frozen=True, slots=True)
@@ -186,7 +225,7 @@ class Sequences:
         box: FloatArray,
         facing: BoolArray,
         source: FloatArray,
-        targets: FloatArray,
+        ends: _Ends,
         usable: BoolArray,
         max_depth: int,
         budget: int,
@@ -204,21 +243,23 @@ class Sequences:
         facing : (faces, faces) bool
             Which of them can follow which.
         source : (3,)
-        targets : (n, 3)
-            Ends [m].
+        ends : _Ends
+            The targets.
         usable : (faces,) bool
             Faces that may reflect.
         max_depth, budget : int
             Most reflections; most sequences of one depth.
         tolerance_m : float
             A point this far behind a face still counts as before it [m].
+
+        Returns
+        -------
+        list of Sequences
+            One per depth, from the line of sight on; shorter where no sequence is left.
         """
         level = cls(np.zeros((1, 0), np.int64), np.zeros((1, 0, 3)))
         levels = [level]
         facing = facing & usable[None, :]
-        lit = (faces.normal @ targets.T - faces.offset_m[:, None] >= -tolerance_m).any(axis=1)
-        low, high = targets.min(axis=0), targets.max(axis=0)
-        hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
         total = 1
         for _ in range(max_depth):
             level = _grow(faces, level, source, usable, facing, box, tolerance_m, budget - total)
@@ -226,7 +267,7 @@ class Sequences:
             if not len(level.faces):
                 break
             levels.append(level)
-        return [_reaching(faces, step, lit, box, hull, tolerance_m) for step in levels]
+        return [_reaching(faces, step, ends.lit, box, ends.hull_m, tolerance_m) for step in levels]
 
 
 def _facing(faces: Faces, box: FloatArray, tolerance_m: float) -> BoolArray:
@@ -287,11 +328,11 @@ def _beam_meets(apex: FloatArray, window: FloatArray, target: FloatArray, tolera
     beam has all target points outside.
     """
     ray = window - apex[:, None, :]
-    side = np.cross(ray, np.roll(ray, -1, axis=1))
-    centre = window.mean(axis=1) - apex
+    (a, b, c), (d, e, f) = ray.transpose(2, 0, 1), ray[:, [1, 2, 3, 0]].transpose(2, 0, 1)
+    side = np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=2)
     # the sense in which the window goes round decides which way the side planes point
-    sense = np.sign(np.einsum("nki,ni->nk", side, centre).sum(axis=1))
-    size = np.linalg.norm(side, axis=2) + 1e-300
+    sense = np.sign(np.einsum("ni,ni->n", side.sum(axis=1), ray.sum(axis=1)))
+    size = np.sqrt(np.einsum("nki,nki->nk", side, side)) + 1e-300
     offset = np.matmul(target - apex[:, None, :], np.swapaxes(side, 1, 2)) * sense[:, None, None]
     outside = offset < -tolerance_m * size[:, None, :]
     return np.asarray(~outside.all(axis=1).any(axis=1))
@@ -459,19 +500,61 @@ def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, m
     return PathSet(pose, np.full(count, tower), np.full(count, depth), faces, points)
 
 
-def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet:
-    """One sorted set of several; with ``faces``, of paths over coplanar faces that overlap only one is kept."""
+def merge(
+    pieces: list[PathSet],
+    max_depth: int,
+    faces: Faces | None,
+    *,
+    in_order: bool = False,
+    threads: int | None = 1,
+) -> PathSet:
+    """One sorted set of several.
+
+    Parameters
+    ----------
+    pieces : list of PathSet
+    max_depth : int
+        Of the set where there is no path at all.
+    faces : Faces or None
+        Where given, of paths over coplanar faces that overlap only one is kept.
+    in_order : bool
+        The pieces, one after another, are sorted.
+    threads : int, optional
+        That copy; default: the cores that this process may use.
+
+    Returns
+    -------
+    PathSet
+        Sorted by pose, tower, depth, faces.
+    """
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    columns = ("pose", "tower", "depth", "faces", "vertices_m", "tree")
-    whole = PathSet(**{name: np.concatenate([getattr(piece, name) for piece in pieces]) for name in columns})
-    order = _order(whole)
+    whole = _one_after_another(pieces, threads)
+    order = np.arange(len(whole)) if in_order else _order(whole)
+    kept = len(whole)
     if faces is not None:
         repeated = _repeated(whole, order, faces)
         if repeated.any():
             order = order[~repeated[order]]
-    return whole if len(order) == len(whole) and (np.diff(order) == 1).all() else whole.select(order)
+            kept = len(order)
+    same = kept == len(whole) and (in_order or bool((np.diff(order) == 1).all()))
+    return whole if same else whole.select(order)
+
+
+def _one_after_another(pieces: list[PathSet], threads: int | None) -> PathSet:
+    """The paths of all pieces; NumPy lets other threads run while it copies."""
+    columns = ("pose", "tower", "depth", "faces", "vertices_m", "tree")
+    total, first = sum(map(len, pieces)), pieces[0]
+    whole = {name: np.empty((total, *(own := getattr(first, name)).shape[1:]), own.dtype) for name in columns}
+    starts = np.cumsum([0, *map(len, pieces)])
+
+    def copy(number: int) -> None:
+        for name, values in whole.items():
+            values[starts[number] : starts[number + 1]] = getattr(pieces[number], name)
+
+    compiled.in_threads(copy, range(len(pieces)), threads)
+    return PathSet(**whole)
 
 
 def _order(paths: PathSet) -> IntArray:

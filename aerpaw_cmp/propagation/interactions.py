@@ -189,6 +189,11 @@ def path_powers(paths: OtherPaths, link: Link, poses: Poses, loss_db: FloatArray
     poses : Poses
     loss_db : (paths,), optional
         Further loss of each path, such as foliage.
+
+    Returns
+    -------
+    (paths,)
+        Relative to isotropic elements of one polarisation: path gain times patterns.
     """
     power, arrays = np.zeros(len(paths)), list(link.tower_arrays.values())
     for tower, array in enumerate(arrays):

@@ -15,7 +15,21 @@ NEAR_END_M = 1e-3
 
 
 def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray, sequence: IntArray) -> str:
-    """Why faces (depth,) make no path between two points; "" where they make one."""
+    """Why faces (depth,) make no path between two points; "" where they make one.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    source_m, target_m : (3,)
+        The two points [m].
+    sequence : (depth,) int
+        Faces from the source on; -1 is none.
+
+    Returns
+    -------
+    str
+        The first reason that was met.
+    """
     from .growth import EDGE_M, reflection_points  # compiled: loaded where there is a scene
 
     sequence = sequence[sequence >= 0]

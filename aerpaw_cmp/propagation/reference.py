@@ -340,6 +340,10 @@ class Blocks:
             Every other building is taken this much larger on all sides [m].
         spared : tuple of int
             Numbers of the buildings that the segment ends on.
+
+        Returns
+        -------
+        bool
         """
         shadow = LineString([a[:2], b[:2]])
         for number, building in enumerate(self._site.buildings):
@@ -559,6 +563,10 @@ def fresnel(cosine: float, eta: complex, thickness_m: float | None, wavelength: 
         Of the slab [m]; None: half-space.
     wavelength : float
         In vacuum [m].
+
+    Returns
+    -------
+    te, tm : complex
     """
     refracted = cmath.sqrt(eta - (1 - cosine * cosine))
     te, tm = (cosine - refracted) / (cosine + refracted), (eta * cosine - refracted) / (eta * cosine + refracted)
@@ -643,6 +651,11 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trun
         Trees that do not count.
     trunks : bool
         The cylinders below in place of the cones.
+
+    Returns
+    -------
+    float
+        [m]
     """
     start, step = np.array(a), np.array(b) - np.array(a)
     length = float(np.sqrt((step**2).sum()))

@@ -103,6 +103,13 @@ class Scene:
             Those that reflect.
         max_depth : int
             Most reflections of a path, the bounce among them.
+
+        Returns
+        -------
+        scene : Scene
+            Its further faces are the facets that a path meets.
+        paths : PathSet
+            Those that bounce off a crown.
         """
         paths, faces = crowns.bounces(
             self.faces,

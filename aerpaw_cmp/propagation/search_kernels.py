@@ -21,7 +21,19 @@ POLYGON, SEAM = 1, 2
 
 @njit(**OPTIONS)
 def through_box(start: FloatArray, end: FloatArray, low: FloatArray, high: FloatArray) -> bool:
-    """Whether a segment meets a box (slab test)."""
+    """Whether a segment meets a box (slab test).
+
+    Parameters
+    ----------
+    start, end : (3,)
+        The segment [m].
+    low, high : (3,)
+        Corners of the box [m].
+
+    Returns
+    -------
+    bool
+    """
     enter, leave = 0.0, 1.0
     for step in range(3):
         axis = 2 - step  # most segments pass above the roofs
@@ -39,7 +51,23 @@ def through_box(start: FloatArray, end: FloatArray, low: FloatArray, high: Float
 def runs_inside(
     start: FloatArray, end: FloatArray, normal: FloatArray, offset_m: FloatArray, first: int, last: int, level: float
 ) -> bool:
-    """Whether a part of a segment lies below ``level`` over all planes ``first`` to ``last`` (Cyrus and Beck, 1978)."""
+    """Whether a part of a segment lies below ``level`` over all planes ``first`` to ``last`` (Cyrus and Beck, 1978).
+
+    Parameters
+    ----------
+    start, end : (3,)
+        The segment [m].
+    normal, offset_m : (planes, 3), (planes,)
+        Planes of all solids, normals outwards.
+    first, last : int
+        Those that count: from ``first`` to before ``last``.
+    level : float
+        Height over the planes [m]: below 0 the segment has to run deeper than the surface.
+
+    Returns
+    -------
+    bool
+    """
     enter, leave = 0.0, 1.0
     for plane in range(first, last):
         n0, n1, n2 = normal[plane, 0], normal[plane, 1], normal[plane, 2]
@@ -70,7 +98,29 @@ def hides(
     abutting: BoolArray,
     tolerance_m: float,
 ) -> int:
-    """1 where a solid cuts the segment, ``SEAM`` where it runs along several pieces that touch, else 0."""
+    """1 where a solid cuts the segment, ``SEAM`` where it runs along several pieces that touch, else 0.
+
+    Parameters
+    ----------
+    start, end : (3,)
+        The segment [m].
+    low_m, high_m : (solids, 3)
+        Their boxes [m].
+    pieces : (solids + 1,) int
+        Which convex pieces are whose.
+    planes : (pieces + 1,) int
+        Which planes are whose.
+    normal, offset_m : (planes, 3), (planes,)
+        Planes of the pieces, normals outwards [m].
+    abutting : (pieces,) bool
+        Pieces that touch another one.
+    tolerance_m : float
+        A segment this deep in a solid is still on its surface [m].
+
+    Returns
+    -------
+    int
+    """
     touches = 0
     for solid in range(len(low_m)):
         if not through_box(start, end, low_m[solid], high_m[solid]):
@@ -99,6 +149,27 @@ def trace(
     """Reflection points of a sequence, from the target back to the source; whether sides and bounds allow them.
 
     ``planes`` (faces, 14) holds normal, offset, along, across, and the bounds with their tolerance.
+
+    Parameters
+    ----------
+    target : (3,)
+        [m]
+    row, depth : int
+        Which sequence, and its length.
+    sequences : (sequences, most) int
+        Faces, -1 beyond the depth.
+    images_m : (sequences, most, 3)
+        Image of the source behind each face [m].
+    planes : (faces, 14)
+        See above.
+    tolerance_m : float
+        A point this far behind a face still counts as before it [m].
+    vertices : (most, 3)
+        Gets the points [m].
+
+    Returns
+    -------
+    bool
     """
     x, y, z = target[0], target[1], target[2]
     for back in range(depth):
@@ -143,7 +214,26 @@ def last_tests(
     last: AnyArray,
     tests: FloatArray,
 ) -> None:
-    """Last face of each sequence, and ``tests`` (7, sequences); a line of sight has passed before."""
+    """Last face of each sequence, and ``tests`` (7, sequences); a line of sight has passed before.
+
+    Parameters
+    ----------
+    sequences : (sequences, most) int
+        Faces, -1 beyond the depth.
+    depths : (sequences,) int
+    images_m : (sequences, most, 3)
+        Image of the source behind each face [m].
+    normal, offset_m, along, across : (faces, 3), (faces,), (faces, 3), (faces, 3)
+        Planes of the faces and their axes [m].
+    lower, upper : (faces, 2)
+        Bounds along these axes [m].
+    tolerance_m : float
+        By which the bounds are widened [m].
+    last : (sequences,) uint64
+        Gets the last face.
+    tests : (7, sequences)
+        Gets what :func:`meeting` compares [m].
+    """
     for s in range(len(sequences)):
         last[s] = np.uint64(0)
         tests[_BELOW, s], tests[_ALONG, s], tests[_ACROSS, s] = -1.0, 0.0, 0.0
@@ -162,7 +252,19 @@ def last_tests(
 
 @njit(**OPTIONS)
 def meeting(last: AnyArray, tests: FloatArray, place: FloatArray, tolerance_m: float, mark: FloatArray) -> None:
-    """Mark the sequences whose line from the last image meets the bounds of the last face before the target."""
+    """Mark the sequences whose line from the last image meets the bounds of the last face before the target.
+
+    Parameters
+    ----------
+    last, tests
+        As :func:`last_tests` fills them.
+    place : (3, faces)
+        Height of the target over each face, and its coordinates along the face's axes [m].
+    tolerance_m : float
+        A target this far behind a face still counts as before it [m].
+    mark : (sequences,)
+        Gets 1 where the line meets the face, else 0.
+    """
     for s in range(len(last)):
         face = last[s]
         height = place[0, face]
@@ -215,6 +317,38 @@ def search(
     ``starts`` (towers + 1,) says which sequences are whose; ``alive`` is (towers, poses). ``numbers`` (room, 4) takes
     pose, tower, depth and flags, ``faces`` (room, max_depth) and ``points`` (room, max_depth, 3) come filled with -1
     and NaN.
+
+    Parameters
+    ----------
+    first_pose, last_pose : int
+        Which poses: from the first to before the last.
+    targets_m, sources_m : (poses, 3), (towers, 3)
+        Ends [m].
+    alive : (towers, poses) bool
+        Links that are searched.
+    starts : (towers + 1,) int
+        Which sequences are whose.
+    sequences, depths : (sequences, most) int, (sequences,) int
+        Faces, -1 beyond the depth.
+    images_m : (sequences, most, 3)
+        Image of the source behind each face [m].
+    normal, offset_m, along, across : (faces, 3), (faces,), (faces, 3), (faces, 3)
+        Planes of the faces and their axes [m].
+    lower, upper : (faces, 2)
+        Bounds along these axes [m].
+    polygonal : (faces,) bool
+        Faces that do not fill their bounds.
+    low_m, high_m, pieces, planes, plane_normal, plane_offset_m, abutting
+        The solids, as :func:`hides` takes them.
+    tolerance_m : float
+        [m]
+    numbers, faces, points
+        Get the paths; see above.
+
+    Returns
+    -------
+    int
+        Number of paths found.
     """
     found, room = 0, len(numbers)
     count = len(normal)

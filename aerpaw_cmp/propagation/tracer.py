@@ -20,8 +20,8 @@ from ..site.site import Site
 from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
-from .channel import channel_matrices, mean_pair_power, rss_dbm
-from .compiled import ENOUGH_WORK
+from .channel import Fields, channel_matrices, mean_pair_power, rss_dbm
+from .compiled import ENOUGH_WORK, in_threads
 from .crowns import Crowns
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .interactions import (
@@ -174,6 +174,7 @@ def replay(
     whole: Whole | None = None,
     interactions: Sequence[str] = ("reflection",),
     scattering_coefficient: float | None = None,
+    only: BoolArray | None = None,
     progress: Callable[[float], None] | None = None,
 ) -> Replay:
     """Replay a flight.
@@ -222,6 +223,8 @@ def replay(
         (:mod:`aerpaw_cmp.propagation.interactions`).
     scattering_coefficient : float, optional
         Of every material, where "scattering" is asked for.
+    only : (towers, poses) bool, optional
+        Links that count; the others have no path and are not searched for.
     progress : callable, optional
         Called with the share done.
 
@@ -258,10 +261,20 @@ def replay(
     scene = Scene.of(site, link, poses)
     if whole is not None:
         scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
+    if only is not None:
+        scene = replace(scene, excluded=scene.excluded | ~only)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads, device)
+    settings = Settings(
+        engine=engine,
+        max_depth=max_depth,
+        samples=0 if samples == "auto" else samples,
+        batch=batch,
+        variant=variant,
+        threads=threads,
+        device=device,
+    )
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":
@@ -287,7 +300,7 @@ def replay(
         result = _with_others(result, link, tuple(interactions), *others)
     if visibility == "pairs":
         small = drop_small_faces
-        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
+        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable, only)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -370,6 +383,9 @@ def replay_parts(
         yield replay(site, link, part, engine, whole=whole, **options)
 
 
+LEVELS_AT_ONCE = 1024
+"""Poses of which a thread makes levels at once."""
+
 LONG_SEARCH_S = 60.0
 """A search that will take longer is announced."""
 
@@ -392,6 +408,7 @@ def _by_pairs(
     loss: Loss | None,
     crowns: Crowns | None,
     usable: BoolArray | None,
+    only: BoolArray | None,
 ) -> Replay:
     """Each element pair with its own paths: every tower element is a source, every UAV element a pose."""
     names, arrays = list(link.tower_arrays), list(link.tower_arrays.values())
@@ -410,7 +427,7 @@ def _by_pairs(
         scene,
         sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
         usable=np.repeat(scene.usable if usable is None else usable[:, : len(scene.faces)], ports, axis=0),
-        excluded=np.repeat(scene.excluded, ports, axis=0),
+        excluded=np.repeat(scene.excluded if only is None else scene.excluded | ~only, ports, axis=0),
     )
     for element in range(len(uav)):
         spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)
@@ -468,6 +485,10 @@ def _within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
     rotation has no field.
     """
     towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+    if len(poses) and len(towers) and np.isfinite(poses.position_m).all() and np.isfinite(poses.rotation).all():
+        low, high = poses.position_m.min(axis=0), poses.position_m.max(axis=0)
+        if (np.maximum(np.abs(low - towers), np.abs(high - towers)) <= REACH_M).all(axis=1).any():
+            return poses, []  # the usual flight, decided by its box
     known = np.isfinite(poses.position_m).all(axis=1)
     turned = np.isfinite(poses.rotation).all(axis=(1, 2))
     with np.errstate(over="ignore", invalid="ignore"):
@@ -491,9 +512,12 @@ def _within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
 def _buried_towers(site: Site, link: Link) -> list[str]:
     """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
     lines = []
-    for name in link.tower_arrays:
+    names = list(link.tower_arrays)
+    places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
+    for number in np.flatnonzero(inside_solids(site, places)):
+        name = names[number]
         for building in site.buildings:
-            if inside_solids(replace(site, buildings=(building,)), site.towers[name].position_m[None]).any():
+            if inside_solids(replace(site, buildings=(building,)), places[number : number + 1]).any():
                 lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
     return lines
 
@@ -772,21 +796,21 @@ def _evaluate(
         device=settings.device,
     )
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
-    open_ = np.ones(len(paths), np.bool_) if loss_db is None else np.isfinite(loss_db)
-    has_path[paths.pose[open_], paths.tower[open_]] = True  # an infinite loss is an obstacle
-    level_dbm = rss_dbm(mean_pair_power(fields.h), link.transmit_power_dbm, link.noise_floor_dbm)
-    above_floor = np.isfinite(level_dbm)
+    if loss_db is None:
+        has_path[paths.pose, paths.tower] = True
+    else:
+        open_ = np.isfinite(loss_db)  # an infinite loss is an obstacle
+        has_path[paths.pose[open_], paths.tower[open_]] = True
     idle: list[str] = []
     if relevance_db is not None:
         labels, _ = idle_objects(paths, scene.faces, fields.path_power, mean_pair_power(fields.h), relevance_db)
         idle = in_words(labels, relevance_db)
-    h = fields.h
-    h[~above_floor] = 0.0
+    level_dbm, power_dbm = _levels(fields, has_path, link, settings.threads)
     return Replay(
         rss_dbm=level_dbm,
-        rss_power_dbm=rss_dbm(fields.power, link.transmit_power_dbm, link.noise_floor_dbm),
-        h=h,
-        has_path=has_path & above_floor,
+        rss_power_dbm=power_dbm,
+        h=fields.h,
+        has_path=has_path,
         paths=paths,
         faces=scene.faces,
         seconds=0.0,
@@ -795,3 +819,21 @@ def _evaluate(
         towers=tuple(link.tower_arrays),
         surfaces=scene.surfaces,
     ), idle
+
+
+def _levels(fields: Fields, has_path: BoolArray, link: Link, threads: int | None) -> tuple[FloatArray, FloatArray]:
+    """Levels (poses, towers) of H and of the summed powers; below the noise floor H and ``has_path`` become nothing."""
+    h, sent, floor = fields.h, link.transmit_power_dbm, link.noise_floor_dbm
+    level_dbm, power_dbm = np.empty(has_path.shape), np.empty(has_path.shape)
+
+    def some(first: int) -> None:
+        part = slice(first, first + LEVELS_AT_ONCE)
+        level_dbm[part] = rss_dbm(mean_pair_power(h[part]), sent, floor)
+        power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
+        above_floor = np.isfinite(level_dbm[part])
+        if not above_floor.all():
+            h[part][~above_floor] = 0.0
+        has_path[part] &= above_floor
+
+    in_threads(some, range(0, len(h), LEVELS_AT_ONCE), threads)
+    return level_dbm, power_dbm

@@ -381,6 +381,10 @@ def write_campaign(
         Formats.
     progress : Progress
         Figures done.
+
+    Returns
+    -------
+    list of Path
     """
     folder = Path(folder)
     indent = 2 if len(data.rss) + len(data.rank) < COMPACT_ROWS else None

@@ -225,6 +225,11 @@ def write_figures(
         Share of the figures that are drawn.
     meanwhile : callable, optional
         What this process may do while others draw.
+
+    Returns
+    -------
+    pictures : list of Picture
+    files : list of Path
     """
     drawn: list[Picture] = []
     written: list[Path] = []
@@ -643,6 +648,10 @@ def colour_bar(fig: Figure, mappable: Any, ax: Any, label: str, extend: str = "n
     label : str
     extend : {"neither", "min", "max", "both"}
         Ends beyond which values lie.
+
+    Returns
+    -------
+    matplotlib.colorbar.Colorbar
     """
     bar = fig.colorbar(mappable, ax=ax, label=label, shrink=0.85, extend=extend, extendfrac=0.03)
     if bar.solids is not None:

@@ -65,6 +65,11 @@ def draw_map(ax: Axes, data: MapsData, values: FloatArray, *, highlight: str | N
         The only tower that counts: no borders are drawn then.
     options
         Of :meth:`matplotlib.axes.Axes.imshow`.
+
+    Returns
+    -------
+    matplotlib.image.AxesImage
+        For a colour bar.
     """
     ax.patch.set(**MISSING)  # cells without a value are transparent, so the hatched ground shows
     image = ax.imshow(values, origin="lower", extent=extent_m(data), interpolation="none", zorder=1, **options)

@@ -42,6 +42,11 @@ def read_elements(kind: str, elements: Iterable[Element], path: Path, line_of: L
         For messages.
     line_of : callable
         Line of the element of an index, asked for those that cannot be used.
+
+    Returns
+    -------
+    MapFile
+        Outlines, trees, and a note per thing that was left out.
     """
     result, data = MapFile(kind), _Data(path)
     for index, element in enumerate(elements):

@@ -122,6 +122,10 @@ def left_out(path: Path, line: int | None, what: str, error: Exception) -> str:
         The element.
     error : Exception
         Why it cannot be used.
+
+    Returns
+    -------
+    str
     """
     place = path.name if line is None else f"{path.name}, line {line}"
     why = reason(error).removeprefix(f"{path.name}: ").removeprefix(f"{what}: ")

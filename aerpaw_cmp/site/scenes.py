@@ -53,6 +53,11 @@ def placed_scene(
     ground_plane : str, optional
         Material of a plane that is added at its lowest point.
 
+    Returns
+    -------
+    TriangleScene
+        In the site frame [m].
+
     Raises
     ------
     UsageError
@@ -86,7 +91,22 @@ def with_ground(scene: TriangleScene, name: str) -> TriangleScene:
 def added(
     scene: TriangleScene, vertices_m: np.ndarray, triangles: np.ndarray, name: str, of_material: str
 ) -> TriangleScene:
-    """The scene with one more shape."""
+    """The scene with one more shape.
+
+    Parameters
+    ----------
+    scene : TriangleScene
+    vertices_m : (v, 3)
+        Corners of the shape [m].
+    triangles : (t, 3) int
+        Rows of ``vertices_m``.
+    name, of_material : str
+        Of the shape.
+
+    Returns
+    -------
+    TriangleScene
+    """
     return replace(
         scene,
         vertices_m=np.concatenate([scene.vertices_m, vertices_m]),

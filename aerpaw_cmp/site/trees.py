@@ -106,6 +106,11 @@ def trees_at(
         By default of seed 0.
     ground_m : (n,) or float
         Height of the ground at the trunks [m].
+
+    Returns
+    -------
+    Trees
+        Of n trees.
     """
     sizes = sizes or TreeSizes()
     random = random or np.random.default_rng(0)

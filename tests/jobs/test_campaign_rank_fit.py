@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -102,12 +103,26 @@ def test_the_log_score_of_a_flight_takes_the_shares_of_the_others(flights: dict[
 def test_refusals(flights: dict[str, FlightData]) -> None:
     with pytest.raises(UsageError, match="1 flights with rank"):
         fit_rank_all({"one": flights["one"]}, GRIDS, None, criterion="kappa")
-    with pytest.raises(UsageError, match="fit_on"):
+    with pytest.raises(UsageError, match="fit_on gave rank"):
         fit_rank_all(flights, GRIDS, ["three"], criterion="kappa")
     silent = dataclasses.replace(flights["one"].rank[0], rank=np.full(REPORTS, np.nan))
     none = {"one": dataclasses.replace(flights["one"], rank=(silent,)), "two": flights["two"]}
     with pytest.raises(InputError, match="nothing can be fitted on one"):
         fit_rank_all(none, GRIDS, ["one"], criterion="kappa")
+
+
+def test_a_fit_takes_the_flights_that_gave_rows_under_its_own_setting() -> None:
+    from types import SimpleNamespace as Row
+
+    from aerpaw_cmp.jobs.campaign import HeldOutSettings, _tasks_of_fit
+    from aerpaw_cmp.jobs.campaign_tasks import Task
+
+    settings = HeldOutSettings.model_validate({"fit": {"rank.k": [10.0]}, "criterion": "kappa", "setting": "a"})
+    tasks = [Task(Path(f"{f}.yaml"), f, s, {}, None) for s in ("a", "b") for f in ("one", "two")]
+    rows: Any = [Row(flight="one", setting="a"), Row(flight="one", setting="b"), Row(flight="two", setting="b")]
+    label, of = _tasks_of_fit(settings, tasks, rows)
+    assert (label, list(of)) == ("a", ["one"])  # two gave rank under b alone
+    assert of["one"].setting == "a"
 
 
 def campaign_file(folder: Path, held_out: str) -> Path:

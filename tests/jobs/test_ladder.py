@@ -118,7 +118,7 @@ def test_several_processes_give_the_numbers_of_one(tmp_path: Path, monkeypatch: 
     path = flight(tmp_path)
     content = yaml.safe_load(path.read_text(encoding="utf-8"))
     content["logs"] += [{**content["logs"][1], "node": tower} for tower in ("LW2", "LW3", "LW4")]
-    content["rss"] |= {"lag": "estimate", "lag_window_s": 2}
+    content["rss"] |= {"lag": "estimate", "lag_window_s": 2, "bootstrap": 20}
     path.write_text(yaml.safe_dump(content), encoding="utf-8")
     settings = load_flight(path)
     data = gather(settings, tmp_path, read_logs(settings, tmp_path))
@@ -137,4 +137,6 @@ def _plain(value: Any) -> Any:
     """Nested records as mappings and lists."""
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
         return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    return [_plain(one) for one in value] if isinstance(value, tuple | list) else value
+    if isinstance(value, dict):
+        return {key: _plain(one) for key, one in value.items()}
+    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value

@@ -19,7 +19,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import channel, compiled, compiled_field, compiled_search, image
+from aerpaw_cmp.propagation import channel, compiled, compiled_field, compiled_search, image, tracer
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
@@ -274,6 +274,25 @@ def test_nothing_to_search(monkeypatch, scenes):
     faces = site_faces(scenes.site())
     assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.zeros((0, 3))))
     assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
+
+
+@pytest.mark.parametrize("mode", ["never", pytest.param("always", marks=needs_numba)])
+def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, mode):
+    """Search, joining of its pieces, field and levels, below the noise floor too."""
+    monkeypatch.setenv(compiled.SWITCH, mode)
+    for module, name in ((compiled_field, "PATHS_PER_CHUNK"), (compiled_search, "POSES_PER_CHUNK")):
+        monkeypatch.setattr(module, name, 7)
+    monkeypatch.setattr(tracer, "LEVELS_AT_ONCE", 7)
+    site, link, poses, _ = case
+    link = dataclasses.replace(link, noise_floor_dbm=-58.0)
+    one, three = (replay(site, link, poses, threads=threads) for threads in (1, 3))
+    assert 0 < np.isnan(one.rss_dbm).sum() < one.rss_dbm.size
+    np.testing.assert_array_equal(one.has_path, np.isfinite(one.rss_dbm))
+    assert not one.h[~one.has_path].any()
+    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
+    for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
+        np.testing.assert_array_equal(getattr(one.paths, name), getattr(three.paths, name))
 
 
 @pytest.mark.parametrize("mode", ["never", pytest.param("always", marks=needs_numba)])

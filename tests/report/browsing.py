@@ -93,6 +93,33 @@ def usual_width(driver) -> None:
     driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})
 
 
+def extents(driver, width: int, views: str) -> tuple[float, list[float]]:
+    """Width of the page, and right edge of each of its views (a CSS selector), in a window of this width [px]."""
+    set_width(driver, width)
+    try:
+        page = driver.execute_script("return document.documentElement.scrollWidth")
+        rights = driver.execute_script(
+            "return [...document.querySelectorAll(arguments[0])].map(c => c.getBoundingClientRect().right)", views
+        )
+        return page, rights
+    finally:
+        usual_width(driver)
+
+
+def papers(driver, canvas: str) -> list[list[int]]:
+    """First pixel of a canvas in the light and in the dark scheme."""
+    found = []
+    for scheme in ("light", "dark"):
+        set_scheme(driver, scheme)
+        frame(driver)
+        script = (
+            "return Array.from(document.getElementById(arguments[0]).getContext('2d').getImageData(1, 1, 1, 1).data)"
+        )
+        found.append(driver.execute_script(script, canvas))
+    set_scheme(driver)
+    return found
+
+
 def set_scheme(driver, *schemes: str) -> None:
     features = [{"name": "prefers-color-scheme", "value": scheme} for scheme in schemes]
     driver.execute_cdp_cmd("Emulation.setEmulatedMedia", {"features": features})

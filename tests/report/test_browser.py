@@ -13,13 +13,12 @@ from tests.report.browsing import (
     asked_outside,
     choose,
     complaints,
+    extents,
     frame,
     needs_browser,
     serious_findings,
     set_scheme,
-    set_width,
     start,
-    usual_width,
 )
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -143,16 +142,10 @@ def test_no_serious_finding_of_accessibility(driver):
 
 @pytest.mark.parametrize("width", [1440, 768, 390])
 def test_nothing_overflows(driver, width):
-    set_width(driver, width)
-    try:
-        assert driver.execute_script("return document.documentElement.scrollWidth") <= width
-        charts = driver.execute_script(
-            "return [...document.querySelectorAll('.u-wrap')].map(c => c.getBoundingClientRect().right)"
-        )
-        assert charts
-        assert max(charts) <= width
-    finally:
-        usual_width(driver)
+    page, charts = extents(driver, width, ".u-wrap")
+    assert page <= width
+    assert charts
+    assert max(charts) <= width
 
 
 def test_dark_and_light(driver):

@@ -13,14 +13,13 @@ from tests.report.browsing import (
     asked_outside,
     choose,
     complaints,
+    extents,
     frame,
     needs_browser,
     open_page,
+    papers,
     serious_findings,
-    set_scheme,
-    set_width,
     start,
-    usual_width,
 )
 
 pytest.importorskip("selenium", reason="selenium is not installed")
@@ -253,29 +252,13 @@ def test_no_serious_finding_of_accessibility(driver):
 
 @pytest.mark.parametrize("width", [1440, 768, 390])
 def test_nothing_overflows(driver, width):
-    set_width(driver, width)
-    try:
-        assert driver.execute_script("return document.documentElement.scrollWidth") <= width
-        right = driver.execute_script(
-            "return [...document.querySelectorAll('#explorer canvas, #explorer select')].map(c => c.getBoundingClientRect().right)"
-        )
-        assert max(right) <= width
-    finally:
-        usual_width(driver)
+    page, rights = extents(driver, width, "#explorer canvas, #explorer select")
+    assert page <= width
+    assert max(rights) <= width
 
 
 def test_dark_and_light(driver):
-    papers = []
-    for scheme in ("light", "dark"):
-        set_scheme(driver, scheme)
-        frame(driver)
-        papers.append(
-            driver.execute_script(
-                "return Array.from(document.getElementById('histogram').getContext('2d').getImageData(1, 1, 1, 1).data)"
-            )
-        )
-    set_scheme(driver)
-    assert papers == [[255, 255, 255, 255], [23, 23, 23, 255]]
+    assert papers(driver, "histogram") == [[255, 255, 255, 255], [23, 23, 23, 255]]
 
 
 def test_with_scripts_off_the_tables_and_figures_stand(driver):

@@ -133,7 +133,22 @@ def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]], *, replicates:
 
 
 def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicates: int = REPLICATES) -> list[LadderRow]:
-    """The rows of one series, whose tower and channel is ``name``."""
+    """The rows of one series.
+
+    Parameters
+    ----------
+    ladder : Ladder
+    series : int
+        Which of the series of its rungs.
+    name : (tower, channel)
+    replicates : int
+        Of the paired differences.
+
+    Returns
+    -------
+    list of LadderRow
+        One per rung.
+    """
     rows = []
     for index, rung in enumerate(ladder.rungs):
         error = ladder.error_db[index][series]

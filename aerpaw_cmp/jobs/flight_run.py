@@ -63,6 +63,11 @@ def replay_flight(
         One per RSS series, in place of what ``rss.lag`` asks for.
     meanwhile : callable, optional
         As for :func:`~aerpaw_cmp.jobs.replay.estimate_clocks`.
+
+    Returns
+    -------
+    FlightReplay
+        Of every RSS and rank series.
     """
     stages = stages or Stages()
     with stages("clocks"):

@@ -296,7 +296,7 @@ CHECKS = {
 
 def checked(name, folder, frames, data):
     more = (data,) if name in ("gpx", "kmz") else ()
-    CHECKS[name](folder / write.FOLDER, frames, *more)
+    CHECKS[name](folder / formats.FOLDER, frames, *more)
 
 
 @pytest.mark.parametrize("name", write.FORMATS)
@@ -466,7 +466,7 @@ def test_formats_are_chosen_by_name():
     with pytest.raises(UsageError, match=r"'shapefile'.*geopackage"):
         formats.chosen_formats(["shapefile"])
     asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
-    assert set(asked) == {*write.FORMATS, write.ALL}
+    assert set(asked) == {*write.FORMATS, formats.ALL}
 
 
 @pytest.mark.parametrize(("name", "module"), [("netcdf", "netCDF4"), ("parquet", "pyarrow")])

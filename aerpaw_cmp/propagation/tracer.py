@@ -315,8 +315,8 @@ class Whole:
     pairs: int
 
 
-POSES_PER_PART = 8192
-"""Poses replayed at once by :func:`replay_parts`: some 40 MB for five towers with 4 x 4 elements."""
+POSES_PER_PART = 2048
+"""Poses replayed at once by :func:`replay_parts`: some 15 MB for five towers with 4 x 4 elements."""
 
 
 def replay_parts(

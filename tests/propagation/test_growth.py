@@ -97,6 +97,41 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
         assert np.array_equal(getattr(found[0], column), getattr(found[1], column))
 
 
+def cells(*open_cells):
+    """The square of the plane east = 5 between -5 and 5, cut at -1 and 1 so that corners meet, without some cells."""
+    cuts = (-5, -1, 1, 5)
+    some = [(i, j) for i in range(3) for j in range(3) if (i, j) not in open_cells]
+    return [
+        t
+        for i, j in some
+        for t in quad((5, cuts[i], cuts[j]), (0, cuts[i + 1] - cuts[i], 0), (0, 0, cuts[j + 1] - cuts[j]))
+    ]
+
+
+OCCLUDERS = {"a square": cells(), "an L": cells((1, 1), (1, 2), (2, 1), (2, 2)), "a frame": cells((1, 1))}
+
+
+@pytest.mark.parametrize("name", OCCLUDERS)
+def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
+    """A mirror is seen through the notch of an L and the hole of a frame: the outline alone would hide it wholly."""
+    mirror = quad((10, -0.6, -0.6), (0, 1.6, 0), (0, 0, 1.6))
+    occluder = OCCLUDERS[name]
+    scene = enumerate_.scene_of([*occluder, *mirror], shapes=[0] * len(occluder) + [1, 1])
+    surfaces, ends = merged(scene), (np.array([[0.0, 0, 0]]), np.array([[0.0, 0.5, 0.5]]))
+    assert len(surfaces) == 2
+    paths, effort = grow_paths(surfaces, *ends, max_depth=1)
+    everything, _ = grow_paths(surfaces, *ends, max_depth=1, shadows=False)
+    wrong, _ = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), *ends, max_depth=1)
+    if name == "a square":  # itself a mirror, at (5, 1/4, 1/4); the one behind it is not followed
+        assert effort.hidden == 1
+        assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[5.0, 0.25, 0.25]]
+    else:
+        assert effort.hidden == 0
+        assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[10.0, 0.25, 0.25]]
+        assert len(wrong) == 1  # this scene does tell the two apart
+    np.testing.assert_array_equal(paths.faces, everything.faces)
+
+
 def test_a_mirror_works_on_both_sides_and_hides_from_both():
     wall = enumerate_.scene_of(quad((0, -50, -50), (0, 100, 0), (0, 0, 100)))
     for side in (1.0, -1.0):

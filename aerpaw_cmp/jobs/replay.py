@@ -21,6 +21,7 @@ from ..flight.settings import RtSettings
 from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.crowns import Crowns
+from ..propagation.effort import Estimate
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
 from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
@@ -356,6 +357,7 @@ def replay_poses(
     *,
     engine: Engine | None = None,
     others: bool | None = None,
+    check_power_cut: bool = True,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -371,6 +373,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
+    check_power_cut : bool
+        Say in ``left_out`` what ``rt.power_cut_db`` costs.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -390,11 +394,12 @@ def replay_poses(
     crowns = reflecting_crowns(site.trees, rt)
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
-        parts = []
+        parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
             some = Poses(poses.position_m[rows], poses.rotation[rows])
-            parts.append(replay_poses(site, rt, link, some, engine=engine))
+            first, listener = not parts, silent if parts else progress
+            parts.append(replay_poses(site, rt, link, some, engine=engine, check_power_cut=first, progress=listener))
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
@@ -410,6 +415,9 @@ def replay_poses(
         crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        power_cut_db=rt.power_cut_db,
+        check_power_cut=check_power_cut,
+        on_estimate=lambda estimate: _tell(progress, name, estimate),
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         device=rt.device,
@@ -421,6 +429,12 @@ def replay_poses(
     if rt.other_interactions and not others:
         found.left_out.append(NOT_IN_RANKS)
     return found
+
+
+def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
+    """Say what a search will take, where it is more than a moment."""
+    if estimate.seconds > 1.0:
+        progress(f"path search {name}: {estimate}")
 
 
 def check_interactions(rt: RtSettings) -> None:

@@ -11,12 +11,13 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import CheckError, UsageError
-from aerpaw_cmp.propagation import image, prisms
+from aerpaw_cmp.propagation import image, power_cut, prisms
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
 from aerpaw_cmp.propagation.obstacles import why_not_there
+from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.tracer import estimate_search, replay
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
@@ -84,9 +85,9 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
     found = [
-        grow_paths(surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda text, _: words.append(text))[
-            0
-        ]
+        grow_paths(
+            surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda told: words.append(str(told))
+        )[0]
         for on in (True, False)
     ]
     assert len(words) == 2
@@ -171,28 +172,46 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 
 
-def test_the_power_cut_leaves_out_long_paths_only():
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("of_link", [False, True])
+def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
+    """Faces that no short path goes over are not followed; a limit may be one for all or one of each link."""
     rng = np.random.default_rng(5)
     walls = [
-        t for _ in range(10) for t in quad(rng.uniform(-30, 30, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
+        t for _ in range(25) for t in quad(rng.uniform(-60, 60, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
     ]
-    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(10), 2)))
-    source, targets = rng.uniform(-20, 20, (1, 3)), rng.uniform(-20, 20, (30, 3))
-    every, _ = grow_paths(surfaces, source, targets, max_depth=2)
-    some, _ = grow_paths(surfaces, source, targets, max_depth=2, longest_m=40.0)
+    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(25), 2)))
+    sources, targets = rng.uniform(-20, 20, (2, 3)), rng.uniform(-20, 20, (60, 3))
+    targets[7] = np.nan
+    longest = power_cut.longest_m(sources, targets, 8.0) if of_link else 40.0
+    every, effort = grow_paths(surfaces, sources, targets, max_depth=2, **way)
+    some, less = grow_paths(surfaces, sources, targets, max_depth=2, longest_m=longest, **way)
+    limit = np.broadcast_to(longest, (2, 60))[every.tower, every.pose]
+    kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
+    assert 0 < (kept.depth > 0).sum() < (every.depth > 0).sum()
+    assert less.sequences < effort.sequences or not way.get("beams", True)
+    for column in ("pose", "tower", "faces"):
+        assert np.array_equal(getattr(kept, column), getattr(some, column)), column
 
-    def length(paths):
-        total, last = np.zeros(len(paths)), np.broadcast_to(source[0], (len(paths), 3))
-        for step in range(3):
-            end = targets[paths.pose] if step == 2 else paths.vertices_m[:, step]
-            end = np.where(np.isfinite(end), end, targets[paths.pose])
-            total, last = total + np.linalg.norm(end - last, axis=1), end
-        return total
 
-    kept = every.select((length(every) <= 40.0) | (every.depth == 0))
-    assert 0 < len(kept) < len(every)
-    assert np.array_equal(kept.faces, some.faces)
-    assert np.array_equal(kept.pose, some.pose)
+def test_the_estimate_of_a_search_comes_without_the_search(scenes):
+    rng = np.random.default_rng(12)
+    spot = rng.uniform(-900, 900, (400, 2))
+    buildings = [
+        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
+    ]
+    site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
+    poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
+    told = []
+    replay(site, scenes.link(site), poses, on_estimate=told.append)
+    before = estimate_search(site, scenes.link(site), poses)
+    assert [one.first_faces for one in told] == [before.first_faces]
+    assert before.first_faces > 500
+    assert before.sequences == told[0].sequences > 2 * before.first_faces
+    assert str(before).startswith("about ")
+    assert "2 towers" in str(before)
+    assert "MiB" in str(before)
+    assert estimate_search(scenes.site(buildings[:5]), scenes.link(scenes.site()), poses) is None
 
 
 def test_paths_can_be_recomputed_from_their_faces():

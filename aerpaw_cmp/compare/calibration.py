@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, IntArray
 from .direction_gain import Choice, GainFit, GainModel, LinkSamples, Term, choose_model, fit_gain
 from .mount import GainOf, MountFit, fit_mounts
 from .rss import local_mean_db
@@ -30,15 +30,20 @@ SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_le
 
 @dataclass(frozen=True, slots=True)
 class Observed:
-    """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg]."""
+    """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg].
+
+    ``tower_m`` (n, 3): places of a tower that moves [m].
+    """
 
     samples: LinkSamples
     free_space_db: FloatArray
     heading_deg: FloatArray
+    tower_m: FloatArray | None = None
 
-    def part(self, keep: BoolArray) -> Observed:
+    def part(self, keep: BoolArray | IntArray) -> Observed:
         """Some of the samples."""
-        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep])
+        tower = None if self.tower_m is None else self.tower_m[keep]
+        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep], tower)
 
 
 @dataclass(frozen=True, slots=True)

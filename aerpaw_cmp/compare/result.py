@@ -210,6 +210,8 @@ class RssResult:
     further: RssFurther
     simulated_sd_db: FloatArray | None = None
     """Standard deviation (n,) of the simulated level that learned antennas state [dB]."""
+    tower_m: FloatArray | None = None
+    """Place (n, 3) of a tower that moves, NaN where it is not known [m]; None of one that stands."""
 
     @property
     def name(self) -> str:
@@ -292,6 +294,8 @@ class RankResult:
     score: RankComparison
     further: RankFurther
     probability: FloatArray | None = None
+    tower_m: FloatArray | None = None
+    """Place (n, 3) of a tower that moves [m]; None of one that stands."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -428,8 +428,8 @@ def link_geometry(
 
     Parameters
     ----------
-    tower_m : (3,)
-        Array centre, east-north-up [m].
+    tower_m : (3,), (1, 3) or (n, 3)
+        Array centre, east-north-up, of a tower that moves at every pose [m].
     position_m : (n, 3)
         UAV [m].
     rotation : (n, 3, 3), optional

@@ -16,15 +16,14 @@ from numpy.typing import NDArray
 
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
-from ..logs.ingest import IngestedFile, exists, ingest, sniffers_of
+from ..logs.ingest import IngestedFile, ingest, read_log
 from ..logs.limits import UNSCORED, flagged
-from ..logs.readers import Reader, by_name
 from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
-from .settings import FlightFile, LinkSettings, LogSettings, SiteChoice
-from .track import Track
+from .settings import FlightFile, GroundNode, LinkSettings, LogSettings, SiteChoice
+from .track import Track, good_positions
 
 Times = NDArray[np.datetime64]
 
@@ -79,6 +78,21 @@ class FlightData:
     rss: tuple[RssSeries, ...]
     rank: tuple[RankSeries, ...]
     warnings: tuple[str, ...]
+    nodes: Mapping[str, Track] = field(default_factory=dict)
+    """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
+
+    def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
+        """Array centre of a tower at instants (n,), and where it is known (n,); NaN elsewhere.
+
+        (1, 3) of a tower that stands, (n, 3) of one that moves.
+        """
+        if tower not in self.nodes:
+            return self.site.towers[tower].position_m[None, :], np.ones(len(time), dtype=np.bool_)
+        pose = self.nodes[tower].pose_at(time)
+        place = pose.position_m.copy()
+        if self.settings.towers[tower].height == "ground":
+            place[pose.valid, 2] = self.site.towers[tower].position_m[2]
+        return place, pose.valid
 
 
 def choose_site(choice: SiteChoice, folder: Path) -> Site:
@@ -103,16 +117,39 @@ STANDS_STILL_M = 3.0
 
 
 def with_ground_nodes(site: Site, settings: FlightFile, folder: Path) -> Site:
-    """The site with the flight's own nodes as towers.
+    """The site with the flight's own nodes as towers; see :func:`ground_nodes`."""
+    return ground_nodes(site, settings, folder)[0]
+
+
+def ground_nodes(
+    site: Site, settings: FlightFile, folder: Path, warnings: list[str] | None = None
+) -> tuple[Site, dict[str, Track]]:
+    """The site with the flight's own nodes as towers, and the tracks of those that move.
+
+    Parameters
+    ----------
+    site : Site
+    settings : FlightFile
+    folder : Path
+        Where the logs of positions resolve.
+    warnings : list of str, optional
+        Takes what is to be said of the tracks.
+
+    Returns
+    -------
+    Site
+        A node that moves stands in the middle of its positions.
+    dict of str to Track
+        Of the nodes that move, by name.
 
     Raises
     ------
     UsageError
-        A name that the site has already; a node that moves.
+        A name that the site has already.
     InputError
-        A track without positions.
+        A track without positions, or whose times are not known.
     """
-    towers = dict(site.towers)
+    towers, nodes = dict(site.towers), dict[str, Track]()
     for name, node in settings.towers.items():
         if name in site.towers:
             raise UsageError(
@@ -123,36 +160,90 @@ def with_ground_nodes(site: Site, settings: FlightFile, folder: Path) -> Site:
             assert node.longitude_deg is not None
             latitude, longitude, source = node.latitude_deg, node.longitude_deg, "flight.yaml"
         else:
-            latitude, longitude = _still(name, folder / node.track, settings.timezone, site)
-            source = node.track
+            found = _node_track(name, node, folder, settings, site)
+            latitude, longitude, source = found.latitude_deg, found.longitude_deg, node.track.path
+            if found.track is not None:
+                nodes[name] = found.track
+                if warnings is not None:
+                    warnings += [f"towers.{name}: {text}" for text in found.said]
         east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
-        towers[name] = Tower(
-            name, latitude, longitude, float(east[0]), float(north[0]), node.antenna_height_m, source=source
+        height = node.antenna_height_m
+        if node.height == "logged":
+            height = found.height_m
+        towers[name] = Tower(name, latitude, longitude, float(east[0]), float(north[0]), height, source=source)
+    return dataclasses.replace(site, towers=towers), nodes
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _NodeTrack:
+    """Middle of a node's positions, and its track where it moves."""
+
+    latitude_deg: float
+    longitude_deg: float
+    height_m: float
+    track: Track | None
+    said: tuple[str, ...] = ()
+
+
+def _node_track(name: str, node: GroundNode, folder: Path, settings: FlightFile, site: Site) -> _NodeTrack:
+    """Where a node stands, or how it moves."""
+    assert node.track is not None
+    path, logged = folder / node.track.path, node.height == "logged"
+    frame = _node_positions(name, node.track, path, settings.timezone)
+    latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
+    middle = float(np.median(latitude)), float(np.median(longitude))
+    east, north = site.frame.to_local(latitude, longitude)
+    there = site.frame.to_local(np.array([middle[0]]), np.array([middle[1]]))
+    away = float(np.hypot(east - there[0], north - there[1]).max())
+    up = np.maximum(frame["altitude_m"].to_numpy(np.float64) + site.datum.takeoff_ground_m, MINIMUM_HEIGHT_M)
+    height = float(np.nanmedian(up)) if logged and np.isfinite(up).any() else float("nan")
+    if logged and not np.isfinite(height):
+        raise InputError(
+            "no heights in this log", expected=f"those of towers.{name}, which has height: logged", path=path
         )
-    return dataclasses.replace(site, towers=towers)
-
-
-def _still(name: str, path: Path, timezone: str | None, site: Site) -> tuple[float, float]:
-    """Median position [deg] of a node that stands still."""
-    if not path.is_file():
-        raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
-    (file,) = ingest([path], options=LogSettings(path=str(path)).options(timezone))
-    frames = [s.frame for s in file.result.streams if {"latitude_deg", "longitude_deg"} <= set(s.frame.columns)]
-    known = [f[["latitude_deg", "longitude_deg"]].dropna().to_numpy(np.float64) for f in frames]
-    if not any(map(len, known)):
-        raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
-    places = next(k for k in known if len(k))
-    latitude, longitude = (float(v) for v in np.median(places, axis=0))
-    east, north = site.frame.to_local(places[:, 0], places[:, 1])
-    middle = site.frame.to_local(np.array([latitude]), np.array([longitude]))
-    away = float(np.hypot(east - middle[0], north - middle[1]).max())
-    if away > STANDS_STILL_M:
-        raise UsageError(
-            f"towers.{name} moves: its track leaves {away:.0f} m from the middle",
-            expected=f"a node that stands still within {STANDS_STILL_M:g} m; nodes in motion are not replayed",
+    rises = float(np.nanmax(np.abs(up - height))) if logged else 0.0
+    stands = _NodeTrack(latitude_deg=middle[0], longitude_deg=middle[1], height_m=height, track=None)
+    if max(away, rises) <= STANDS_STILL_M:
+        return stands
+    track = Track(
+        frame if logged else frame.assign(altitude_m=0.0),
+        site.frame,
+        maximum_gap_s=settings.rt.maximum_gap_s,
+        ground_m=site.datum.takeoff_ground_m,
+    )
+    if not len(track):
+        raise InputError(
+            f"towers.{name} moves and no position of its track has a time",
+            expected="a time beside each position",
+            cause="relative times want 'time_origin', local ones 'timezone', beside the track's path",
             path=path,
         )
-    return latitude, longitude
+    said = [f"moves {away:.0f} m from its middle: every sample is replayed from the node's place at that moment"]
+    said += [text for text in track.account.warnings if "attitude" not in text]
+    return dataclasses.replace(stands, track=track, said=tuple(said))
+
+
+def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | None) -> pd.DataFrame:
+    """Rows with a position of the first stream that has any, with all columns of telemetry."""
+    if not path.is_file():
+        raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
+    (file,) = ingest([path], options=log.options(timezone), reader=log.reader)
+    for stream in file.result.streams:
+        if stream.name in log.skip or not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
+            continue
+        frame = stream.frame.loc[~flagged(stream.frame)]
+        latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
+        frame = frame.loc[good_positions(latitude, longitude, np.zeros(len(frame)))]
+        if len(frame):
+            whole: pd.DataFrame = frame.reindex(columns=["time", *_TELEMETRY])
+            return whole
+    raise InputError("no positions in this log", expected=f"those of towers.{name}", path=path)
+
+
+_TELEMETRY = (
+    "latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg",
+    "velocity_north_mps", "velocity_east_mps", "velocity_down_mps",
+)  # fmt: skip
 
 
 def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> tuple[IngestedFile, ...]:
@@ -163,45 +254,8 @@ def read_logs(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     InputError
         A missing file, a log of another kind than the flight file says, a log without any record.
     """
-    files = []
-    for log in settings.logs:
-        path = (logs_root or folder) / log.path
-        if not exists(path):
-            root = logs_root or folder
-            raise InputError(
-                "there is no such log",
-                expected=f"the file below {root}",
-                cause="a wrong path, or --logs-root",
-                path=path,
-            )
-        reader = None if log.reader is None else by_name(log.reader)
-        if reader is not None:
-            _refuse_other_kind(path, reader)
-        (file,) = ingest([path], options=log.options(settings.timezone), reader=log.reader)
-        if not file.result.streams:
-            raise InputError(
-                "no record could be read",
-                expected=f"records of reader {file.result.reader!r}",
-                cause=file.result.rejected[0].reason if file.result.rejected else "an aborted run",
-                path=path,
-            )
-        files.append(file)
-    return tuple(files)
-
-
-def _refuse_other_kind(path: Path, reader: Reader) -> None:
-    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
-    if reader.name == "generic_csv":
-        return  # its columns were named: no other reader knows better
-    others = sniffers_of(path)
-    if not others or reader.name in others:
-        return
-    raise InputError(
-        f"the content is that of {' or '.join(others)}",
-        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
-        cause="the wrong file, or the wrong 'reader:'",
-        path=path,
-    )
+    root = logs_root or folder
+    return tuple(read_log(root, log.path, log.options(settings.timezone), reader=log.reader) for log in settings.logs)
 
 
 SNR = "snr"
@@ -253,8 +307,8 @@ def gather(
     InputError
         No position, no row that may be compared, a flight far from every tower.
     """
-    site = with_ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder)
     warnings: list[str] = []
+    site, nodes = ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder, warnings)
     telemetry: list[tuple[str, Stream]] = []
     rss: list[tuple[str, RssSeries]] = []
     rank: list[tuple[str, RankSeries]] = []
@@ -291,10 +345,25 @@ def gather(
         rss=_records(rss, lambda s: f"RSS of {s.tower} {s.channel}"),
         rank=_records(rank, lambda s: f"rank of {s.tower}"),
         warnings=tuple(warnings),
+        nodes=nodes,
     )
     _check_place(data, [(path, stream) for path, stream in telemetry[:1]])
     _check_overlap(data)
     return dataclasses.replace(data, warnings=(*_idle_attitude(data), *data.warnings))
+
+
+def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None) -> FlightData:
+    """The data of a flight: :func:`gather` of what :func:`read_logs` reads.
+
+    Parameters
+    ----------
+    settings : FlightFile
+    folder : Path
+        Of the flight file.
+    logs_root : Path, optional
+        Where logs and antenna files resolve, in place of ``folder``.
+    """
+    return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
 
 
 def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
@@ -569,6 +638,31 @@ def _check_overlap(data: FlightData) -> None:
                 f"no overlap in time: {kind} of {tower} spans {shown}, telemetry {flown} (UTC)",
                 expected="logs of the same flight",
                 cause=_clock_cause(data.settings.timezone, time, start, end),
+            )
+    _check_nodes(data)
+
+
+FIRST_YEAR = 2000
+"""A log that ends before counts from a zero of its own."""
+
+
+def _check_nodes(data: FlightData) -> None:
+    """Every series of a tower that moves must share time with the tower's track."""
+    every = [("RSS", s.tower, s.time) for s in data.rss] + [("rank", s.tower, s.time) for s in data.rank]
+    for kind, tower, time in every:
+        track = data.nodes.get(tower)
+        if track is None or not len(time):
+            continue
+        start, end = np.datetime64(track.start_ns, "ns"), np.datetime64(track.end_ns, "ns")
+        if time.min() > end or time.max() < start:
+            cause = _clock_cause(data.settings.timezone, time, start, end)
+            if pd.Timestamp(end).year < FIRST_YEAR:
+                cause = "relative times: they want 'time_origin' beside the log"
+            raise InputError(
+                f"no overlap in time: {kind} of {tower} spans {pd.Timestamp(time.min())} .. {pd.Timestamp(time.max())}"
+                f", the track of this tower {pd.Timestamp(start)} .. {pd.Timestamp(end)} (UTC)",
+                expected="positions of the node during the flight",
+                cause=cause.replace("beside the log", f"beside 'path' in towers.{tower}.track"),
             )
 
 

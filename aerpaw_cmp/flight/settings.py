@@ -316,19 +316,30 @@ class SiteChoice(Settings):
 
 
 class GroundNode(Settings):
-    """A node of this flight that the site does not list, such as a rover: a place, or a log of its positions."""
+    """A node of this flight that the site does not list, such as a rover or a second UAV: a place, or its track."""
 
     latitude_deg: Annotated[float, Field(ge=-90, le=90)] | None = None
     longitude_deg: Annotated[float, Field(ge=-180, le=180)] | None = None
-    track: str | None = None
+    track: LogSettings | None = None
     """Log with its positions; a node that stands still within ``STANDS_STILL_M`` is at their median."""
+    height: Literal["ground", "logged"] = "ground"
+    """``ground``: the antenna is ``antenna_height_m`` above the ground plane; ``logged``: where the track says."""
     antenna_height_m: Positive = 1.5
+
+    @field_validator("track", mode="before")
+    @classmethod
+    def _a_path_is_a_log(cls, value: object) -> object:
+        return {"path": value} if isinstance(value, str) else value
 
     @model_validator(mode="after")
     def _a_place_or_a_track(self) -> GroundNode:
         given = (self.latitude_deg is not None, self.longitude_deg is not None)
         if given not in ((True, True), (False, False)) or all(given) == (self.track is not None):
             raise ValueError("a tower needs latitude_deg and longitude_deg, or a track")
+        if self.height == "logged" and self.track is None:
+            raise ValueError("height: logged needs a track, which is where it is logged")
+        if self.height == "logged" and "antenna_height_m" in self.model_fields_set:
+            raise ValueError("height: logged takes the height from the track: no antenna_height_m beside it")
         return self
 
 

@@ -7,6 +7,7 @@ along the course and flagged. Nothing is dropped silently: :class:`TrackAccount`
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal
 
@@ -28,7 +29,9 @@ COURSE_SPEED_MPS = 1.0
 COURSE_SPAN_S = 2.0
 """Positions this long before and after give a velocity that is not logged [s]."""
 
-REASONS = ("", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time")
+REASONS = (
+    "", "before telemetry", "after telemetry", "telemetry gap", "no telemetry", "no time", "no position of the tower"
+)  # fmt: skip
 """Why a pose is not valid; index 0 is a valid pose."""
 
 
@@ -111,6 +114,24 @@ class TrackPoses:
     def __len__(self) -> int:
         return len(self.valid)
 
+    def pick(self, rows: BoolArray) -> TrackPoses:
+        """The poses of some rows (n,) bool; the very same where these are all of them."""
+        if rows.all():
+            return self
+        return TrackPoses(**{one.name: getattr(self, one.name)[rows] for one in dataclasses.fields(self)})
+
+    def where(self, known: BoolArray) -> TrackPoses:
+        """The poses with those as not valid at which the tower, which moves too, is not known (n,)."""
+        if known.all():
+            return self
+        lost = self.valid & ~known
+        return dataclasses.replace(
+            self,
+            position_m=np.where(known[:, None], self.position_m, np.nan),
+            valid=self.valid & known,
+            reason_code=np.where(lost, REASONS.index("no position of the tower"), self.reason_code).astype(np.int8),
+        )
+
     @property
     def reason(self) -> AnyArray:
         """Why a pose is not valid (n,), one of :data:`REASONS`; empty where it is."""
@@ -171,7 +192,7 @@ def _hour_steps(stamp: AnyArray) -> int:
     return int(((hours != 0) & (np.abs(hours) <= 2) & (np.abs(step - 3600.0 * hours) < 5.0)).sum())
 
 
-def _good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
+def good_positions(latitude: FloatArray, longitude: FloatArray, altitude: FloatArray) -> BoolArray:
     """Coordinates that can be: finite, in range, not (0, 0) and not the -999 that loggers write without a fix."""
     finite = np.isfinite(latitude) & np.isfinite(longitude) & np.isfinite(altitude)
     with np.errstate(invalid="ignore"):
@@ -256,7 +277,7 @@ class Track:
         stamp = nanoseconds(telemetry["time"])
         latitude, longitude, altitude = column("latitude_deg"), column("longitude_deg"), column("altitude_m")
         timed = stamp != NO_TIME
-        placed = timed & _good_positions(latitude, longitude, altitude)
+        placed = timed & good_positions(latitude, longitude, altitude)
         rows = np.flatnonzero(placed)
         forward, duplicates, backward = _forward_rows(stamp[rows])
         rows = rows[forward]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -19,10 +19,12 @@ from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
+from ..propagation.arrays import Poses
 from ..propagation.audit import Audit, audit
 from ..propagation.channel import mean_pair_power
 from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ..propagation.interactions import summary
+from ..propagation.moving import site_with_tower_at
 from ..propagation.reference import (
     C_MPS,
     PATTERNS,
@@ -34,7 +36,8 @@ from ..propagation.reference import (
     layout_positions,
     turned,
 )
-from .replay import Replayed, attitude_rotation, path_loss, reflecting_crowns
+from ..site.site import Site
+from .replay import Replayed, attitude_rotation, part_of, path_loss, reflecting_crowns
 
 ATTITUDE_ROWS = 200
 """Logged attitudes that are turned into rotations a second time."""
@@ -92,12 +95,12 @@ def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, ob
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """One audit over all series: links are shared out in proportion to their poses."""
-    site, rt, ks = data.site, data.settings.rt, data.settings.rank.k
+    rt, ks = data.settings.rt, data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
     parts: list[Audit] = []
-    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+    for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
-        links = min(count, math.ceil(rt.audit_links * count / max(total, 1)))
+        links = min(count, max(math.ceil(rt.audit_links * count / max(total, 1)), 1))
         if links == 0:
             continue
         progress(f"audit {replayed.replay.towers[0]}: {links} links")
@@ -137,6 +140,31 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         note=" ".join([TIMES, *_rays(parts)]),
         fields=dataclasses.replace(found, not_covered=(*found.not_covered, *NOT_COVERED)),
     )
+
+
+MOMENTS = 6
+"""At so many moments a tower that moves is audited as one that stands where it was then; each is a scene of its own."""
+
+
+def standing(data: FlightData, replays: Sequence[Replayed]) -> Iterator[tuple[Site, Replayed, Expected]]:
+    """Replays with towers that stand, with what the settings say of them: of a tower that moves some moments."""
+    for replayed, expected in zip(replays, expectations(data, replays), strict=True):
+        if replayed.tower_m is None:
+            yield data.site, replayed, expected
+            continue
+        (tower,) = replayed.link.tower_arrays
+        count = len(replayed.poses)
+        for at in np.unique(np.linspace(0, count - 1, min(count, MOMENTS)).round().astype(np.int64)).tolist():
+            pose = Poses(replayed.poses.position_m[at : at + 1], replayed.poses.rotation[at : at + 1])
+            moment = dataclasses.replace(
+                replayed,
+                poses=pose,
+                valid=np.ones(1, dtype=np.bool_),
+                replay=part_of(replayed.replay, at, at + 1),
+                track=None,
+                tower_m=None,
+            )
+            yield site_with_tower_at(data.site, tower, replayed.tower_m[at]), moment, expected
 
 
 def _rays(parts: Sequence[Audit]) -> list[str]:

@@ -30,7 +30,7 @@ from ..compare.direction_gain import (
     column_forms,
 )
 from ..compare.mount import GainOf
-from ..flight.data import RATIOS, SNR, FlightData, RssSeries, gather, read_logs
+from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
@@ -192,7 +192,7 @@ def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None
     for name in settings.flights:
         path = folder / name
         flight = load_flight(path)
-        out.append(gather(flight, path.parent, read_logs(flight, path.parent, logs_root), logs_root))
+        out.append(load_data(flight, path.parent, logs_root))
     names = [data.settings.flight.name for data in out]
     for name in names:
         if names.count(name) > 1:
@@ -253,15 +253,18 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
     """One series, and which share of its attitudes stands for an unknown one."""
     if data.track is None:
         raise InputError(f"flight {data.settings.flight.name} has no telemetry", expected="positions and attitude")
-    pose = data.track.pose_at(series.time)
+    place, known = data.tower_at(series.tower, series.time)
+    pose = data.track.pose_at(series.time).where(known)
     low = data.settings.rss.minimum_height_m
     with np.errstate(invalid="ignore"):
         keep = pose.valid if low is None else pose.valid & (pose.position_m[:, 2] >= low)
-    place = data.site.towers[series.tower].position_m
     position = pose.position_m[keep]
+    if series.tower in data.nodes:
+        place = place[keep]
     ray = position - place
     at_tower = ray / np.linalg.norm(ray, axis=1, keepdims=True)
-    free = free_space_dbm(place[None, :], position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
+    ends = place[:, None, :] if series.tower in data.nodes else place
+    free = free_space_dbm(ends, position, series.link.carrier_hz, series.link.transmit_power_dbm)[:, 0]
     time = series.time[keep]
     seconds = (time - time.min()) / np.timedelta64(1, "s") if len(time) else np.zeros(0)
     order = np.argsort(seconds, kind="stable")
@@ -276,7 +279,8 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
         residual_db=series.measured_db[keep] - free,
     )
     guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
-    return Observed(samples.part(order), free[order], pose.heading_deg[keep][order]), guessed
+    found = Observed(samples, free, pose.heading_deg[keep], place if series.tower in data.nodes else None)
+    return found.part(order), guessed
 
 
 # --- what is learned -----------------------------------------------------------------------------------------------
@@ -331,10 +335,11 @@ def fit_ground(flights: Sequence[FlightData], observed: Sequence[Observed], lear
         o = kept[samples.flight, samples.antenna]
         link = next(s.link for s in data.rss if f"{s.tower}.{s.channel}" == samples.antenna)
         tower = data.site.towers[samples.tower]
+        place = tower.position_m[None, :] if o.tower_m is None else o.tower_m[:, None, :]
         out = [samples.binned(model.bin_s).residual_db]
         for sigma in ROUGHNESS_M:
             level = two_ray_dbm(
-                tower.position_m[None, :],
+                place,
                 samples.position_m,
                 link.carrier_hz,
                 link.transmit_power_dbm,

@@ -177,6 +177,11 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         keep = valid if low is None else valid & (position[:, 2] >= low)
     link = data.settings.link.rank.build([series.tower], data.folder)
     ports = {len(link.uav_array), len(link.tower_arrays[series.tower])}
+    if series.tower in data.nodes:
+        raise UsageError(
+            f"rank of {series.tower} in {data.settings.flight.name}, which moves",
+            expected="a tower that stands still: geometries of the modem are fitted as seen from one place",
+        )
     if ports != {4}:
         raise UsageError(
             f"link.rank of {data.settings.flight.name} has arrays of {sorted(ports)} ports",

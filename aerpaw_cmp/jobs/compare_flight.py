@@ -146,6 +146,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         simulated_dbm=np.where(levels.posed, levels.simulated_db, np.nan),
         posed=levels.posed,
         position_m=position,
+        tower_m=tower_places(replayed),
         line_of_sight=direct,
         geometry=geometry,
         score=score,
@@ -183,7 +184,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
 def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:
     """Free space and two-ray (isotropic) at the replayed poses (n,) [dBm]."""
     place, link = site.towers[tower], replayed.link
-    source, target = place.position_m[None, :], replayed.poses.position_m
+    source, target = replayed.source_m(site), replayed.poses.position_m
+    if replayed.tower_m is not None:  # a place per pose: (poses, towers, 3)
+        source = source[:, None, :]
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
     two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
     return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
@@ -393,6 +396,15 @@ def _positions(replayed: Replayed) -> FloatArray:
     return position
 
 
+def tower_places(replayed: Replayed) -> FloatArray | None:
+    """Places (n, 3) [m] of a tower that moves at the samples, NaN where not known; None of one that stands."""
+    if replayed.tower_m is None:
+        return None
+    place = np.full((len(replayed.valid), 3), np.nan)
+    place[replayed.valid] = replayed.tower_m
+    return place
+
+
 def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) -> dict[str, FloatArray]:
     """Quantities that residuals are drawn against, at the samples of the series (n,), by name with unit.
 
@@ -412,9 +424,9 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
         ``uav_azimuth_deg``, ``uav_elevation_deg``; ``heading_deg`` with a track, ``foliage_depth_m`` with trees.
         NaN where no pose is known.
     """
-    place, link = site.towers[tower], replayed.link
+    link = replayed.link
     seen = rss.link_geometry(
-        place.position_m,
+        replayed.source_m(site),
         replayed.poses.position_m,
         replayed.poses.rotation,
         tower_mount=link.tower_arrays[tower].mount,
@@ -427,9 +439,9 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
     ):  # fmt: skip
         out[name] = replayed.spread(seen[name])
     if replayed.track is not None:
-        out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)
+        out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
     if len(site.trees) and rt.foliage != "none":
-        depth = direct_foliage_m(place.position_m, replayed.poses.position_m, site.trees)
+        depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.trees)
         out["foliage_depth_m"] = replayed.spread(depth)
     return out
 
@@ -476,13 +488,14 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
         replicates=max(settings.bootstrap, 1),
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
-    sigma = ranks.singular_values(h)
+    sigma, towers = ranks.singular_values(h), tower_places(replayed)
     probability, forecast = _receiver_forecast(data, series)
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
         time=series.time[rows],
         position_m=position[rows],
+        tower_m=None if towers is None else towers[rows],
         measured=series.rank[rows],
         sinr_db=sinr_db,
         sigma=sigma,
@@ -530,7 +543,7 @@ def _repeated_rank(
     elapsed = rss.seconds(time)
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
-    heading = None if replayed.track is None else replayed.track.heading_deg[rows]
+    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
     found = {}
     for name, turned in (("same_heading", heading), ("any_heading", None)):
         if name == "same_heading" and turned is None:

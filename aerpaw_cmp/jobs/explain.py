@@ -15,7 +15,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray
-from ..flight.data import FlightData, RankSeries, RssSeries, gather, rank_positions, read_logs
+from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
 from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
 from ..propagation.explained import (
@@ -27,6 +27,7 @@ from ..propagation.explained import (
     why_not,
 )
 from ..propagation.image import planes_of
+from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
 from .replay import _poses, _track_poses, attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time
@@ -157,16 +158,22 @@ def run_explain(
         Unknown tower or channel, a time that is none or lies outside the logs, no pose there.
     """
     settings = load_flight(flight)
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     series = _series(data, tower, channel)
     at, seconds = _sample(series, time, settings.timezone)
-    link, pose, notes = _pose(data, series, at, progress)
+    link, pose, notes, instant = _pose(data, series, at, progress)
+    if tower in data.nodes:  # as it stood at that moment
+        place, known = data.tower_at(tower, instant)
+        _known(known, series, at)
+        data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
     rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
     chosen = rt.engine if engine in (None, "both") else engine
     others = bool(rt.other_interactions) and chosen == "sionna" and isinstance(series, RssSeries)
     found = replay_poses(data.site, rt, link, pose, engine=chosen, others=others, progress=progress)  # type: ignore[arg-type]
     other, found = _other_power(found, link), found.of_reflections()
     source = data.site.towers[tower].position_m
+    if tower in data.nodes:
+        notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
     paths = _paths(data, rt, found, link, pose, source)
     differences = None
     if engine == "both":
@@ -279,8 +286,8 @@ def _instant(text: str, first: Any, zone: str | None) -> Any:
 
 def _pose(
     data: FlightData, series: RssSeries | RankSeries, at: int, progress: Progress
-) -> tuple[Link, Poses, list[str]]:
-    """Link and pose of a sample, as the report replays it."""
+) -> tuple[Link, Poses, list[str], Times]:
+    """Link and pose of a sample, as the report replays it, and its instant (1,) on the telemetry's clock."""
     rt, notes = data.settings.rt, []
     if isinstance(series, RssSeries):
         time = series.time
@@ -291,7 +298,7 @@ def _pose(
                 notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
         track = _track_poses(data.track, time[at : at + 1])
         _known(track.valid, series, at)
-        return series.link.build([series.tower], data.folder), _poses(track, rt.attitude), notes
+        return series.link.build([series.tower], data.folder), _poses(track, rt.attitude), notes, time[at : at + 1]
     link = data.settings.link.rank.build([series.tower], data.folder)
     position, valid = rank_positions(series, data.track)
     _known(valid[at : at + 1], series, at)
@@ -300,7 +307,7 @@ def _pose(
         track = _track_poses(data.track, series.time[at : at + 1])
         if track.valid[0]:
             rotation = np.asarray(attitude_rotation(track, rt.attitude))
-    return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes
+    return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes, series.time[at : at + 1]
 
 
 def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:

@@ -23,13 +23,14 @@ from ..compare.ladder import Ladder, Rung, climb
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile
 from ..propagation.arrays import Link, Poses
-from ..propagation.channel import channel_matrices, mean_pair_power, rss_dbm
+from ..propagation.channel import mean_pair_power, rss_dbm
+from ..propagation.moving import replay_moving
 from ..propagation.tracer import Replay, replay
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
 from .levels import Levels, levels_of
-from .replay import FlightReplay, Replayed, attitude_rotation, path_loss
+from .replay import FlightReplay, Replayed, attitude_rotation, fields_from, path_loss
 
 WEAK_GROUND_DB = 10.0
 """Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""
@@ -213,9 +214,7 @@ class _Climber:
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         wanted = rt.model_copy(update=model.settings(rt.max_depth)["rt"])
         loss = path_loss(self._data.site.trees, wanted, link.carrier_hz)
-        sources = np.array([self._data.site.towers[name].position_m for name in traced.towers])
-        loss_db = None if loss is None else loss(paths, sources, poses.position_m)
-        fields = channel_matrices(paths, traced.faces, sources, poses, link, loss_db)
+        fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
         return level, series.step * (search_s + time.perf_counter() - begin)
@@ -226,13 +225,22 @@ class _Climber:
             site: Site = self._data.site if buildings else dataclasses.replace(self._data.site, buildings=())
             depth = max(self._data.settings.rt.max_depth, 1) if buildings else 1
             series = self._series[index]
-            found = replay(site, series.replayed.link, self._poses(series, "ignored"), max_depth=depth, cache_dir="")
+            link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series)
+            if series.replayed.tower_m is not None:
+                found = replay_moving(site, link, poses, sources, max_depth=depth)
+            else:
+                found = replay(site, link, poses, max_depth=depth, cache_dir="")
             self._traced[index, buildings] = found, time.perf_counter() - begin
         return self._traced[index, buildings]
 
+    def _sources(self, series: _Series) -> FloatArray:
+        """Place of the tower: (1, 3), or (m, 3) at the thinned samples where it moves."""
+        places = series.replayed.source_m(self._data.site)
+        return places if series.replayed.tower_m is None else places[series.picked]
+
     def _poses(self, series: _Series, attitude: str) -> Poses:
         whole, track = series.replayed.poses, series.replayed.track
-        turn = whole.rotation if track is None else attitude_rotation(track, attitude)[series.replayed.valid]
+        turn = whole.rotation if track is None else attitude_rotation(track, attitude)
         return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
 
 

@@ -72,7 +72,7 @@ def gain_sd_db(site: Site, tower: str, replayed: Replayed) -> FloatArray | None:
     None where neither antenna states one.
     """
     link, poses = replayed.link, replayed.poses
-    ray = poses.position_m - site.towers[tower].position_m
+    ray = poses.position_m - replayed.source_m(site)
     at_uav = np.einsum("nji,nj->ni", poses.rotation, -ray)
     square = np.zeros(len(ray))
     stated = False

@@ -14,7 +14,7 @@ import pandas as pd
 from ..common.errors import UsageError
 from ..common.units import ComplexArray, FloatArray
 from ..compare.result import FlightResult
-from ..flight.data import FlightData, gather, rank_positions, read_logs
+from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.overrides import overridden
 from ..flight.settings import FlightFile, load_flight
 from ..propagation.paths import PathSet
@@ -64,7 +64,7 @@ def open_flight(
     file = Path(path)
     settings = overridden(load_flight(file), overrides or {})
     root = None if logs_root is None else Path(logs_root)
-    data = gather(settings, file.parent, read_logs(settings, file.parent, root), root)
+    data = load_data(settings, file.parent, root)
     return Flight(file, data, root, changed=tuple(overrides or ()))
 
 

@@ -19,9 +19,10 @@ from ..common.errors import UsageError
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..flight.data import FlightData
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses, single_element
 from ..propagation.tracer import estimate_search, replay
+from ..site.site import Site
 from ..site.siteyaml import load_site
 
 MEASURED = {
@@ -157,11 +158,11 @@ def report_plan(
     UsageError, InputError
         What the report itself would raise of its settings, logs and output.
     """
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
 
     OutputFolder(out, job="report", inputs=inputs, force=force).refuse()
     start = time.process_time()
-    data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+    data = load_data(settings, flight.parent, logs_root)
     reading = time.process_time() - start
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
@@ -204,36 +205,35 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
     groups: dict[tuple[str, str], list[Any]] = {}
     for series in data.rss:
         groups.setdefault((series.tower, series.settings_key), []).append(series)
-    rss, rank, attitude = [], [], data.settings.rt.attitude
+    rss, rank, site, rt = [], [], data.site, data.settings.rt
     for (tower, _), members in groups.items():
         assert data.track is not None
         track = data.track.pose_at(np.concatenate([series.time for series in members]))
-        poses = Poses(track.position_m[track.valid], attitude_rotation(track, attitude)[track.valid])
+        poses = Poses(track.position_m[track.valid], attitude_rotation(track, rt.attitude)[track.valid])
         name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
-        rss.append(_tried(data, name, members[0].link.build([tower], data.folder), poses))
+        rss.append(_tried(site, rt, name, members[0].link.build([tower], data.folder), poses))
     for one in data.rank:
         position, valid = rank_positions(one, data.track)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         link = data.settings.link.rank.build([one.tower], data.folder)
-        rank.append(_tried(data, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
+        rank.append(_tried(site, rt, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
     return rss, rank
 
 
-def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStage:
+def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> PlannedStage:
     """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
     from .replay import replay_poses
 
-    rt, n = data.settings.rt, len(poses)
-    work = f"{n} poses, engine {rt.engine}"
+    work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
         return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
-    if (planned := _by_first_faces(data, name, work, link, poses)) is not None:
+    if (planned := _by_first_faces(site, rt, name, work, link, poses)) is not None:
         return planned
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
         some = Poses(poses.position_m[few], np.ascontiguousarray(poses.rotation[few]))
-        return _cpu_seconds(lambda: replay_poses(data.site, rt, link, some))
+        return _cpu_seconds(lambda: replay_poses(site, rt, link, some))
 
     few, more = TRIED_POSES
     if n <= more:
@@ -243,10 +243,10 @@ def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStag
     return PlannedStage(name=name, work=work, seconds=large + per_pose * (n - more))
 
 
-def _by_first_faces(data: FlightData, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
+def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
     """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
-    rt, start = data.settings.rt, time.process_time()
-    estimate = estimate_search(data.site, link, poses, max_depth=rt.max_depth, power_cut_db=rt.power_cut_db, threads=1)
+    start = time.process_time()
+    estimate = estimate_search(site, link, poses, max_depth=rt.max_depth, power_cut_db=rt.power_cut_db, threads=1)
     if estimate is None:
         return None
     setup = time.process_time() - start  # reading, merging and trees, which are kept for the next stage

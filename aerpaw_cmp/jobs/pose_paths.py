@@ -23,8 +23,8 @@ def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> t
         if series.tower not in found and replayed.valid.any():
             poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
             time = series.time[replayed.valid][poses]
-            tower_m = data.site.towers[series.tower].position_m
-            lines = tuple(tuple(_lines(replayed, pose, tower_m)) for pose in poses)
+            tower_m = np.broadcast_to(replayed.source_m(data.site), replayed.poses.position_m.shape)
+            lines = tuple(tuple(_lines(replayed, pose, tower_m[pose])) for pose in poses)
             found[series.tower] = PosePaths(tower=series.tower, time=time, lines=lines)
     return tuple(found.values())
 

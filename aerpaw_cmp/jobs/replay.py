@@ -20,10 +20,12 @@ from ..flight.lag import DIRECTION_TERMS, direction_terms
 from ..flight.settings import RtSettings
 from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
 from ..propagation.effort import Estimate
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
-from ..propagation.paths import PathSet
+from ..propagation.moving import loss_along, moving_matrices, replay_moving
+from ..propagation.paths import Faces, PathSet
 from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
 from ..site.site import Site, Trees
 
@@ -44,7 +46,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
+    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; all else has those alone."""
 
     link: Link
     poses: Poses
@@ -52,6 +54,15 @@ class Replayed:
     replay: Replay
     track: TrackPoses | None = None
     clock: Clock | None = None
+    tower_m: FloatArray | None = None
+    """Place (poses, 3) of a tower that moves [m]; None of one that stands."""
+
+    def source_m(self, site: Site) -> FloatArray:
+        """Centre of the tower's array [m]: (1, 3), or (poses, 3) where it moves."""
+        if self.tower_m is not None:
+            return self.tower_m
+        (tower,) = self.link.tower_arrays
+        return site.towers[tower].position_m[None, :]
 
     def spread(self, values: FloatArray, fill: float = np.nan) -> FloatArray:
         """Values per replayed pose, put back at their samples (n,)."""
@@ -89,25 +100,42 @@ def replay_rss(
     for members in groups.values():
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
-        tracks = [_track_poses(data.track, telemetry_time(data.rss[i].time, shifts[i])) for i in members]
+        times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
+        valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
-        whole = replay_poses(data.site, rt, link, joined, progress=progress)
+        towers_m = None if tower not in data.nodes else np.concatenate(places)
+        whole = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
         start = 0
-        for index, track, part in zip(members, tracks, poses, strict=True):
+        for index, here, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
                 link=link,
                 poses=part,
-                valid=track.valid,
+                valid=here,
                 replay=part_of(whole, start, stop),
                 track=track,
                 clock=shifts[index],
+                tower_m=None if towers_m is None else place,
             )
             start = stop
     return [out[i] for i in range(len(data.rss))]
+
+
+def _towers_and_poses(
+    data: FlightData, tower: str, times: Sequence[Times]
+) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
+    """At which instants a tower and the UAV are known; their places and poses at those."""
+    valid, places, tracks = [], [], []
+    for time in times:
+        place, known = data.tower_at(tower, time)
+        track = _track_poses(data.track, time).where(known)
+        valid.append(track.valid)
+        tracks.append(track.pick(track.valid))
+        places.append(place if len(place) == 1 and tower not in data.nodes else place[track.valid])
+    return valid, places, tracks
 
 
 def _joined_poses(poses: Sequence[Poses]) -> Poses:
@@ -169,15 +197,20 @@ class _Predictions:
         key = (series.tower, series.settings_key, _digest(times))
         if key not in self._kept:
             link = series.link.build([series.tower], self._data.folder)
-            parts = [self._levels(link, part) for part in _in_blocks(times)]
+            parts = [self._levels(link, series.tower, part) for part in _in_blocks(times)]
             self._kept = {k: v for k, v in self._kept.items() if k[0] == series.tower}  # towers come one after another
             self._kept[key] = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
         return self._kept[key][field]
 
-    def _levels(self, link: Link, times: Any) -> dict[str, FloatArray]:
-        data, track = self._data, self.track_at(times)
+    def _levels(self, link: Link, tower: str, times: Any) -> dict[str, FloatArray]:
+        data = self._data
+        place, known = data.tower_at(tower, times)
+        track = self.track_at(times).where(known)
         poses, depth = _poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
-        found = replay(data.site, link, poses, engine="image", max_depth=depth)
+        if tower in data.nodes:
+            found = replay_moving(data.site, link, poses, place[track.valid], max_depth=depth)
+        else:
+            found = replay(data.site, link, poses, engine="image", max_depth=depth)
         levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
         return {name: _spread(track.valid, level) for name, level in levels.items()}
 
@@ -189,12 +222,12 @@ class _Predictions:
             self._tracks = {**dict(kept), key: _track_poses(self._data.track, times)}
         return self._tracks[key]
 
-    def terms_at(self, place_m: FloatArray, times: Any) -> FloatArray:
+    def terms_at(self, tower: str, times: Any) -> FloatArray:
         """Terms of direction (n, 12) as seen from a tower, for antennas that are not known."""
         found, start = np.empty((len(times), DIRECTION_TERMS)), 0
         for part in _in_blocks(times):
             track = self.track_at(part)
-            line = track.position_m - place_m
+            line = track.position_m - self._data.tower_at(tower, part)[0]
             azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
             elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
             some = direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
@@ -222,7 +255,7 @@ def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], prediction
     Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
     (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
     """
-    place = data.site.towers[channels[0].tower].position_m
+    tower = channels[0].tower
 
     def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
         return ClockChannel(
@@ -230,7 +263,7 @@ def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], prediction
             times=series.time,
             measured_db=_high_enough(data, series),
             predictor=lambda times: predictions(series, field, times),
-            terms=lambda times: predictions.terms_at(place, times),
+            terms=lambda times: predictions.terms_at(tower, times),
             resolution_s=resolution_s,
         )
 
@@ -310,15 +343,20 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
     for series in data.rank:
         link = data.settings.link.rank.build([series.tower], data.folder)
         position, valid = rank_positions(series, data.track)
-        track = None if data.track is None else _track_poses(data.track, series.time)
-        rotation = np.tile(np.eye(3), (len(position), 1, 1))
+        place, known = data.tower_at(series.tower, series.time)
+        valid = valid & known
+        towers_m = place[valid] if series.tower in data.nodes else None
+        track = None if data.track is None else _track_poses(data.track, series.time).pick(valid)
+        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
-        poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
+        poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
-        found = replay_poses(data.site, data.settings.rt, link, poses, others=False, progress=progress)
-        out.append(Replayed(link=link, poses=poses, valid=valid, replay=found, track=track))
+        found = replay_poses(
+            data.site, data.settings.rt, link, poses, towers_m=towers_m, others=False, progress=progress
+        )
+        out.append(Replayed(link=link, poses=poses, valid=valid, replay=found, track=track, tower_m=towers_m))
     return out
 
 
@@ -343,10 +381,9 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def _poses(track: TrackPoses, attitude: str) -> Poses:
-    rotation = attitude_rotation(track, attitude)
-    if track.valid.all():  # the very arrays of the track: a long flight has one copy of them
-        return Poses(track.position_m, np.ascontiguousarray(rotation))
-    return Poses(track.position_m[track.valid], np.ascontiguousarray(rotation[track.valid]))
+    """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
+    some = track.pick(track.valid)
+    return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
 
 def replay_poses(
@@ -355,6 +392,7 @@ def replay_poses(
     link: Link,
     poses: Poses,
     *,
+    towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     others: bool | None = None,
     check_power_cut: bool = True,
@@ -370,6 +408,8 @@ def replay_poses(
     link : Link
         Carrier, power and arrays; its towers are those of ``site`` by name.
     poses : Poses
+    towers_m : (poses, 3), optional
+        Places of the one tower of the link, which moves [m].
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
@@ -392,6 +432,22 @@ def replay_poses(
     others = engine is None if others is None else others
     engine = engine or rt.engine
     crowns = reflecting_crowns(site.trees, rt)
+    if towers_m is not None:
+        name = "+".join(link.tower_arrays)
+        _check_moving(rt, engine, name)
+        return replay_moving(
+            site,
+            link,
+            poses,
+            towers_m,
+            max_depth=rt.max_depth,
+            loss=path_loss(site.trees, rt, link.carrier_hz),
+            crowns=crowns,
+            visibility=rt.visibility,
+            threads=rt.threads,
+            device=rt.device,
+            progress=share_of(progress, f"replay {name}, which moves"),
+        )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
         parts: list[Replay] = []
@@ -435,6 +491,61 @@ def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
     """Say what a search will take, where it is more than a moment."""
     if estimate.seconds > 1.0:
         progress(f"path search {name}: {estimate}")
+
+
+def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
+    """Refuse what a tower that moves cannot be replayed with.
+
+    Raises
+    ------
+    UsageError
+        Engine sionna; ``rt.relevance_db``; ``rt.power_cut_db``.
+    """
+    if engine != "image":
+        raise UsageError(
+            f"towers.{name} moves and the engine is {engine!r}",
+            expected="rt.engine: image (or --engine image)",
+            cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
+        )
+    if rt.relevance_db is not None:
+        raise UsageError(
+            f"rt.relevance_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.relevance_db",
+            cause="which buildings matter is told for one place of the tower",
+        )
+    if rt.power_cut_db is not None:
+        raise UsageError(
+            f"rt.power_cut_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.power_cut_db",
+            cause="what the cut costs is checked for one place of the tower",
+        )
+
+
+def fields_from(
+    sources_m: FloatArray, faces: Faces, paths: PathSet, link: Link, poses: Poses, loss: Loss | None
+) -> Fields:
+    """Fields over the paths of one tower.
+
+    Parameters
+    ----------
+    sources_m : (1 or poses, 3)
+        Where the tower is, or is at each pose: :meth:`Replayed.source_m` [m].
+    faces : Faces
+    paths : PathSet
+    link : Link
+    poses : Poses
+    loss : callable or None
+        Loss per path [dB].
+
+    Returns
+    -------
+    Fields
+        H (poses, 1, n_rx, n_tx) and powers.
+    """
+    loss_db = loss_along(loss, paths, sources_m, poses.position_m)
+    if len(sources_m) == 1:
+        return channel_matrices(paths, faces, sources_m, poses, link, loss_db)
+    return moving_matrices(paths, faces, sources_m, poses, link, loss_db)
 
 
 def check_interactions(rt: RtSettings) -> None:
@@ -532,6 +643,6 @@ def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str,
 
 
 def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, trees: Trees) -> FloatArray:
-    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,) to poses (n, 3) [m]."""
+    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
     source = np.broadcast_to(tower_m, poses_m.shape)
     return foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, trees)

@@ -212,11 +212,16 @@ def run_report(
     UsageError, InputError
         With what was found, expected, and the likely cause.
     """
+    from ..flight.data import load_data
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
     from ..report.exports.write import chosen_formats
     from ..report.write import FIGURES, STYLES, write_report
+    from .flight_run import run_flight
+    from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
+    from .manifest import other_inputs
+    from .report_record import report_record
 
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
@@ -225,22 +230,24 @@ def run_report(
     formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
+    if recommend is not None:
+        _beside(recommend, flight, logs_root)
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
         target = None
         if recommend is not None:
-            _beside(recommend, flight, logs_root)
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
         stages = Stages(progress)
-        record, ladder = _replayed_and_compared(settings, flight, logs_root, stages)
+        with stages("read"):
+            data = load_data(settings, flight.parent, logs_root)
+        found = run_flight(data, stages, ladder=True)
+        record = report_record(found, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
-            refuse_changed(same_inputs, record)
+            refuse_changed(same_inputs, record.inputs)
         if target is not None:
-            from .ladder import recommended_text
-
-            target.write(sealed(recommended_text(load_flight(flight), ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight), found.ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
@@ -362,40 +369,6 @@ def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> lis
 
     roots = [path.parent] if logs_root is None else [logs_root, path.parent]
     return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
-
-
-def _replayed_and_compared(settings: Any, flight: Path, logs_root: Path | None, stages: Stages) -> Any:
-    """The record of a report: read, replay, compare, audit, ladder; and the ladder itself."""
-    from ..flight.data import gather, read_logs
-
-    with stages("read"):
-        files = read_logs(settings, flight.parent, logs_root)
-        data = gather(settings, flight.parent, files, logs_root)
-    from .flight_run import run_flight
-    from .what_if import foliage_notes
-
-    found = run_flight(data, stages, ladder=True)
-    replays = found.replays.all
-    speed: tuple[Any, ...] = ()
-    if settings.report.speed_table and settings.rt.audit_links and settings.report.audit == "now":
-        with stages("speed"):
-            from .speed_table import speed_rows
-
-            speed = speed_rows(data, [*found.replays.rank, *found.replays.rss][0], stages.progress)
-    from ..report.build import report_data
-    from .manifest import other_inputs
-    from .pose_paths import pose_paths
-
-    notes = foliage_notes(len(data.site.trees), settings.rt, {r.link.carrier_hz for r in replays})
-    record = report_data(
-        data,
-        found.result,
-        speed=speed,
-        notes=notes,
-        other_inputs=other_inputs(settings, flight, logs_root),
-        paths=pose_paths(data, found.replays),
-    )
-    return record, found.ladder
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -594,10 +567,10 @@ def run_site_show(
         if flight is None or settings is None:
             place = load_site(site or "lake_wheeler")
         else:
-            from ..flight.data import gather, read_logs
+            from ..flight.data import load_data
             from ..report.build import track_of
 
-            data = gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root)
+            data = load_data(settings, flight.parent, logs_root)
             place, track = data.site, track_of(data)
             if pose is not None:
                 paths = _paths_of_pose(settings, place, track, pose)
@@ -819,12 +792,12 @@ def _flown_line(flight: Path, logs_root: Path | None) -> tuple[Any, str]:
     """East and north (n, 2) [m] of a flight, and its name."""
     import numpy as np
 
-    from ..flight.data import gather, read_logs
+    from ..flight.data import load_data
     from ..flight.settings import load_flight
     from ..report.build import track_of
 
     settings = load_flight(flight)
-    track = track_of(gather(settings, flight.parent, read_logs(settings, flight.parent, logs_root), logs_root))
+    track = track_of(load_data(settings, flight.parent, logs_root))
     if track is None:
         raise UsageError(f"{flight} has no track", expected="telemetry, or rank logs with positions")
     line = np.column_stack([track.east_m, track.north_m])

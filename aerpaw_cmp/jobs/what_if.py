@@ -16,13 +16,13 @@ from ..compare.result import FoliageLoss, FoliageRankChange
 from ..flight.data import RssSeries
 from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
-from ..propagation.channel import Fields, channel_matrices, mean_pair_power, rss_dbm
+from ..propagation.channel import Fields, mean_pair_power, rss_dbm
 from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from ..propagation.tracer import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
-from .replay import Replayed, attitude_rotation, path_loss
+from .replay import Replayed, attitude_rotation, fields_from, path_loss
 
 LEAVES = ("in", "out")
 
@@ -53,10 +53,7 @@ def evaluate(
         H (poses, towers, n_rx, n_tx) and the power of each path.
     """
     link, poses = link or replayed.link, poses or replayed.poses
-    sources = np.array([site.towers[name].position_m for name in replayed.replay.towers])
-    paths = replayed.replay.paths
-    loss_db = None if loss is None else loss(paths, sources, poses.position_m)
-    return channel_matrices(paths, replayed.replay.faces, sources, poses, link, loss_db)
+    return fields_from(replayed.source_m(site), replayed.replay.faces, replayed.replay.paths, link, poses, loss)
 
 
 def level_dbm(link: Link, fields: Fields, field: RssField) -> FloatArray:
@@ -93,7 +90,7 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
     if replayed.track is not None and any(p.name != "iso" for p in link.uav_array.patterns):
         for mode, name in (("logged", "logged attitude"), ("level", "heading only"), ("ignored", "attitude ignored")):
             if mode != rt.attitude:
-                rotation = attitude_rotation(replayed.track, mode)[replayed.valid]
+                rotation = attitude_rotation(replayed.track, mode)
                 changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
     found = {
         name: level_dbm(other, evaluate(site, replayed, loss, link=other, poses=poses), field)

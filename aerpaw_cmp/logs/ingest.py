@@ -194,17 +194,90 @@ def exists(path: Path) -> bool:
 
 def sniffers_of(path: Path) -> list[str]:
     """Names of the readers whose sniffers accept a log; none for a folder of pieces."""
-    from .readers import catalogue, head_of
+    from .readers import catalogue
 
     if path.is_dir():
         return []
-    part = None if _present(path) else archives.inside(path)
-    if part is None:
-        data = as_utf8(read_bytes(path)[0])
-    else:
+    head = _sniffed(path)
+    return [reader.name for reader in catalogue() if reader.kinds and reader.sniff(head)]
+
+
+def _sniffed(path: Path) -> bytes:
+    """What sniffers see of a log; of a large one no more than that is read."""
+    from .readers import head_of
+
+    if (part := None if _present(path) else archives.inside(path)) is not None:
         content = dict(archives.members(read_bytes(part[0])[0], part[0]))
-        data = as_utf8(content[part[1]]()) if part[1] in content else b""
-    return [reader.name for reader in catalogue() if reader.kinds and reader.sniff(head_of(data))]
+        return head_of(as_utf8(content[part[1]]())) if part[1] in content else b""
+    head = _raw(path, HEAD_BYTES)
+    if head.startswith(_GZIP) and path.stat().st_size > blocks.FROM_BYTES // 16:
+        head = _unpacked_head(head)
+    head = as_utf8(head)
+    if head.startswith(_GZIP) or hides_its_content(head):
+        return head_of(as_utf8(read_bytes(path)[0]))
+    return head
+
+
+def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None = None) -> IngestedFile:
+    """One log of a flight file, which says where it lies and may say what it is.
+
+    Parameters
+    ----------
+    root : Path
+        Folder against which the path resolves.
+    name : str
+        Path of the log: a file, a folder of pieces, or a member of an archive.
+    options : ReadOptions
+        What the file cannot say about itself.
+    reader : str, optional
+        In place of recognising it.
+
+    Returns
+    -------
+    IngestedFile
+        With at least one stream.
+
+    Raises
+    ------
+    InputError
+        A missing file, a log of another kind than its reader's, a log without any record.
+    UsageError
+        No such reader; options that the reader asks for.
+    """
+    path = root / name
+    if not exists(path):
+        raise InputError(
+            "there is no such log",
+            expected=f"the file below {root}",
+            cause="a wrong path, or --logs-root",
+            path=path,
+        )
+    if reader is not None:
+        _refuse_other_kind(path, by_name(reader))
+    (file,) = ingest([path], options=options, reader=reader)
+    if not file.result.streams:
+        raise InputError(
+            "no record could be read",
+            expected=f"records of reader {file.result.reader!r}",
+            cause=file.result.rejected[0].reason if file.result.rejected else "an aborted run",
+            path=path,
+        )
+    return file
+
+
+def _refuse_other_kind(path: Path, reader: Reader) -> None:
+    """A log whose content another reader recognises, and the named one does not, is the wrong file."""
+    if reader.name == "generic_csv":
+        return  # its columns were named: no other reader knows better
+    others = sniffers_of(path)
+    if not others or reader.name in others:
+        return
+    raise InputError(
+        f"the content is that of {' or '.join(others)}",
+        expected=f"a log of reader {reader.name!r}, as flight.yaml says",
+        cause="the wrong file, or the wrong 'reader:'",
+        path=path,
+    )
 
 
 def _head(place: Path) -> bytes:

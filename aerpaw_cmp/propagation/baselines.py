@@ -18,7 +18,8 @@ def free_space_dbm(
 
     Parameters
     ----------
-    sources_m : (towers, 3)
+    sources_m : (towers, 3) or (poses, towers, 3)
+        The latter for towers that move.
     targets_m : (poses, 3)
     carrier_hz, transmit_power_dbm : float
 
@@ -26,7 +27,7 @@ def free_space_dbm(
     -------
     (poses, towers)
     """
-    distance = np.linalg.norm(targets_m[:, None, :] - sources_m[None, :, :], axis=2)
+    distance = np.linalg.norm(targets_m[:, None, :] - sources_m, axis=2)
     with np.errstate(divide="ignore"):
         return np.asarray(transmit_power_dbm + db_from_amplitude(wavelength_m(carrier_hz) / (4.0 * np.pi * distance)))
 
@@ -48,7 +49,8 @@ def two_ray_dbm(
 
     Parameters
     ----------
-    sources_m : (towers, 3)
+    sources_m : (towers, 3) or (poses, towers, 3)
+        The latter for towers that move.
     targets_m : (poses, 3)
     carrier_hz, transmit_power_dbm : float
     ground_material : str
@@ -68,9 +70,9 @@ def two_ray_dbm(
         NaN for poses below the ground.
     """
     wavelength = wavelength_m(carrier_hz)
-    across = np.linalg.norm(targets_m[:, None, :2] - sources_m[None, :, :2], axis=2)
-    ground = np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (len(sources_m),))
-    low = sources_m[None, :, 2] - ground
+    across = np.linalg.norm(targets_m[:, None, :2] - sources_m[..., :2], axis=2)
+    ground = np.broadcast_to(np.asarray(ground_m, dtype=np.float64), (sources_m.shape[-2],))
+    low = np.atleast_2d(sources_m[..., 2]) - ground
     high = targets_m[:, None, 2] - ground[None, :]
     direct = np.hypot(across, high - low)
     bounced = np.hypot(across, high + low)

@@ -178,6 +178,7 @@ def replay(
     scattering_coefficient: float | None = None,
     power_cut_db: float | None = None,
     check_power_cut: bool = True,
+    only: BoolArray | None = None,
     progress: Callable[[float], None] | None = None,
     on_estimate: OnEstimate | None = None,
 ) -> Replay:
@@ -232,6 +233,8 @@ def replay(
         (:mod:`aerpaw_cmp.propagation.power_cut`).
     check_power_cut : bool
         Search a few poses without the cut and say in ``left_out`` what it costs.
+    only : (towers, poses) bool, optional
+        Links that count; the others have no path and are not searched for.
     progress : callable, optional
         Called with the share done.
     on_estimate : callable, optional
@@ -272,11 +275,21 @@ def replay(
     scene = Scene.of(site, link, poses)
     if whole is not None:
         scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
+    if only is not None:
+        scene = replace(scene, excluded=scene.excluded | ~only)
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
-    rays = 0 if samples == "auto" else samples
-    settings = Settings(engine, max_depth, rays, batch, variant, threads, device, power_cut_db)
+    settings = Settings(
+        engine=engine,
+        max_depth=max_depth,
+        samples=0 if samples == "auto" else samples,
+        batch=batch,
+        variant=variant,
+        threads=threads,
+        device=device,
+        power_cut_db=power_cut_db,
+    )
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":
@@ -306,7 +319,7 @@ def replay(
         result = _with_others(result, link, tuple(interactions), *others)
     if visibility == "pairs":
         small = drop_small_faces
-        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable)
+        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable, only)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -414,6 +427,7 @@ def _by_pairs(
     loss: Loss | None,
     crowns: Crowns | None,
     usable: BoolArray | None,
+    only: BoolArray | None,
 ) -> Replay:
     """Each element pair with its own paths: every tower element is a source, every UAV element a pose."""
     names, arrays = list(link.tower_arrays), list(link.tower_arrays.values())
@@ -432,7 +446,7 @@ def _by_pairs(
         scene,
         sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
         usable=np.repeat(scene.usable if usable is None else usable[:, : len(scene.faces)], ports, axis=0),
-        excluded=np.repeat(scene.excluded, ports, axis=0),
+        excluded=np.repeat(scene.excluded if only is None else scene.excluded | ~only, ports, axis=0),
     )
     for element in range(len(uav)):
         spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)

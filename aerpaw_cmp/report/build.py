@@ -156,8 +156,16 @@ def rss_panel(result: RssResult) -> record.RssPanel:
             for name in FOLIAGE_RUNS
             if name in result.variants
         }
-        | ({} if result.simulated_sd_db is None else {"simulated_sd_db": result.simulated_sd_db}),
+        | ({} if result.simulated_sd_db is None else {"simulated_sd_db": result.simulated_sd_db})
+        | _tower_columns(result.tower_m),
     )
+
+
+def _tower_columns(tower_m: FloatArray | None) -> dict[str, FloatArray]:
+    """Place of a tower that moves, as columns of rss.csv and rank.csv."""
+    if tower_m is None:
+        return {}
+    return {f"tower_{name}_m": tower_m[:, axis] for axis, name in enumerate(("east", "north", "up"))}
 
 
 def source_of(series: RssSeries, settings: FlightFile) -> record.Source | None:
@@ -310,6 +318,7 @@ def rank_panel(result: RankResult) -> record.RankPanel:
         },
         values={
             "level_dbm": result.level_dbm,
+            **_tower_columns(result.tower_m),
             **{f"sigma{i + 2}_over_sigma1_db": ratio_db[:, i] for i in range(ratio_db.shape[1])},
             **(
                 {}

@@ -58,6 +58,7 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
             panel.east_m[few], panel.north_m[few], c=residual[few], cmap="RdBu_r", vmin=-12, vmax=12, s=6, linewidths=0,
             rasterized=True, zorder=5,
         )  # fmt: skip
+        draw_node(plan, panel)
         tower = data.site.towers.get(panel.tower)
         ends = ([], []) if tower is None else ([tower.east_m], [tower.north_m])
         frame_around(plan, np.concatenate([panel.east_m, ends[0]]), np.concatenate([panel.north_m, ends[1]]))
@@ -78,12 +79,23 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
     return fig
 
 
+def draw_node(ax: Axes, panel: RssPanel) -> None:
+    """The way of a tower that moves; its mark stands in the middle of it."""
+    east, north = (panel.per_sample.get(f"tower_{name}_m") for name in ("east", "north"))
+    if east is not None and north is not None:
+        ax.plot(*thinned_plan(east, north), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
+                label=f"way of {panel.tower}")  # fmt: skip
+
+
 def trajectory(data: ReportData, track: Track) -> Figure:
     """The flight on the plan of the whole site, and closer, coloured by height."""
     fig = figure((9.2, 5.4))
     whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
     draw_site(whole, data.site)
     draw_site(close, data.site)
+    for panel in {panel.tower: panel for panel in data.rss}.values():
+        draw_node(whole, panel)
+        draw_node(close, panel)
     whole.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
     points = close.scatter(
         track.east_m, track.north_m, c=track.up_m, cmap="cividis", s=5, linewidths=0, rasterized=True, zorder=3,

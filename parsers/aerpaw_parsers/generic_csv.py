@@ -213,13 +213,13 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
     if kind == "rss" and options.unit is None:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
-        "generic_csv",
-        (stream, *_track(kind, frame, options)) if len(frame) else (),
-        len(lines),
-        len(frame),
-        int(blank.sum()) + 1,
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        tuple(warnings),
+        reader="generic_csv",
+        streams=(stream, *_track(kind, frame, options)) if len(frame) else (),
+        lines=len(lines),
+        accepted=len(frame),
+        blank=int(blank.sum()) + 1,
+        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
+        warnings=tuple(warnings),
     )
 
 

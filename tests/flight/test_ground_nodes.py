@@ -2,11 +2,12 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 from pydantic import ValidationError
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.flight.data import with_ground_nodes
+from aerpaw_cmp.flight.data import ground_nodes, with_ground_nodes
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -35,14 +36,20 @@ def test_a_node_with_a_place_is_a_tower(tmp_path):
     assert "ROVER" not in site.towers
 
 
-def test_a_track_that_stays_is_a_place_and_one_that_moves_is_refused(tmp_path):
+def test_a_track_that_stays_is_a_place_and_one_that_moves_a_track(tmp_path):
     site = load_site("lake_wheeler")
     rover(tmp_path, 1e-7)  # 0.3 m in all
     found = with_ground_nodes(site, flight(track="rover.csv"), tmp_path)
     assert found.towers["ROVER"].latitude_deg == pytest.approx(35.728, abs=3e-6)
     rover(tmp_path, 1e-5)  # 32 m
-    with pytest.raises(UsageError, match="moves"):
-        with_ground_nodes(site, flight(track="rover.csv"), tmp_path)
+    warnings: list[str] = []
+    moved, nodes = ground_nodes(site, flight(track="rover.csv"), tmp_path, warnings)
+    assert moved.towers["ROVER"].latitude_deg == pytest.approx(35.728 + 1.45e-4, abs=1e-7)
+    assert "moves 16 m" in warnings[0]
+    at = nodes["ROVER"].pose_at(np.array(["2023-12-13T17:00:10.5", "2023-12-13T18:00:00"], "datetime64[ns]"))
+    east, north = site.frame.to_local([35.728 + 10.5e-5], [-78.697])
+    assert at.position_m[0, :2] == pytest.approx([east[0], north[0]], abs=1e-6)  # the flight's zone: EST
+    assert at.valid.tolist() == [True, False]
     with pytest.raises(InputError, match="no such log"):
         with_ground_nodes(site, flight(track="gone.csv"), tmp_path)
 
@@ -55,3 +62,31 @@ def test_a_node_is_one_thing_and_has_its_own_name(tmp_path):
     taken = settings.model_copy(update={"towers": {"LW1": settings.towers["ROVER"]}})
     with pytest.raises(UsageError, match="of this name"):
         with_ground_nodes(load_site("lake_wheeler"), taken, tmp_path)
+
+
+def test_heights_are_the_ground_s_or_the_log_s(tmp_path):
+    site = load_site("lake_wheeler")
+    rover(tmp_path, 1e-5)
+    text = (tmp_path / "rover.csv").read_text()
+    text = text.replace(",0.0", ",25.0").replace("25.0", "0.0", 3)  # this reader's heights are above the first
+    (tmp_path / "rover.csv").write_text(text)
+    low = with_ground_nodes(site, flight(track="rover.csv", antenna_height_m=2.0), tmp_path)
+    assert low.towers["ROVER"].position_m[2] == pytest.approx(2.0)
+    high, nodes = ground_nodes(site, flight(track={"path": "rover.csv"}, height="logged"), tmp_path)
+    up = 25.0 + site.datum.takeoff_ground_m
+    assert high.towers["ROVER"].position_m[2] == pytest.approx(up)
+    assert nodes["ROVER"].pose_at(np.array(["2023-12-13T17:00:10"], "datetime64[ns]")).position_m[0, 2] == up
+    for wrong in ({"latitude_deg": 35.0, "longitude_deg": -78.0}, {"track": "rover.csv", "antenna_height_m": 2.0}):
+        with pytest.raises(ValidationError, match="height: logged"):
+            flight(height="logged", **wrong)
+    (tmp_path / "rover.csv").write_text(text.replace(",25.0", ",").replace(",0.0\n", ",\n"))
+    with pytest.raises(InputError, match=r"no (heights|positions)"):
+        ground_nodes(site, flight(track="rover.csv", height="logged"), tmp_path)
+
+
+def test_a_fix_at_null_island_is_no_motion(tmp_path):
+    site = load_site("lake_wheeler")
+    path = rover(tmp_path, 1e-7)
+    path.write_text(path.read_text().replace("35.72800050,-78.697", "0.0,0.0"))
+    assert "0.0,0.0" in path.read_text()
+    assert not ground_nodes(site, flight(track="rover.csv"), tmp_path)[1]

@@ -5,6 +5,7 @@ from __future__ import annotations
 import gzip
 import json
 import os
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,7 +15,7 @@ import pytest
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.logs import ingest as room
 from aerpaw_cmp.logs.flight_file import write_flight
-from aerpaw_cmp.logs.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, summary
+from aerpaw_cmp.logs.ingest import ACCOUNT, Ingested, account_notes, account_rows, ingest, read_log, summary
 from aerpaw_cmp.logs.readers import ReadOptions
 from tests.parsers.samples import OPTIONS, SAMPLES
 
@@ -219,6 +220,29 @@ def test_files_that_are_no_logs_are_not_read_whole(tmp_path: Path, monkeypatch: 
     assert [skipped.reason for skipped in ingest(tmp_path, options=OPTIONS).skipped] == [
         "binary content that no reader knows"
     ]
+
+
+@pytest.mark.parametrize("pack", [bytes, gzip.compress], ids=["plain", "gzip"])
+def test_a_log_of_a_named_reader_is_read_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pack: Callable[[bytes], bytes]
+) -> None:
+    """What another reader would say of it takes its first bytes alone, however large the log is."""
+    (tmp_path / "log").write_bytes(pack(VEHICLE * 2000))
+    monkeypatch.setattr(room.blocks, "FROM_BYTES", 1)  # nothing is small
+    whole = []
+    raw = room._raw
+
+    def counted(place: Path, limit: int | None = None) -> bytes:
+        whole.append(limit is None)
+        return raw(place, limit)
+
+    monkeypatch.setattr(room, "_raw", counted)
+    monkeypatch.setattr(room, "_in_blocks", lambda *_: None)
+    assert read_log(tmp_path, "log", OPTIONS, reader="vehicle_out").result.accepted
+    assert sum(whole) == 1
+    with pytest.raises(InputError, match="the content is that of vehicle_out"):
+        read_log(tmp_path, "log", OPTIONS, reader="sounder_log")
+    assert sum(whole) == 1
 
 
 def test_reader_errors_name_the_file(tmp_path: Path) -> None:

@@ -1,0 +1,346 @@
+"""A replay whose tower moves, too: a rover or a second UAV with its own place at every pose.
+
+Every place of the node is a source of its own, so nothing is approximated: the poses are taken in blocks of a few
+places, each place a tower that has links to its own poses alone. Poses at one and the same place share a tower, so a
+node that stands still is replayed as a fixed tower is, bit by bit.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, fields, replace
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray
+from ..site.site import Site, Tower
+from .arrays import Link, Poses
+from .channel import Fields, channel_matrices
+from .paths import Faces, PathSet
+from .tracer import Loss, Replay, Whole, replay
+
+PLACES_AT_ONCE = 64
+"""Places of a node in one block: H of a block has this many times the links that count."""
+
+LINKS_AT_ONCE = 16_384
+"""Links (poses times places) of a block: some 4 MB of H with 4 x 4 elements."""
+
+WORK_PER_POSE = 200
+"""Element pairs that NumPy evaluates in the time of one pose with a source of its own."""
+
+
+@dataclass(frozen=True, slots=True)
+class _Block:
+    """Poses (rows of the flight) and their places: ``own`` (rows,) indexes ``places_m`` (places, 3)."""
+
+    rows: IntArray
+    places_m: FloatArray
+    own: IntArray
+
+
+def _blocks(sources_m: FloatArray) -> Iterator[_Block]:
+    """Poses in blocks, in the order in which their places first occur."""
+    unique, first, member = np.unique(sources_m, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first)
+    rank = np.empty(len(order), dtype=np.int64)
+    rank[order] = np.arange(len(order))
+    place, places_m = rank[member.ravel()], unique[order]
+    rows = np.argsort(place, kind="stable")
+    count = np.bincount(place, minlength=len(order))
+    ends = np.cumsum(count)
+    start = 0
+    while start < len(order):
+        stop = start + 1
+        before = ends[start] - count[start]
+        while (
+            stop < len(order)
+            and stop - start < PLACES_AT_ONCE
+            and (ends[stop] - before) * (stop + 1 - start) <= LINKS_AT_ONCE
+        ):
+            stop += 1
+        some = rows[before : ends[stop - 1]]
+        yield _Block(some, places_m[start:stop], place[some] - start)
+        start = stop
+
+
+def site_with_tower_at(site: Site, tower: str, place_m: AnyArray) -> Site:
+    """The site with a tower's array at a place (3,) [m], above the ground that it had."""
+    return replace(site, towers={**site.towers, tower: _moved(site, site.towers[tower], tower, place_m)})
+
+
+def _moved(site: Site, tower: Tower, name: str, place_m: AnyArray) -> Tower:
+    east, north, up = (float(x) for x in place_m)
+    latitude, longitude = site.frame.to_geographic(np.array([east]), np.array([north]))
+    return replace(
+        tower,
+        name=name,
+        latitude_deg=float(latitude[0]),
+        longitude_deg=float(longitude[0]),
+        east_m=east,
+        north_m=north,
+        antenna_height_m=up - tower.ground_m,
+    )
+
+
+def replay_moving(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    sources_m: FloatArray,
+    *,
+    progress: Callable[[float], None] | None = None,
+    **options: Any,
+) -> Replay:
+    """Replay a flight against one tower that has a place of its own at every pose.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+        With one tower; its array keeps its orientation in the site.
+    poses : Poses
+    sources_m : (poses, 3)
+        Centre of the tower's array at each pose, east, north, up [m].
+    progress : callable, optional
+        Called with the share done.
+    **options
+        Of :func:`aerpaw_cmp.propagation.tracer.replay`, engine ``image``.
+
+    Returns
+    -------
+    Replay
+        As of one tower. ``paths`` run from the place that the tower had at their pose.
+
+    Raises
+    ------
+    UsageError
+        Another engine than ``image``, more than one tower; what :func:`replay` raises.
+
+    Notes
+    -----
+    Exact: each pose is traced from its own place. Paths and fields are those of a fixed tower there.
+    """
+    (name,) = _one_tower(link)
+    if options.get("engine", "image") != "image":
+        raise UsageError(
+            f"tower {name!r} moves and the engine is {options['engine']!r}",
+            expected="rt.engine: image (or --engine image)",
+            cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
+        )
+    parts: list[Replay] = []
+    blocks = list(_blocks(sources_m))
+    if len(blocks) > 1:
+        options["whole"] = _whole(link, poses, sources_m)
+    done = 0
+    for block in blocks:
+        parts.append(_replay_block(site, link, name, poses, block, options))
+        done += len(block.rows)
+        if progress is not None:
+            progress(done / max(len(poses), 1))
+    if not parts:
+        return replay(site, link, poses, **options)
+    return _put_together(parts, [block.rows for block in blocks], name)
+
+
+def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
+    """What a block must know of the others: one tolerance, and whether compiled code is worth loading."""
+    good = poses.position_m[np.isfinite(poses.position_m).all(axis=1)]
+    points = np.concatenate([good, sources_m])
+    pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
+    return Whole(np.stack([points.min(axis=0), points.max(axis=0)]), pairs * WORK_PER_POSE)
+
+
+def _one_tower(link: Link) -> tuple[str, ...]:
+    if len(link.tower_arrays) != 1:
+        raise UsageError(
+            f"{len(link.tower_arrays)} towers in a link whose tower moves", expected="one tower: links of their own"
+        )
+    return tuple(link.tower_arrays)
+
+
+def _replay_block(site: Site, link: Link, name: str, poses: Poses, block: _Block, options: dict[str, Any]) -> Replay:
+    """Replay of the poses of a block, as of one tower."""
+    names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
+    towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
+    here = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
+    several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
+    some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
+    only = np.arange(len(names))[:, None] == block.own[None, :]
+    found = replay(here, several, some, only=None if len(names) == 1 else only, **options)
+    row = np.arange(len(some))
+
+    def own(values: AnyArray) -> AnyArray:
+        return np.ascontiguousarray(values[row, block.own][:, None])
+
+    return replace(
+        found,
+        rss_dbm=own(found.rss_dbm),
+        rss_power_dbm=own(found.rss_power_dbm),
+        h=own(found.h),
+        has_path=own(found.has_path),
+        pairs_differ=None if found.pairs_differ is None else own(found.pairs_differ),
+        paths=replace(found.paths, tower=np.zeros_like(found.paths.tower)),
+        towers=(name,),
+        left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in found.left_out],
+    )
+
+
+def _put_together(parts: list[Replay], rows: list[IntArray], name: str) -> Replay:
+    """One replay of blocks, poses in their order."""
+    first, count = parts[0], sum(map(len, rows))
+    # faces of crowns are numbered as they are met: other blocks have others
+    faces, shifted = _joined_faces(parts)
+    arrays: dict[str, Any] = {}
+    for column in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
+        values = [getattr(part, column) for part in parts]
+        whole = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
+        for at, value in zip(rows, values, strict=True):
+            whole[at] = value
+        arrays[column] = whole
+    if first.pairs_differ is not None:
+        differ: BoolArray = np.zeros((count, 1), dtype=np.bool_)
+        for at, part in zip(rows, parts, strict=True):
+            differ[at] = part.pairs_differ
+        arrays["pairs_differ"] = differ
+    columns: dict[str, Any] = {}
+    for field in fields(PathSet):
+        columns[field.name] = np.concatenate([getattr(paths, field.name) for paths in shifted])
+    columns["pose"] = np.concatenate([at[paths.pose] for at, paths in zip(rows, shifted, strict=True)])
+    paths = PathSet(**columns)
+    return replace(
+        first,
+        **arrays,
+        paths=paths.select(np.argsort(paths.pose, kind="stable")),
+        faces=faces,
+        seconds=sum(part.seconds for part in parts),
+        search_seconds=sum(part.search_seconds for part in parts),
+        towers=(name,),
+        left_out=_counted(parts),
+    )
+
+
+def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
+    """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
+    least = min(len(part.faces) for part in parts)
+    if all(len(part.faces) == least for part in parts):
+        return parts[0].faces, [part.paths for part in parts]
+    from .paths import joined
+
+    common = least if least == min(_shared(parts[0].faces, part.faces) for part in parts) else 0
+    faces, out = _face_part(parts[0].faces, 0, common), []
+    for part in parts:
+        shift = len(faces) - common
+        own = part.paths.faces
+        out.append(replace(part.paths, faces=np.where(own >= common, own + shift, own)))
+        faces = joined(faces, _face_part(part.faces, common, len(part.faces)))
+    return faces, out
+
+
+def _shared(one: Faces, other: Faces) -> int:
+    """How many faces from the first on are the same in both."""
+    count = min(len(one), len(other))
+    same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
+    return count if same.all() else int(np.argmin(same))
+
+
+def _face_part(faces: Faces, start: int, stop: int) -> Faces:
+    arrays = {
+        name: getattr(faces, name)[start:stop]
+        for name in ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+    }
+    tuples = {name: getattr(faces, name)[start:stop] for name in ("material", "label", "polygon")}
+    return Faces(**arrays, **tuples)
+
+
+_COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
+
+
+def _counted(parts: list[Replay]) -> list[str]:
+    """What was left out, each message once; counts at the front of a message are added up."""
+    found: dict[str, list[int]] = {}
+    for text in (text for part in parts for text in part.left_out):
+        match = _COUNT.fullmatch(text)
+        key, numbers = (match[3], [int(n) for n in match.groups()[:2] if n]) if match else (text, [])
+        kept = found.get(key, [0] * len(numbers))
+        found[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
+    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in found.items()]
+
+
+def moving_matrices(
+    paths: PathSet,
+    faces: Faces,
+    sources_m: FloatArray,
+    poses: Poses,
+    link: Link,
+    loss_db: FloatArray | None = None,
+) -> Fields:
+    """Channel matrices of the paths of one tower that moves, as :func:`channel_matrices` gives them of a fixed one.
+
+    Parameters
+    ----------
+    paths : PathSet
+        Sorted by pose.
+    faces : Faces
+    sources_m : (poses, 3)
+        Centre of the tower's array at each pose [m].
+    poses : Poses
+    link : Link
+        With one tower.
+    loss_db : (paths,), optional
+        Further loss of each path.
+
+    Returns
+    -------
+    Fields
+        H (poses, 1, n_rx, n_tx) and powers.
+    """
+    (name,) = _one_tower(link)
+    ports, uav = len(link.tower_arrays[name]), len(link.uav_array)
+    size = (ports, uav) if link.uav_transmits else (uav, ports)
+    h: ComplexArray = np.zeros((len(poses), 1, *size), dtype=np.complex128)
+    path_power, power = np.zeros(len(paths)), np.zeros((len(poses), 1))
+    for block in _blocks(sources_m):
+        at = np.full(len(poses), -1, dtype=np.int64)
+        at[block.rows] = np.arange(len(block.rows))
+        mine = np.flatnonzero(at[paths.pose] >= 0)
+        some = paths.select(mine)
+        row = at[some.pose]
+        some = replace(some, pose=row, tower=block.own[row])
+        names = [f"{name} {i}" for i in range(len(block.places_m))]
+        several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
+        spots = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
+        found = channel_matrices(
+            some, faces, block.places_m, spots, several, None if loss_db is None else loss_db[mine],
+            work=len(poses) * ports * uav,
+        )  # fmt: skip
+        rows = np.arange(len(block.rows))
+        h[block.rows] = found.h[rows, block.own][:, None]
+        power[block.rows] = found.power[rows, block.own][:, None]
+        path_power[mine] = found.path_power
+    return Fields(h, path_power, power)
+
+
+def loss_along(loss: Loss | None, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
+    """Loss (paths,) [dB] of paths from a place per pose; None where nothing is lost.
+
+    Parameters
+    ----------
+    loss : callable or None
+    paths : PathSet
+    sources_m : (1 or poses, 3)
+        Place of the one tower, at all poses or at each [m].
+    targets_m : (poses, 3)
+        Of the UAV [m].
+
+    Returns
+    -------
+    (paths,) or None
+        Loss [dB].
+    """
+    if loss is None:
+        return None
+    moving = paths if len(sources_m) == 1 else replace(paths, tower=paths.pose)
+    return loss(moving, sources_m, targets_m)

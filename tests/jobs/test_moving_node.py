@@ -1,0 +1,162 @@
+"""A flight against a rover that drives: from its log of positions to the report's numbers."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.jobs.audit_flight import standing
+from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series
+from aerpaw_cmp.jobs.explain import run_explain
+from aerpaw_cmp.jobs.ladder import flight_ladder
+from aerpaw_cmp.jobs.replay import FlightReplay, replay_rank, replay_rss
+from aerpaw_cmp.propagation.baselines import two_ray_dbm
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.report.build import rank_panel, rss_panel
+from aerpaw_cmp.report.export import rank_csv, rss_csv
+from aerpaw_cmp.site.siteyaml import load_site
+
+ORIGIN = "2025-06-01T14:00:00Z"
+FRAME = load_site("lake_wheeler").frame
+SECONDS = 120
+
+YAML = """
+flight: rover
+site: {{file: lake_wheeler, without_buildings: true}}
+timezone: America/New_York
+towers:
+  ROVER: {{track: {{path: rover.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
+    columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}}}}, antenna_height_m: 2}}
+logs:
+  - {{path: track.csv, reader: generic_csv, kind: telemetry, time_origin: "{origin}",
+     columns: {{time: t, latitude_deg: lat, longitude_deg: lon, altitude_m: alt}}}}
+  - {{path: a.csv, reader: generic_csv, kind: rss, node: ROVER, channel: a, time_origin: "{origin}",
+     columns: {{time: t, rss_db: level}}}}
+  - {{path: ri.csv, reader: generic_csv, kind: rank, node: ROVER, ri_base: one, time_origin: "{origin}",
+     columns: {{time: t, ri_raw: ri}}}}
+rt: {{engine: {engine}, max_depth: 1, audit_links: 0}}
+rss: {{bootstrap: 20, lag: "off", span_db: [-100, 100]}}
+rank: {{bootstrap: 20, tower: ROVER}}
+report: {{speed_table: false}}
+"""
+
+
+def uav(t: np.ndarray) -> np.ndarray:
+    return np.stack([-200 + 4.0 * t, 100 + 1.0 * t, 40.0 + 0 * t], axis=1)
+
+
+def rover(t: np.ndarray) -> np.ndarray:
+    return np.stack([60.0 - 1.5 * t, -40.0 + 0.8 * t, 2.0 + 0 * t], axis=1)
+
+
+def write(path: Path, head: str, *columns: np.ndarray) -> None:
+    rows = [",".join(f"{v:.11g}" for v in row) for row in zip(*columns, strict=True)]
+    path.write_text(head + "\n" + "\n".join(rows) + "\n")
+
+
+def positions(path: Path, t: np.ndarray, places: np.ndarray) -> None:
+    latitude, longitude = FRAME.to_geographic(places[:, 0], places[:, 1])
+    write(path, "t,lat,lon,alt", t, latitude, longitude, places[:, 2])
+
+
+def flown(folder: Path, *, engine: str = "image", gap: tuple[float, float] = (50.0, 60.0), start: float = 0.0) -> Path:
+    """Logs whose level is the closed form of two rays between the two ends, less 20 dB."""
+    t = np.arange(0.0, SECONDS + 1)
+    kept = t[(t <= gap[0]) | (t >= gap[1])]
+    positions(folder / "track.csv", t, uav(t))
+    positions(folder / "rover.csv", kept + start, rover(kept))
+    at = np.arange(0.0, SECONDS, 0.5)
+    level = [two_ray_dbm(r[None], u[None], 3.3e9, 40.0)[0, 0] for r, u in zip(rover(at), uav(at), strict=True)]
+    write(folder / "a.csv", "t,level", at, np.array(level) - 20.0)
+    write(folder / "ri.csv", "t,ri", t, np.ones(len(t)))
+    path = folder / "flight.yaml"
+    path.write_text(YAML.format(origin=ORIGIN, engine=engine))
+    return path
+
+
+def data_of(path: Path) -> FlightData:
+    settings = load_flight(path)
+    return gather(settings, path.parent, read_logs(settings, path.parent))
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("rover")
+    path = flown(folder)
+    data = data_of(path)
+    return path, data, replay_rss(data), replay_rank(data)
+
+
+def test_the_closed_form_along_both_tracks(case):
+    _, data, (one,), _ = case
+    found = compare_rss_series(data, data.rss[0], one)
+    t = np.arange(0.0, SECONDS, 0.5)
+    lost = (t > 50) & (t < 60)
+    np.testing.assert_array_equal(found.posed, ~lost)  # a gap of the rover's log is no pose, as one of the UAV's
+    assert found.score.n == (~lost).sum()
+    error = found.measured_db - found.simulated_dbm
+    # the track is linear between rows, and so is the way: what is left is the rounding of the coordinates
+    assert np.nanmax(np.abs(error + 20.0)) < 0.02
+    assert found.score.rmse_db < 0.02
+    np.testing.assert_allclose(found.tower_m[~lost], rover(t)[~lost], atol=1e-3)
+    away = np.linalg.norm(uav(t) - rover(t), axis=1)
+    np.testing.assert_allclose(found.geometry["distance_m"][~lost], away[~lost], atol=2e-3)
+    assert found.baselines["two_ray"].rmse_db < 0.02
+    # from the rover's middle the same levels are far off
+    assert found.baselines["free_space"].rmse_db > 0.5
+
+
+def test_rank_and_ladder_have_the_place_of_each_sample(case):
+    _, data, rss, rank = case
+    assert rank[0].tower_m.shape == (len(rank[0].poses), 3)
+    np.testing.assert_allclose(rank[0].tower_m, rover(np.r_[0:51, 60:121].astype(float)), atol=1e-3)
+    ladder = flight_ladder(data, FlightReplay(rss=tuple(rss), rank=()))
+    names = [rung.model for rung in ladder.ladder.rungs]
+    coherent = names.index(next(n for n in names if "ground (coherent)" in n))
+    assert ladder.ladder.rmse_db[coherent] < 0.02
+    assert ladder.ladder.rmse_db[0] > 0.5
+
+
+def test_explain_stands_where_the_rover_was(case):
+    path, _, (one,), _ = case
+    found = run_explain(path, time="30.0", tower="ROVER", channel="a")
+    assert found.level_dbm == pytest.approx(one.spread(one.replay.rss_dbm[:, 0])[60], abs=1e-9)
+    assert any("ROVER moves: it was at 15.0 m east, -16.0 m north, 2.0 m up" in note for note in found.notes)
+
+
+def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
+    _, data, (one,), _ = case
+    moments = list(standing(data, [one]))
+    assert len(moments) == 6
+    for site, moment, _expected in moments:
+        at = int(np.argmin(np.linalg.norm(one.poses.position_m - moment.poses.position_m, axis=1)))
+        np.testing.assert_allclose(site.towers["ROVER"].position_m, one.tower_m[at], atol=1e-9)
+        again = replay(site, moment.link, moment.poses, max_depth=1)
+        assert again.rss_dbm[0, 0] == pytest.approx(moment.replay.rss_dbm[0, 0], abs=1e-9)
+        assert len(again.paths) == len(moment.replay.paths)
+
+
+def test_the_tables_carry_the_place(case):
+    _, data, (one,), (rank,) = case
+    rss = "".join(rss_csv([rss_panel(compare_rss_series(data, data.rss[0], one))])).splitlines()
+    ranks = "".join(rank_csv([rank_panel(compare_rank_series(data, data.rank[0], rank))])).splitlines()
+    for head, first, *_ in (rss, ranks):
+        row = dict(zip(head.split(","), first.split(","), strict=True))
+        place = [float(row[f"tower_{axis}_m"]) for axis in ("east", "north", "up")]
+        assert place == pytest.approx([60, -40, 2], abs=0.01)
+
+
+def test_what_cannot_be_is_one_message(tmp_path, capsys):
+    with pytest.raises(InputError, match=r"no overlap in time: RSS of ROVER .* the track of this tower"):
+        data_of(flown(tmp_path, start=5000.0))
+    assert main(["report", str(flown(tmp_path, engine="sionna")), "-o", str(tmp_path / "out")]) == 2
+    assert "towers.ROVER moves and the engine is 'sionna'" in capsys.readouterr().err
+    path = flown(tmp_path)
+    path.write_text(path.read_text().replace(f', time_origin: "{ORIGIN}",\n    columns', ",\n    columns", 1))
+    with pytest.raises(InputError, match="no overlap in time") as caught:
+        data_of(path)
+    assert "time_origin" in str(caught.value)

@@ -1,0 +1,114 @@
+"""A tower that moves: no approximation, and the limits in which it is a tower that stands."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.propagation import moving
+from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
+from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.moving import moving_matrices, replay_moving, site_with_tower_at
+from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.site.siteyaml import load_site
+
+SITE = load_site("lake_wheeler")
+BARE = dataclasses.replace(SITE, buildings=())
+LINK = Link(3.4e9, {"LW1": single_element()}, single_element())
+N = 90
+
+
+def poses(n: int = N, up_m: float = 40.0) -> Poses:
+    places = np.stack([np.linspace(-300, 300, n), np.linspace(-200, 500, n), np.full(n, up_m)], axis=1)
+    return Poses(places, np.broadcast_to(np.eye(3), (n, 3, 3)))
+
+
+def rover(n: int = N, up_m: float = 1.5) -> np.ndarray:
+    return np.stack([np.linspace(250, 90, n), np.linspace(100, 380, n), np.full(n, up_m)], axis=1)
+
+
+def test_a_node_that_stands_still_is_a_fixed_tower_to_the_last_digit():
+    at = SITE.towers["LW1"].position_m
+    link = Link(3.4e9, {"LW1": linear_array(4, 0.044)}, linear_array(2, 0.044))
+    fixed = replay(SITE, link, poses(), max_depth=2)
+    still = replay_moving(SITE, link, poses(), np.tile(at, (N, 1)), max_depth=2)
+    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
+        np.testing.assert_array_equal(getattr(still, name), getattr(fixed, name))
+    np.testing.assert_array_equal(still.paths.vertices_m, fixed.paths.vertices_m)
+    assert still.towers == ("LW1",)
+
+
+def test_every_pose_is_traced_from_its_own_place_whatever_the_blocks(monkeypatch):
+    found = replay_moving(SITE, LINK, poses(), rover(), max_depth=2)
+    assert len(found.paths) > N
+    for i in range(0, N, 11):
+        one = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
+        alone = replay(site_with_tower_at(SITE, "LW1", rover()[i]), LINK, one, max_depth=2)
+        assert found.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
+        assert (found.paths.pose == i).sum() == len(alone.paths)
+    for most in (1, 7):
+        monkeypatch.setattr(moving, "PLACES_AT_ONCE", most)
+        np.testing.assert_allclose(replay_moving(SITE, LINK, poses(), rover()).h, found.h, rtol=1e-9)
+    again = moving_matrices(found.paths, found.faces, rover(), poses(), LINK)
+    np.testing.assert_allclose(again.h, found.h, rtol=1e-12)
+
+
+def test_reciprocity_the_moving_end_may_be_called_tower_or_uav():
+    """A node on a track against a hovering UAV, and a UAV on that track against a tower where the other hovered."""
+    track, there = rover(up_m=35.0), np.array([40.0, -120.0, 18.0])
+    hovering = Poses(np.tile(there, (N, 1)), np.broadcast_to(np.eye(3), (N, 3, 3)))
+    one = replay_moving(SITE, LINK, hovering, track, max_depth=2)
+    flying = Poses(track, np.broadcast_to(np.eye(3), (N, 3, 3)))
+    other = replay(site_with_tower_at(SITE, "LW1", there), LINK, flying, max_depth=2)
+    assert np.isfinite(one.rss_dbm).all()
+    np.testing.assert_allclose(one.rss_dbm, other.rss_dbm, atol=1e-6)
+
+
+def test_free_space_and_two_rays_along_a_moving_node_are_the_closed_forms():
+    for depth, form in ((0, free_space_dbm), (1, two_ray_dbm)):
+        found = replay_moving(BARE, LINK, poses(), rover(), max_depth=depth)
+        expected = np.array(
+            [form(s[None], p[None], 3.4e9, 40.0)[0, 0] for s, p in zip(rover(), poses().position_m, strict=True)]
+        )
+        np.testing.assert_allclose(found.rss_dbm[:, 0], expected, atol=1e-6)
+        np.testing.assert_array_equal(form(rover()[:, None], poses().position_m, 3.4e9, 40.0)[:, 0], expected)
+    # and not those of the node's middle
+    middle = free_space_dbm(rover().mean(axis=0)[None], poses().position_m, 3.4e9, 40.0)[:, 0]
+    assert np.abs(middle - expected).max() > 3.0
+
+
+def test_crowns_that_reflect_are_numbered_as_one():
+    near = np.hypot(SITE.trees.east_m - 150, SITE.trees.north_m - 200).argsort()[:6]
+    trees = dataclasses.replace(SITE.trees, **{
+        f.name: getattr(SITE.trees, f.name)[near]
+        for f in dataclasses.fields(SITE.trees) if isinstance(getattr(SITE.trees, f.name), np.ndarray)
+    })  # fmt: skip
+    few, site = poses(40), dataclasses.replace(BARE, trees=trees)
+    found = replay_moving(site, LINK, few, rover(40), max_depth=1, crowns=Crowns(trees))
+    for i in range(0, 40, 5):
+        one = Poses(few.position_m[i : i + 1], np.eye(3)[None])
+        here = site_with_tower_at(site, "LW1", rover(40)[i])
+        alone = replay(here, LINK, one, max_depth=1, crowns=Crowns(trees))
+        assert found.rss_dbm[i, 0] == pytest.approx(alone.rss_dbm[0, 0], abs=1e-9, nan_ok=True)
+        assert (found.paths.pose == i).sum() == len(alone.paths)
+
+
+def test_what_cannot_move_is_refused_in_one_message():
+    with pytest.raises(UsageError, match="moves and the engine is 'sionna'"):
+        replay_moving(SITE, LINK, poses(), rover(), engine="sionna")
+    two = Link(3.4e9, dict.fromkeys(("LW1", "LW2"), single_element()), single_element())
+    with pytest.raises(UsageError, match="2 towers"):
+        replay_moving(SITE, two, poses(), rover())
+    empty = replay_moving(SITE, LINK, poses(0), rover(0))
+    assert empty.rss_dbm.shape == (0, 1)
+
+
+def test_messages_of_blocks_are_counted_together():
+    far = poses()
+    far.position_m[[3, 80]] = 1e9
+    found = replay_moving(BARE, LINK, far, rover(), max_depth=0)
+    (text,) = found.left_out
+    assert text.startswith("2 poses further than 100 km")
+    assert np.isnan(found.rss_dbm[[3, 80]]).all()

@@ -28,7 +28,19 @@ def longest_m(sources_m: FloatArray, targets_m: FloatArray, cut_db: float) -> Fl
 
 
 def within_cut(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray, cut_db: float) -> PathSet:
-    """The paths that a cut leaves."""
+    """The paths that a cut leaves.
+
+    Parameters
+    ----------
+    paths : PathSet
+    sources_m, targets_m : (towers, 3), (poses, 3)
+    cut_db : float
+
+    Returns
+    -------
+    PathSet
+        Lines of sight stay in any case.
+    """
     gap = np.linalg.norm(targets_m[paths.pose] - sources_m[paths.tower], axis=1)
     short = path_lengths(paths, sources_m, targets_m) <= gap * float(amplitude_from_db(cut_db))
     return paths.select(short | (paths.depth == 0))
@@ -47,6 +59,10 @@ def loss_in_words(cut_db: float, whole: int, left_out: int, poses: int, change_d
         Change of RSS of the links that have a level either way.
     lost : int
         Links that the cut leaves without a path.
+
+    Returns
+    -------
+    str
     """
     ratio = float(amplitude_from_db(cut_db))
     worst = float(np.abs(change_db).max(initial=0.0))

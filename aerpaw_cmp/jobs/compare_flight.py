@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
@@ -65,9 +66,12 @@ PASSES_WITHIN_M = 3.0
 
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
-    found = tuple(compare_rss_series(data, s, r) for s, r in zip(data.rss, replays.rss, strict=True))
+    found = []
+    for series, replayed in zip(data.rss, replays.rss, strict=True):
+        found.append(compare_rss_series(data, series, replayed))
+        give_memory_back()  # a series of a long flight leaves some 100 MiB of holes
     return FlightResult(
-        rss=found,
+        rss=tuple(found),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(found)),
         serving=serving_of(data.rss, found),

@@ -22,6 +22,7 @@ from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
+from ..propagation.effort import Estimate
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
@@ -394,6 +395,7 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     others: bool | None = None,
+    check_power_cut: bool = True,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -411,6 +413,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
+    check_power_cut : bool
+        Say in ``left_out`` what ``rt.power_cut_db`` costs.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -446,11 +450,12 @@ def replay_poses(
         )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
-        parts = []
+        parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
             some = Poses(poses.position_m[rows], poses.rotation[rows])
-            parts.append(replay_poses(site, rt, link, some, engine=engine))
+            first, listener = not parts, silent if parts else progress
+            parts.append(replay_poses(site, rt, link, some, engine=engine, check_power_cut=first, progress=listener))
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
@@ -466,6 +471,9 @@ def replay_poses(
         crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        power_cut_db=rt.power_cut_db,
+        check_power_cut=check_power_cut,
+        on_estimate=lambda estimate: _tell(progress, name, estimate),
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         device=rt.device,
@@ -479,13 +487,19 @@ def replay_poses(
     return found
 
 
+def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
+    """Say what a search will take, where it is more than a moment."""
+    if estimate.seconds > 1.0:
+        progress(f"path search {name}: {estimate}")
+
+
 def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
     """Refuse what a tower that moves cannot be replayed with.
 
     Raises
     ------
     UsageError
-        Engine sionna; ``rt.relevance_db``.
+        Engine sionna; ``rt.relevance_db``; ``rt.power_cut_db``.
     """
     if engine != "image":
         raise UsageError(
@@ -498,6 +512,12 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             f"rt.relevance_db with towers.{name}, which moves",
             expected="a tower that stands still, or no rt.relevance_db",
             cause="which buildings matter is told for one place of the tower",
+        )
+    if rt.power_cut_db is not None:
+        raise UsageError(
+            f"rt.power_cut_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.power_cut_db",
+            cause="what the cut costs is checked for one place of the tower",
         )
 
 

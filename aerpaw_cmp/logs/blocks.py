@@ -365,8 +365,8 @@ class _Flags(_Column):
         import pandas as pd
 
         codes = np.zeros(len(piece), dtype=np.uint8)
-        marked = np.flatnonzero(piece.astype(np.bool_))
-        if len(marked):
+        if piece.tolist().count("") < len(piece):  # the quickest look at objects
+            marked = np.flatnonzero(piece != "")
             place, found = pd.factorize(piece[marked])
             number = np.array([self.texts.setdefault(text, len(self.texts)) for text in found])
             codes = codes.astype(np.min_scalar_type(len(self.texts)))

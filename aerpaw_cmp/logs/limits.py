@@ -128,7 +128,8 @@ def _apply(stream: Stream, frame: pd.DataFrame, limit: Limit, warnings: list[str
         if name not in names:
             continue
         value = frame[name].to_numpy(dtype=np.float64)
-        if not len(value) or (low <= np.fmin.reduce(value) and np.fmax.reduce(value) <= high):
+        least = np.fmin.reduce(value) if len(value) else np.nan
+        if np.isnan(least) or (low <= least and np.fmax.reduce(value) <= high):
             continue
         beyond = (value < low) | (value > high)
         if beyond.any() and (first is None or int(np.argmax(beyond)) < first[0]):

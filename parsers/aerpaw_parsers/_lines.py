@@ -203,14 +203,16 @@ def numbers(column: AnyArray) -> AnyArray:
 
 def flags(count: int) -> AnyArray:
     """Empty flag column."""
-    return np.full(count, "", dtype=object)
+    column = np.empty(count, dtype=object)
+    column.fill("")  # one object; np.full would make one per row
+    return column
 
 
 def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
     """Add a reason where the mask holds, in place."""
     if mask.any():
         old = column[mask]
-        if old.astype(np.bool_).any():
+        if (old != "").any():
             column[mask] = [f"{text};{reason}" if text else reason for text in old]
         else:
             column[mask] = reason  # one object for all rows

@@ -9,6 +9,7 @@ from __future__ import annotations
 import io
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -76,7 +77,10 @@ class Fields:
 
     def take(self, mask: AnyArray) -> Fields:
         """The lines of a mask."""
-        return self if mask.all() else Fields(self.rows[mask], self.begin[mask], self.ends[mask])
+        count, first = int(np.count_nonzero(mask)), int(np.argmax(mask)) if len(mask) else 0
+        run = slice(first, first + count)  # as a rule all but a header
+        pick: Any = run if mask[run].all() else mask
+        return Fields(self.rows[pick], self.begin[pick], self.ends[pick])
 
 
 def fields(lines: Lines, count: int, separator: int = 44) -> Fields:

@@ -238,7 +238,7 @@ def _settled(result: ReadResult) -> ReadResult:
         return result
     frame = result.streams[0].frame
     flag = frame["flag"].to_numpy(dtype=object)
-    odd = flag[flag != ""].tolist()  # few: the flags are looked at one by one
+    odd = [text for text in flag.tolist() if text]  # few: the flags are looked at one by one
     zero, no_fix = (sum(name in text.split(";") for text in odd) for name in ("zero_attitude", "no_fix"))
     warnings = []
     if zero:

@@ -14,10 +14,20 @@ from ..common.units import AnyArray, FloatArray, IntArray, db_from_amplitude
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
-from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
+from ..compare.result import (
+    APPLIED,
+    GIVEN,
+    NOT_APPLIED,
+    ClockResult,
+    FlightResult,
+    ModelLevel,
+    PairResult,
+    RankResult,
+    RssResult,
+)
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
-from ..flight.settings import FlightFile, LogSettings
+from ..flight.settings import LogSettings
 from ..logs.ingest import IngestedFile
 from . import data as record
 from .export import merge
@@ -79,7 +89,7 @@ def report_data(
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(
-            dataclasses.replace(rss_panel(one), source=source_of(series, settings))
+            dataclasses.replace(rss_panel(one), source=source_of(series, settings.logs))
             for one, series in zip(result.rss, data.rss, strict=True)
         ),
         paths=tuple(paths),
@@ -168,11 +178,11 @@ def _tower_columns(tower_m: FloatArray | None) -> dict[str, FloatArray]:
     return {f"tower_{name}_m": tower_m[:, axis] for axis, name in enumerate(("east", "north", "up"))}
 
 
-def source_of(series: RssSeries, settings: FlightFile) -> record.Source | None:
+def source_of(series: RssSeries, logs: Sequence[LogSettings]) -> record.Source | None:
     """Where the samples of a series stand in its logs."""
     if len(series.line) != len(series.time):
         return None
-    return record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
+    return record.Source(files=tuple(log.path for log in logs), file=series.log, line=series.line)
 
 
 def _baseline(name: str, model: ModelLevel, paired: PairedDifference | None) -> record.Baseline:
@@ -215,12 +225,12 @@ def clock_warnings(result: FlightResult) -> tuple[str, ...]:
     for receiver, clock in clocks_of(result).items():
         low, high = clock.ci95_s
         shown = f"{clock.radio_minus_telemetry_s:+.2f} s ({low:+.2f} .. {high:+.2f})"
-        if clock.applied == "asked for, not applied":
+        if clock.applied == NOT_APPLIED:
             asked.append(
                 f"{receiver}: rss.lag: apply was asked for, but the radio clock was NOT corrected: the check is "
                 f"{clock.verdict} ({clock.reason})."
             )
-        elif clock.applied == "estimated and applied":
+        elif clock.applied == APPLIED:
             other.append(f"{receiver}: the radio clock shows {shown} more than the telemetry clock; it was corrected.")
         elif clock.verdict == "ok":
             other.append(
@@ -283,7 +293,7 @@ def _clock_entry(clock: ClockResult) -> dict[str, Any]:
         "ci95_s": list(clock.ci95_s),
         "verdict": clock.verdict,
         "reason": clock.reason,
-        "applied": clock.applied in ("estimated and applied", "given in flight.yaml"),
+        "applied": clock.applied in (APPLIED, GIVEN),
     }
 
 

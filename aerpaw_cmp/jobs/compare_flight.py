@@ -16,6 +16,7 @@ import numpy as np
 
 from ..common.errors import InputError
 from ..common.forked import in_order
+from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
@@ -73,6 +74,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
     found = tuple(in_order(calls, fewest=FEWEST_SERIES))
+    give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
         rss=found,
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),

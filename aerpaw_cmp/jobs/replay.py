@@ -195,7 +195,7 @@ SHARED_UP_TO = 200_000
 
 
 def processes_for(data: FlightData) -> int | None:
-    """Processes for the series of a flight: as many as are safe, one on a long flight, where each holds as much as all."""
+    """Processes for the series of a flight: as many as are safe; one on a long flight, where each holds much memory."""
     return None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
 
 

@@ -120,6 +120,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 cache_dir=None if rt.cache else "",
                 ks=ks,
                 expected=expected,
+                power_cut_db=rt.power_cut_db,
                 reference_links=int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS)),
             )
         )

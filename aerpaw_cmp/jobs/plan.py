@@ -21,7 +21,7 @@ from ..common.stages import Stages
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses, single_element
-from ..propagation.tracer import replay
+from ..propagation.tracer import estimate_search, replay
 from ..site.site import Site
 from ..site.siteyaml import load_site
 
@@ -227,6 +227,8 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:
         return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
+    if (planned := _by_first_faces(site, rt, name, work, link, poses)) is not None:
+        return planned
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
@@ -239,6 +241,16 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
     small, large = tried(few), tried(more)
     per_pose = max(large - small, 0.2 * large) / (more - few)  # a hiccup in the small one does not make poses free
     return PlannedStage(name=name, work=work, seconds=large + per_pose * (n - more))
+
+
+def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
+    """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
+    start = time.process_time()
+    estimate = estimate_search(site, link, poses, max_depth=rt.max_depth, power_cut_db=rt.power_cut_db, threads=1)
+    if estimate is None:
+        return None
+    setup = time.process_time() - start  # reading, merging and trees, which are kept for the next stage
+    return PlannedStage(name=name, work=f"{work}; path search {estimate}", seconds=setup + estimate.seconds)
 
 
 def map_plan(

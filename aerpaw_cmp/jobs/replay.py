@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import ClockResult
@@ -22,6 +24,7 @@ from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
+from ..propagation.effort import Estimate
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
@@ -148,10 +151,13 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+def estimate_clocks(
+    data: FlightData, progress: Progress = silent, meanwhile: Callable[[], object] | None = None
+) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
-    Predictions are the image engine's RSS along the track with at most one reflection.
+    Predictions are the image engine's RSS along the track with at most one reflection. ``meanwhile`` is what this
+    process may do while others estimate; it is not called where there is nothing to estimate.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
@@ -159,9 +165,16 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
     if isinstance(wanted, float):
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
-    for tower in dict.fromkeys(series.tower for series in data.rss):
-        progress(f"clock {tower}")
-        found[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+    towers = list(dict.fromkeys(series.tower for series in data.rss))
+    calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
+    # on a long flight the estimates are made here, one after the other: each of them holds as much as all else
+    processes = None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
+    with ahead(calls, processes) as estimates:
+        if meanwhile is not None:
+            meanwhile()
+        for tower in towers:
+            progress(f"clock {tower}")
+            found[tower] = next(estimates)
     return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -178,6 +191,9 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
     )
     return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
 
+
+SHARED_UP_TO = 200_000
+"""RSS samples of a flight up to which the clocks of its receivers are estimated by several processes."""
 
 BLOCK = 100_000
 """Instants of a clock's prediction that are replayed at once: bounds memory on flights of more than half an hour."""
@@ -394,6 +410,7 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     others: bool | None = None,
+    check_power_cut: bool = True,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -411,6 +428,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
+    check_power_cut : bool
+        Say in ``left_out`` what ``rt.power_cut_db`` costs.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -446,11 +465,12 @@ def replay_poses(
         )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
-        parts = []
+        parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
             some = Poses(poses.position_m[rows], poses.rotation[rows])
-            parts.append(replay_poses(site, rt, link, some, engine=engine))
+            first, listener = not parts, silent if parts else progress
+            parts.append(replay_poses(site, rt, link, some, engine=engine, check_power_cut=first, progress=listener))
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
@@ -466,6 +486,9 @@ def replay_poses(
         crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        power_cut_db=rt.power_cut_db,
+        check_power_cut=check_power_cut,
+        on_estimate=lambda estimate: _tell(progress, name, estimate),
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         device=rt.device,
@@ -479,13 +502,19 @@ def replay_poses(
     return found
 
 
+def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
+    """Say what a search will take, where it is more than a moment."""
+    if estimate.seconds > 1.0:
+        progress(f"path search {name}: {estimate}")
+
+
 def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
     """Refuse what a tower that moves cannot be replayed with.
 
     Raises
     ------
     UsageError
-        Engine sionna; ``rt.relevance_db``.
+        Engine sionna; ``rt.relevance_db``; ``rt.power_cut_db``.
     """
     if engine != "image":
         raise UsageError(
@@ -498,6 +527,12 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             f"rt.relevance_db with towers.{name}, which moves",
             expected="a tower that stands still, or no rt.relevance_db",
             cause="which buildings matter is told for one place of the tower",
+        )
+    if rt.power_cut_db is not None:
+        raise UsageError(
+            f"rt.power_cut_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.power_cut_db",
+            cause="what the cut costs is checked for one place of the tower",
         )
 
 

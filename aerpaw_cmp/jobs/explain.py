@@ -30,7 +30,16 @@ from ..propagation.image import planes_of
 from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
-from .replay import _poses, _track_poses, attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time
+from .replay import (
+    _poses,
+    _track_poses,
+    attitude_rotation,
+    estimate_clocks,
+    path_loss,
+    replay_poses,
+    roughness_loss,
+    telemetry_time,
+)
 
 MORE_SAMPLES = 10
 """Times the samples with which Sionna is asked again for paths that it lacks."""
@@ -271,16 +280,22 @@ def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
         )
 
 
+SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
+
+
 def _paths(
     data: FlightData, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
 ) -> tuple[ExplainedPath, ...]:
     """The paths with their terms, foliage and roughness apart."""
-    through = path_loss(data.site.trees, rt.model_copy(update={"reflection_loss_db": 0.0}), link.carrier_hz)
+    through = path_loss(data.site, rt.model_copy(update=SMOOTH), link.carrier_hz)
     further = {}
     if through is not None:
         further["foliage"] = through(found.paths, source[None], pose.position_m)
     if rt.reflection_loss_db:
         further["rough surfaces"] = rt.reflection_loss_db * found.paths.depth.astype(np.float64)
+    rough = roughness_loss(data.site, rt, link.carrier_hz)
+    if rough is not None:
+        further["rough ground"] = rough(found.paths, source[None], pose.position_m)
     return explain_paths(found.paths, found.faces, source, pose, link, further)
 
 

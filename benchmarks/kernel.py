@@ -6,7 +6,8 @@
 3. how far the field kernel is from what the processor can do: its operations, counted, against the most multiplications
    and additions of this machine without fused ones, which the kernel must not use (both measured in this run);
 4. seconds and peak memory of a flight of ``--long`` poses, replayed in parts that are made as they are asked for
-   (a process of its own per length);
+   (a process of its own per length), compiled and, for the shortest, in NumPy; and what a process with compiled code
+   holds before it has any pose, step by step;
 5. the field on a CUDA device, where there is one;
 6. with ``--cold``: seconds of a first replay in a new process, NumPy and compiled, for growing sizes: where they cross.
 
@@ -32,7 +33,7 @@ from aerpaw_cmp.propagation.arrays import Poses
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.channel import channel_matrices
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import Replay, replay, replay_parts
+from aerpaw_cmp.propagation.tracer import POSES_PER_PART, Replay, replay, replay_parts
 
 TOWERS = 5
 FLOPS = {"pair": 213, "reflection": 115, "slab": 105}
@@ -184,9 +185,8 @@ def peak_mib() -> float:
 
 def long_flight(poses: int) -> dict[str, float]:
     """A flight in parts; RSS and ranks are kept, everything else is let go."""
-    os.environ.pop(compiled.SWITCH, None)
     site, link, _ = random_scene(2, towers=TOWERS)
-    step = 4096
+    step = POSES_PER_PART
 
     def parts():
         for start in range(0, poses, step):
@@ -197,7 +197,8 @@ def long_flight(poses: int) -> dict[str, float]:
             yield Poses(place, np.broadcast_to(np.eye(3), (len(along), 3, 3)))
 
     before = peak_mib()
-    state = compiled.load("kernels"), compiled.load("search_kernels")
+    if compiled.switch() != "never":
+        compiled.load("kernels"), compiled.load("search_kernels")
     loaded = peak_mib()
     rss, cpu = 0, time.process_time()
     for part in replay_parts(site, link, parts(), extent_m=np.array([[-290.0, -290, 20], [290, 290, 60]]), threads=1):
@@ -210,8 +211,34 @@ def long_flight(poses: int) -> dict[str, float]:
         "peak_mib": peak_mib(),
         "before_mib": before,
         "with_kernels_mib": loaded,
-        "compiled": float(state[0].kernels is not None),
+        "compiled": float(compiled.switch() != "never" and compiled.load("kernels").kernels is not None),
     }
+
+
+MEMORY = """
+import json, sys
+from pathlib import Path
+rows = {}
+def row(name):
+    status = dict(line.split(":", 1) for line in Path("/proc/self/status").read_text().splitlines())
+    rows[name] = {key: int(status[key].split()[0]) / 1024 for key in ("VmRSS", "RssAnon", "RssFile")}
+import numpy; row("NumPy")
+from aerpaw_cmp.propagation import bench, compiled, tracer; row("aerpaw_cmp.propagation")
+case = bench.random_scene(2); row("a site (pyproj)")
+import llvmlite.binding; row("llvmlite")
+import numba; row("numba")
+from numba.core.registry import cpu_target
+cpu_target.target_context.refresh(); cpu_target.typing_context.refresh(); row("its functions, scipy.linalg too")
+compiled.load("kernels"), compiled.load("search_kernels"); row("our kernels, read from their cache")
+print(json.dumps(rows))
+"""
+"""Resident memory [MiB] of a process, step by step: of files (shared with other processes) and its own."""
+
+
+def memory() -> dict[str, dict[str, float]]:
+    """What is held before the first pose."""
+    said = subprocess.run([sys.executable, "-c", MEMORY], capture_output=True, check=True, text=True)
+    return dict(json.loads(said.stdout))
 
 
 def cold(sizes: tuple[int, ...] = (1000, 3000, 5000, 10_000)) -> list[dict[str, float]]:
@@ -253,9 +280,20 @@ def main() -> None:
         "gpu": on_gpu(options.poses),
     }
     command = [sys.executable, __file__, "--only-long"]
+    modes = [(n, "auto") for n in options.long] + [(n, "never") for n in sorted(options.long)[:1]]
+    if modes:
+        result["memory"] = [{"after": step, **row} for step, row in memory().items()]
     result["long"] = [
-        json.loads(subprocess.run([*command, str(n)], check=True, capture_output=True, text=True).stdout)
-        for n in options.long
+        json.loads(
+            subprocess.run(
+                [*command, str(n)],
+                check=True,
+                capture_output=True,
+                text=True,
+                env=os.environ | {compiled.SWITCH: mode},
+            ).stdout
+        )
+        for n, mode in modes
     ]
     if options.cold:
         result["cold"] = cold()

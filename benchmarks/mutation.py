@@ -1,7 +1,8 @@
 """Mutation testing of the modules that hold the physics and the readers.
 
-Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. The tests named
-for the module run on it in a forked child, where nothing else is changed, and end at the first failure.
+Each mutant changes one place of one module: an operator, a comparison, a sign, a constant, a condition. Of the tests
+named for the module, those that reach the changed statement run on it in a forked child, where nothing else is changed,
+and end at the first failure.
 A mutant that every test passes has survived; `mutation_equivalent.txt` beside this file lists, with the reason, those
 that change nothing that can be seen. Mutants are drawn at random, with a seed, since all of them would take days.
 
@@ -13,6 +14,8 @@ from __future__ import annotations
 import argparse
 import ast
 import contextlib
+import functools
+import gc
 import importlib.abc
 import importlib.machinery
 import importlib.util
@@ -21,10 +24,12 @@ import json
 import multiprocessing
 import os
 import random
+import select
 import signal
 import sys
 import time
-from collections.abc import Iterator
+import types
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -132,7 +137,7 @@ def changes(node: ast.AST) -> Iterator[ast.AST]:
     elif isinstance(node, ast.Constant) and type(node.value) in (int, float):
         yield ast.Constant(node.value + 1)
         if node.value not in (0, -1):
-            yield ast.Constant(-node.value)
+            yield ast.UnaryOp(ast.USub(), ast.Constant(node.value))
     elif isinstance(node, ast.Constant) and isinstance(node.value, bool):
         yield ast.Constant(not node.value)
     elif isinstance(node, (ast.Break, ast.Continue)):
@@ -212,45 +217,202 @@ def module_name(path: str) -> str:
     return path.removeprefix("parsers/").removesuffix(".py").replace("/", ".")
 
 
-def trial(path: str, source: str, tests: tuple[str, ...], pipe: Any) -> None:
-    """In a child: run the tests on the changed module, say whether one failed."""
-    import resource
+OPTIONS = ("-q", "-x", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist", "-p", "no:randomly", "--tb=no")
+QUIET = ("-W", "ignore::pytest.PytestAssertRewriteWarning")
 
-    resource.setrlimit(resource.RLIMIT_CPU, (int(TIMEOUT_S), int(TIMEOUT_S) + 5))
-    os.chdir(ROOT)
-    sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
-    sys.meta_path.insert(0, Planted(module_name(path), ROOT / path, source))
+
+def pytest_on(tests: tuple[str, ...], plugins: list[Any]) -> int:
+    """Pytest in this process, silent."""
     import pytest
 
-    importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
-    options = ["-q", "-x", "--no-header", "-p", "no:cacheprovider", "-p", "no:xdist", "--tb=no"]
-    options += ["-W", "ignore::pytest.PytestAssertRewriteWarning"]
     with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(io.StringIO()):
-        code = pytest.main([*options, *(t for t in tests if (ROOT / t).is_file())])
-    pipe.send(int(code))
-    os._exit(0)
+        return int(pytest.main([*OPTIONS, *QUIET, *(t for t in tests if (ROOT / t).exists())], plugins=plugins))
 
 
-def outcome(path: str, source: str, tests: tuple[str, ...]) -> tuple[str, float]:
-    """``killed``, ``survived`` or ``killed by time``; and the seconds it took."""
-    begin = time.monotonic()
-    here, there = multiprocessing.get_context("fork").Pipe(duplex=False)
-    child = multiprocessing.get_context("fork").Process(target=trial, args=(path, source, tests, there))
-    child.start()
-    there.close()
-    code: int | None = None
-    if here.poll(4 * TIMEOUT_S):
-        with contextlib.suppress(EOFError):
-            code = here.recv()
-    if child.is_alive():
-        child.join(2)
-        if child.pid is not None and child.is_alive():
-            os.kill(child.pid, signal.SIGKILL)
-    child.join()
-    took = time.monotonic() - begin
-    if code is None:
-        return "killed by time or crash", took
-    return ("survived" if code == 0 else "killed"), took
+def own_folders() -> None:
+    """Nothing that one mutant leaves in a cache reaches the next."""
+    import tempfile
+
+    os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-mutant-")
+    for one in gc.get_objects():
+        if isinstance(one, functools._lru_cache_wrapper) and str(getattr(one, "__module__", "")).startswith("aerpaw"):
+            one.cache_clear()
+
+
+def in_child(work: Callable[[], str], limit_s: float) -> str:
+    """``killed by`` the test that the work, in a forked child, names; by time or crash where it says nothing."""
+    import resource
+
+    here, there = os.pipe()
+    child = os.fork()
+    if child == 0:
+        try:
+            resource.setrlimit(resource.RLIMIT_CPU, (int(limit_s) + 1, int(limit_s) + 3))
+            os.setpgid(0, 0)
+            own_folders()
+            null = os.open(os.devnull, os.O_WRONLY)
+            os.dup2(null, 1)
+            os.dup2(null, 2)
+            test = work()
+            os.write(there, f"killed by {test}".encode() if test else b"survived")
+        except Exception as error:  # of this script: no mutant is counted by it
+            os.write(there, f"broken: {error!r}".encode())
+        finally:
+            os._exit(0)
+    os.close(there)
+    ready, _, _ = select.select([here], [], [], 20 * limit_s)
+    answer = os.read(here, 4096).decode() if ready else ""
+    os.close(here)
+    with contextlib.suppress(ProcessLookupError, PermissionError):
+        os.killpg(child, signal.SIGKILL)  # with what its tests started
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(child, signal.SIGKILL)
+    os.waitpid(child, 0)
+    return answer or "killed by time or crash"
+
+
+class Trials:
+    """A plug-in of pytest: runs every test once, noting which lines of the module it reaches; then tries the mutants.
+
+    A mutant is tried on the tests that reach its statement, the shortest first, in a forked child whose function has
+    got the changed code. What is no body of a function (constants, defaults, fields) is planted by a new import.
+    """
+
+    def __init__(self, path: str, chosen: list[Mutant]) -> None:
+        self.path, self.chosen = path, chosen
+        self.found: list[tuple[Mutant, str, float]] = []
+        self.fault = ""
+
+    def pytest_runtestloop(self, session: Any) -> bool:
+        """In place of pytest's own."""
+        items = session.items
+        reach = [self._reached(item, after) for item, after in zip(items, [*items[1:], None], strict=True)]
+        if self.fault:
+            return True
+        tree = ast.parse((ROOT / self.path).read_text(encoding="utf-8"))
+        for mutant in self.chosen:
+            begin = time.monotonic()
+            place = place_of(tree, of_code(tree)[mutant.node])
+            if place is None:
+                kind = in_child(lambda one=mutant: planted(self.path, one.source, TARGETS[self.path]), TIMEOUT_S)
+            else:
+                first, last = place.lines
+                near = sorted((s, k) for k, (s, lines) in enumerate(reach) if any(first <= n <= last for n in lines))
+                limit = min(TIMEOUT_S, 20 + 10 * sum(s for s, _ in near))
+                tests = [items[k] for _, k in near]
+                kind = in_child(lambda one=mutant, at=place, those=tests: self._fails(one, at, those), limit)
+            self.found.append((mutant, kind, time.monotonic() - begin))
+        return True
+
+    def _reached(self, item: Any, after: Any) -> tuple[float, set[int]]:
+        from _pytest.runner import runtestprotocol
+
+        lines: set[int] = set()
+        own = str(ROOT / self.path)
+
+        def local(frame: Any, event: str, argument: Any) -> Any:
+            del event, argument
+            lines.add(frame.f_lineno)
+            return local
+
+        def every(frame: Any, event: str, argument: Any) -> Any:
+            del argument
+            if frame.f_code.co_filename != own or event != "call":
+                return None
+            return local
+
+        begin = time.process_time()
+        sys.settrace(every)
+        try:
+            reports = runtestprotocol(item, log=False, nextitem=after)
+        finally:
+            sys.settrace(None)
+        if any(r.failed for r in reports):
+            self.fault = item.nodeid
+        return time.process_time() - begin, lines
+
+    def _fails(self, mutant: Mutant, place: Place, items: list[Any]) -> str:
+        from _pytest.runner import runtestprotocol
+
+        swap(self.path, mutant, place)
+        for number, item in enumerate(items):
+            after = items[number + 1] if number + 1 < len(items) else None
+            if any(report.failed for report in runtestprotocol(item, log=False, nextitem=after)):
+                return str(item.nodeid)
+        return ""
+
+
+def planted(path: str, source: str, tests: tuple[str, ...]) -> str:
+    """In a child: whether a test fails when the module, and all that imports it, is imported anew from a source."""
+    for name in [n for n in sys.modules if n.split(".")[0] in ("aerpaw_cmp", "aerpaw_parsers", "tests", "conftest")]:
+        del sys.modules[name]
+    sys.meta_path.insert(0, Planted(module_name(path), ROOT / path, source))
+    try:
+        importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
+    except Exception:
+        return "the import"
+    return "a test, imported anew" if pytest_on(tests, []) == 1 else ""
+
+
+@dataclass(frozen=True, slots=True)
+class Place:
+    """Where a change stands: the names of the function (with its classes) and the lines of its statement."""
+
+    names: tuple[str, ...]
+    begin: int
+    lines: tuple[int, int]
+
+
+def place_of(tree: ast.Module, node: ast.AST) -> Place | None:
+    """Of a node in the body of a function; None elsewhere."""
+    body: list[ast.stmt] = tree.body
+    names: list[str] = []
+    while True:
+        within = next((s for s in body if any(n is node for n in ast.walk(s))), None)
+        if not isinstance(within, (ast.ClassDef, ast.FunctionDef)):
+            return None
+        names.append(within.name)
+        if isinstance(within, ast.FunctionDef):
+            break
+        body = within.body
+    if not any(n is node for s in within.body for n in ast.walk(s)):
+        return None
+    begin = min([within.lineno, *(d.lineno for d in within.decorator_list)])
+    return Place(tuple(names), begin, _lines_of(within.body, node))
+
+
+def _lines_of(body: list[ast.stmt], node: ast.AST) -> tuple[int, int]:
+    """First and last line of the innermost simple statement, or of the head of a compound one."""
+    statement = next(s for s in body if any(n is node for n in ast.walk(s)))
+    for name in ("body", "orelse", "finalbody", "handlers"):
+        inner = getattr(statement, name, None)
+        if isinstance(inner, list) and any(n is node for s in inner for n in ast.walk(s)):
+            return _lines_of(inner, node)
+    blocks = getattr(statement, "body", None)
+    last = blocks[0].lineno - 1 if blocks and statement is not node else statement.end_lineno
+    return statement.lineno, max(last or statement.lineno, statement.lineno)
+
+
+def swap(path: str, mutant: Mutant, place: Place) -> None:
+    """Give the imported function the changed code."""
+    tree = ast.parse((ROOT / path).read_text(encoding="utf-8"))
+    target = of_code(tree)[mutant.node]
+    other = list(changes(target))[mutant.change]
+    _replace(tree, target, ast.copy_location(other, target))
+    code = compile(ast.fix_missing_locations(tree), str(ROOT / path), "exec")
+    for name in place.names[:-1]:
+        code = next(c for c in code.co_consts if isinstance(c, types.CodeType) and c.co_name == name)
+    code = next(
+        c
+        for c in code.co_consts
+        if isinstance(c, types.CodeType) and (c.co_name, c.co_firstlineno) == (place.names[-1], place.begin)
+    )
+    holder: Any = sys.modules[module_name(path)]
+    for name in place.names:
+        holder = vars(holder)[name]
+        for inner in ("fget", "__func__", "func", "__wrapped__"):
+            holder = getattr(holder, inner, holder)
+    holder.__code__ = code
 
 
 # --- all of them ----------------------------------------------------------------------------------------------------
@@ -278,15 +440,20 @@ def drawn(path: str, each: int, seed: int) -> list[Mutant]:
 
 
 def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, str]) -> dict[str, Any]:
-    """Try each mutant; one line of the account for each."""
-    tests = TARGETS[path]
-    clean, _ = outcome(path, (ROOT / path).read_text(encoding="utf-8"), tests)
-    if clean != "survived":
-        raise SystemExit(f"{path}: its tests fail without any change ({clean})")
+    """Try each mutant, in a process of its own; one line of the account for each."""
+    here, there = multiprocessing.get_context("fork").Pipe(duplex=False)
+    child = multiprocessing.get_context("fork").Process(target=_tried, args=(path, chosen, there))
+    child.start()
+    there.close()
+    found, fault = here.recv()
+    child.join()
+    if fault:
+        raise SystemExit(f"{path}: its tests fail without any change ({fault})")
     counts = {"killed": 0, "survived": 0, "equivalent": 0}
     survivors = []
-    for mutant in chosen:
-        result, took = outcome(path, mutant.source, tests)
+    for mutant, result, took in found:
+        if result.startswith("broken"):
+            raise SystemExit(f"{mutant.name}: {result}")
         kind = "killed" if result.startswith("killed") else "survived"
         if kind == "survived" and change_of(mutant) in known:
             kind = "equivalent"
@@ -298,6 +465,17 @@ def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, 
             with account.open("a", encoding="utf-8") as file:
                 file.write(json.dumps(row) + "\n")
     return {"path": path, **counts, "survivors": survivors}
+
+
+def _tried(path: str, chosen: list[Mutant], pipe: Any) -> None:
+    os.chdir(ROOT)
+    sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
+    importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
+    trials = Trials(path, chosen)
+    code = pytest_on(TARGETS[path], [trials])
+    pipe.send((trials.found, trials.fault or ("" if trials.found or not chosen else f"pytest ended with {code}")))
+    pipe.close()
+    os._exit(0)
 
 
 def main() -> None:

@@ -13,6 +13,8 @@ import pytest
 
 import aerpaw_cmp as ac
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
 

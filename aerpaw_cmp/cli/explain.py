@@ -84,6 +84,12 @@ def _print(found: Any) -> None:
         table(["path", "face", "material", "incidence deg", "|TE| dB", "|TM| dB"], bounces, "Reflections")
     levels = [number(level, "{:.2f}") for level in (found.level_dbm, found.power_sum_dbm)]
     print(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
+    if (other := found.other_interactions) is not None:
+        power, level = number(other.power_dbm, "{:.2f}"), number(other.level_dbm, "{:.2f}")
+        kinds = ", ".join(f"{count} {kind}" for kind, count in other.kinds.items()) or "none found"
+        print(
+            f"{' and '.join(other.interactions)} by Sionna: {kinds}; {power} dBm together, level with them {level} dBm"
+        )
     if found.measured_db is not None:
         print(f"measured {number(found.measured_db, '{:.2f}')} {found.unit}, before any offset")
     for path, reason in found.absent:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import ctypes
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from functools import cache
 from typing import Protocol
 
 
@@ -76,4 +78,24 @@ class Stages:
         try:
             yield
         finally:
+            give_memory_back()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+
+
+def give_memory_back() -> None:
+    """Hand freed pages back to the system, where the C library can (glibc: ``malloc_trim``).
+
+    A stage frees most of what it asked for, in pieces among those that stay: a flight of ten hours kept a quarter of
+    a GiB of such holes from stage to stage.
+    """
+    trim = getattr(_library(), "malloc_trim", None)
+    if trim is not None:
+        trim(ctypes.c_size_t(0))
+
+
+@cache
+def _library() -> ctypes.CDLL | None:
+    try:
+        return ctypes.CDLL(None)
+    except (OSError, TypeError):  # no such thing as the running program's own symbols there
+        return None

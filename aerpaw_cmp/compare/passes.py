@@ -200,7 +200,16 @@ class PassTable:
                     partners.setdefault(entry.one.link, []).append((number, entry))
                 for number, here in self._flights[first]:
                     for other, there in partners.get(here.one.link, ()):
-                        yield _pair(number, here, other, there, self._places, found, shared, rule)
+                        yield _pair(
+                            first=number,
+                            here=here,
+                            second=other,
+                            there=there,
+                            places=self._places,
+                            found=found,
+                            shared=shared,
+                            rule=rule,
+                        )
 
 
 def pass_pairs(

@@ -379,6 +379,10 @@ class KCurve:
     at_edge: bool
 
 
+_CELLS_AT_ONCE = 2_000_000
+"""Samples times K that are resampled at once: bounds memory on flights of hours, and changes no digit."""
+
+
 def k_curve(
     measured: ArrayLike,
     sigma: ArrayLike,
@@ -422,17 +426,22 @@ def k_curve(
             best_k_total_variation_interval=NO_INTERVAL,
             at_edge=False,
         )
-    ranks = np.stack([rank_from_singular_values(profile, value) for value in grid], axis=1).astype(np.int8)
-    equal = (ranks == ri[:, None]).astype(np.float64)
+    ranks = np.stack([rank_from_singular_values(profile, value).astype(np.int8) for value in grid], axis=1)
+    equal = ranks == ri[:, None]
     known = autocorrelation(equal.mean(axis=1))
-    length = known.block_length
     agree = equal.mean(axis=0)
-    drawn = bootstrap_means(equal, length, replicates=replicates, seed=seed)
-    vary, varied = np.zeros(len(grid)), np.zeros(drawn.shape)
-    for rank in range(1, MAX_RANK + 1):  # the same seed draws the same blocks each time
-        apart = (ranks == rank).astype(np.float64) - (ri == rank)[:, None]
-        vary += 0.5 * np.abs(apart.mean(axis=0))
-        varied += 0.5 * np.abs(bootstrap_means(apart, length, replicates=replicates, seed=seed))
+    drawn, vary, varied = np.zeros((replicates, len(grid))), np.zeros(len(grid)), np.zeros((replicates, len(grid)))
+    width = max(1, _CELLS_AT_ONCE // len(ri))
+
+    def resampled(columns: BoolArray | IntArray) -> FloatArray:  # the same seed draws the same blocks each time
+        return bootstrap_means(columns.astype(np.float64), known.block_length, replicates=replicates, seed=seed)
+
+    for some in (slice(start, start + width) for start in range(0, len(grid), width)):
+        drawn[:, some] = resampled(equal[:, some])
+        for rank in range(1, MAX_RANK + 1):
+            apart = (ranks[:, some] == rank).astype(np.int8) - (ri == rank)[:, None]
+            vary[some] += 0.5 * np.abs(apart.mean(axis=0))
+            varied[:, some] += 0.5 * np.abs(resampled(apart))
     best, best_tv = _middle_of_best(agree[None], grid)[0], _middle_of_best(-vary[None], grid)[0]
     return KCurve(
         k=grid,

@@ -22,7 +22,7 @@ from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
-from .settings import FlightFile, GroundNode, LinkSettings, LogSettings, SiteChoice
+from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
 from .track import Track, good_positions
 
 Times = NDArray[np.datetime64]
@@ -322,7 +322,7 @@ def gather(
             elif stream.kind == "rss" and not _unnamed_cell(log, stream):
                 rss.append((log.path, _rss_series(settings, log, stream, site)))
             elif stream.kind == "rank":
-                rank.append((log.path, _rank_series(settings, log, stream, site)))
+                rank.append((log.path, _rank_series(log, stream, site, tower=log.node or settings.rank.tower)))
         if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
             warnings.append(f"{log.path}: {len(others)} cells that 'cells' does not name are left out")
         names = [s.name for s in file.result.streams]
@@ -369,7 +369,7 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
 def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
     """What is said of streams that are compared with a level over noise, or as if they were one."""
     kept = [s for s in streams if is_ratio(s) and s.name not in log.skip]
-    blind = [s.name for s in kept if _noise(s, _link_of(settings, log, s))[0] is None]
+    blind = [s.name for s in kept if _noise(s, _link_of(settings.link, log, s))[0] is None]
     if not blind:
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
@@ -380,9 +380,9 @@ def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]
     ]
 
 
-def _link_of(settings: FlightFile, log: LogSettings, stream: Stream) -> LinkSettings:
+def _link_of(links: LinksSettings, log: LogSettings, stream: Stream) -> LinkSettings:
     """Of the stream's channel."""
-    return settings.link.channels.get(_channel_of(log, stream), settings.link.rss)
+    return links.channels.get(_channel_of(log, stream), links.rss)
 
 
 def _channel_of(log: LogSettings, stream: Stream) -> str:
@@ -532,7 +532,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
     home = log.cells.get(int(pci)) if pci is not None else None
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
-    noise_dbm, link = _noise(stream, _link_of(settings, log, stream))
+    noise_dbm, link = _noise(stream, _link_of(settings.link, log, stream))
     frame, left_out = _scored(stream, log.path)
     return RssSeries(
         tower=tower,
@@ -550,8 +550,8 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
     )
 
 
-def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RankSeries:
-    tower = _known_tower(log.node or settings.rank.tower, log, site)
+def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | None) -> RankSeries:
+    home = _known_tower(tower, log, site)
     frame, left_out = _scored(stream, log.path)
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
@@ -560,7 +560,12 @@ def _rank_series(settings: FlightFile, log: LogSettings, stream: Stream, site: S
         position = np.stack([east, north, up], axis=-1)
     sinr = frame["sinr_db"].to_numpy(np.float64) if "sinr_db" in frame else np.full(len(frame), np.nan)
     return RankSeries(
-        tower, frame["time"].to_numpy("datetime64[ns]"), frame["rank"].to_numpy(np.float64), sinr, position, left_out
+        tower=home,
+        time=frame["time"].to_numpy("datetime64[ns]"),
+        rank=frame["rank"].to_numpy(np.float64),
+        sinr_db=sinr,
+        position_m=position,
+        flagged=left_out,
     )
 
 

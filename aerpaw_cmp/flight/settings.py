@@ -372,6 +372,8 @@ class RtSettings(Settings):
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None
+    power_cut_db: Positive | None = None
+    """Leave out reflections that their length alone puts this far below free space over their link."""
     visibility: Literal["centre", "pairs"] = "centre"
     """``pairs``: each element pair has its own paths (engine image); ``centre``: those of the array centres."""
     audit_links: Annotated[int, Field(ge=0)] = 200

@@ -331,8 +331,17 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rss_interval_s)
         links = self.settings.link
         link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
+        rt = self.settings.rt
         result = replay(
-            self.site, link, self._poses(time_s), engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth
+            self.site,
+            link,
+            self._poses(time_s),
+            engine=rt.engine,
+            max_depth=rt.max_depth,
+            samples=rt.samples,
+            batch=rt.batch,
+            interactions=rt.interactions,  # refused by the image engine
+            scattering_coefficient=rt.scattering_coefficient,
         )
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
         level = result.rss_dbm[:, 0] - offset

@@ -114,6 +114,12 @@ class TrackPoses:
     def __len__(self) -> int:
         return len(self.valid)
 
+    def pick(self, rows: BoolArray) -> TrackPoses:
+        """The poses of some rows (n,) bool; the very same where these are all of them."""
+        if rows.all():
+            return self
+        return TrackPoses(**{one.name: getattr(self, one.name)[rows] for one in dataclasses.fields(self)})
+
     def where(self, known: BoolArray) -> TrackPoses:
         """The poses with those as not valid at which the tower, which moves too, is not known (n,)."""
         if known.all():

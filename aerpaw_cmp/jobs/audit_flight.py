@@ -19,6 +19,7 @@ from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
+from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
 from ..propagation.audit import Audit, audit
 from ..propagation.channel import mean_pair_power
@@ -119,6 +120,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 cache_dir=None if rt.cache else "",
                 ks=ks,
                 expected=expected,
+                power_cut_db=rt.power_cut_db,
                 reference_links=int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS)),
             )
         )
@@ -254,7 +256,7 @@ def attitude_checked(data: FlightData, replays: Sequence[Replayed]) -> FieldAudi
         turned_anyway = any(np.abs(r.poses.rotation - np.eye(3)).max(initial=0.0) > 0 for r in replays)
         moved = mode == "ignored" and turned_anyway
         return FieldAudit(failures=("rt.attitude is 'ignored' and the UAV's array turns",) if moved else ())
-    times, angles = _logged_attitudes(data)
+    times, angles = _logged_attitudes(data.files)
     if not len(times):
         return FieldAudit(not_covered=("the attitude: the telemetry has none",))
     rows = np.unique(np.linspace(0, len(times) - 1, min(len(times), ATTITUDE_ROWS)).round().astype(int))
@@ -279,11 +281,11 @@ def _angle(one: FloatArray, two: FloatArray) -> float:
     return float(np.abs(one - two).max())
 
 
-def _logged_attitudes(data: FlightData) -> tuple[AnyArray, FloatArray]:
+def _logged_attitudes(files: Sequence[IngestedFile]) -> tuple[AnyArray, FloatArray]:
     """Instants (n,) and roll, pitch, yaw (n, 3) [deg] of telemetry rows whose instant occurs once."""
     import pandas as pd
 
-    frames = [s.frame for f in data.files for s in f.result.streams if s.kind == "telemetry"]
+    frames = [s.frame for f in files for s in f.result.streams if s.kind == "telemetry"]
     if not frames:
         return np.zeros(0, dtype="datetime64[ns]"), np.zeros((0, 3))
     frame = frames[0]

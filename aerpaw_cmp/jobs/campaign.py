@@ -24,7 +24,7 @@ from ..common.yamlfile import load_yaml, nearest
 from ..compare.heldout import rmse
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
-from ..report.campaign_data import CampaignData, Failure, RankHeldOutFold, RankRow, RssRow
+from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldOutFold, RankRow, RssRow
 from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
@@ -165,38 +165,27 @@ def run(
         check_place(open_place(where))
     with stage("flights"):
         outcomes, orders = kept_outcomes(tasks, where, progress)
-    seen = [path for path, _ in files.values()]
-    seen += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
-    seen = [path for path in seen if path.exists()]  # what is missing here, too, is a row of the result
     much = len(orders) > 1 or campaign.held_out is not None or len(files) > MANY_FLIGHTS
+    seen = _inputs_of(files, logs_root)
     with open_workers(
         workers if much else 1, scheduler if much else None, paths=seen, keep=where, progress=progress
     ) as crew:
         with stage("flights"):
             compute(tasks, orders, crew, progress, outcomes)
         results = [fitted_to(task, outcomes[number]) for number, task in enumerate(tasks)]
+        rank = tuple(row for o in results for row in o.rank)
+        flown = tuple(one for o in results for one in o.flown)
         failures += [o.failure for o in results if o.failure is not None]
         with stage("pool"):
             rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
             reference = [row for row in rows if row.setting == next(iter(settings))]
             found = repeats(reference, campaign.repeatability, crew, where if scheduler else None)
-            flown = [f for o in results for f in o.flown]
             ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
-        folds: list[Any] = []
-        rank_folds: list[RankHeldOutFold] = []
-        trouble = ""
+        held_out = _Folds()
         if campaign.held_out is not None:
             with stage("held-out"):
-                try:
-                    if campaign.held_out.criterion == "rmse":
-                        folds = _held_out(campaign.held_out, tasks, rows, crew, progress)
-                    else:
-                        given = [row for o in results for row in o.rank]
-                        rank_folds = _held_out_rank(campaign.held_out, tasks, given, progress)
-                except AerpawCmpError as error:
-                    trouble = str(error)
+                held_out = _folds(campaign.held_out, tasks, rows, rank, crew, progress)
     good = [t for t, o in zip(tasks, results, strict=True) if o.failure is None]
-    rank = tuple(row for o in results for row in o.rank)
     tracks = {o.track.flight: o.track for o in reversed(results) if o.track is not None}
     return CampaignData(
         name=campaign.campaign,
@@ -210,14 +199,14 @@ def run(
         rank=rank,
         rank_transfers=tuple(transfer_ranks(rank)),
         tracks=tuple(tracks[name] for name in files if name in tracks),
-        flown_ranks=tuple(one for o in results for one in o.flown),
+        flown_ranks=flown,
         failures=tuple(failures),
         pooled=tuple(pooled),
         repeats=tuple(found),
         rank_repeats=tuple(ranks_again),
-        held_out=tuple(folds),
-        held_out_rank=tuple(rank_folds),
-        held_out_failure=trouble,
+        held_out=held_out.rss,
+        held_out_rank=held_out.rank,
+        held_out_failure=held_out.failure,
         radius_m=campaign.repeatability.radius_m,
         heading_within_deg=campaign.repeatability.heading_within_deg,
         cell_m=campaign.repeatability.cell_m,
@@ -255,9 +244,42 @@ def campaign_tasks(
     return tasks, files, failures
 
 
+def _inputs_of(files: Mapping[str, tuple[Path, FlightFile]], logs_root: Path | None) -> list[Path]:
+    """Flight files and logs that are there; what is missing here is a row of the result."""
+    paths = [path for path, _ in files.values()]
+    paths += [(logs_root or path.parent) / log.path for path, flight in files.values() for log in flight.logs]
+    return [path for path in paths if path.exists()]
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Folds:
+    """What was fitted on some flights and scored on others, or why nothing was."""
+
+    rss: tuple[HeldOutFold, ...] = ()
+    rank: tuple[RankHeldOutFold, ...] = ()
+    failure: str = ""
+
+
+def _folds(
+    settings: HeldOutSettings,
+    tasks: Sequence[Task],
+    rows: Sequence[RssRow],
+    rank: Sequence[RankRow],
+    workers: Workers,
+    progress: Progress,
+) -> _Folds:
+    """The held-out fit by its criterion; one that fails costs the other numbers of a campaign nothing."""
+    try:
+        if settings.criterion == "rmse":
+            return _Folds(rss=tuple(_held_out(settings, tasks, rows, workers, progress)))
+        return _Folds(rank=tuple(_held_out_rank(settings, tasks, rank, progress)))
+    except AerpawCmpError as error:
+        return _Folds(failure=str(error))
+
+
 def _held_out(
     settings: HeldOutSettings, tasks: Sequence[Task], rows: Sequence[RssRow], workers: Workers, progress: Progress
-) -> list[Any]:
+) -> list[HeldOutFold]:
     """Fit under one setting on the flights that gave RSS under it."""
     label, of = _tasks_of_fit(settings, tasks, rows)
     return fit_all(

@@ -18,7 +18,7 @@ from ..compare.heldout import fit_held_out, goes_round, rmse
 from ..compare.offset import grid_offset
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RssSettings
 from ..report.campaign_data import HeldOutFold, HeldOutRow
 from .levels import levels_of
 from .replay import Clock, estimate_clocks, replay_rss
@@ -84,7 +84,7 @@ class Bench:
         if known is not None:
             return np.array([known])
         pairs = zip(self.measured_db, self.simulated(point), strict=True)
-        return np.concatenate([own_residual_db(m, s, self.data.settings) for m, s in pairs])
+        return np.concatenate([own_residual_db(m, s, self.data.settings.rss) for m, s in pairs])
 
     def thinned(self, samples: int) -> Bench:
         """Evenly spread samples of every series."""
@@ -111,9 +111,9 @@ def _combinations(grids: Mapping[str, Sequence[float]]) -> int:
     return prod(len(values) for values in grids.values())
 
 
-def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, settings: FlightFile) -> FloatArray:
+def own_residual_db(measured_db: FloatArray, simulated_db: FloatArray, rules: RssSettings) -> FloatArray:
     """Measured minus simulated after the best offset of these very samples (n,)."""
-    fit = grid_offset(measured_db, simulated_db, step_db=settings.rss.step_db, span_db=settings.rss.span_db)
+    fit = grid_offset(measured_db, simulated_db, step_db=rules.step_db, span_db=rules.span_db)
     return measured_db + fit.offset_db - simulated_db
 
 
@@ -325,8 +325,8 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
                     channel=series.channel,
                     fitted_here=name in train,
                     n=int((np.isfinite(measured) & np.isfinite(fitted)).sum()),
-                    start_rmse_db=rmse(own_residual_db(measured, start, bench.data.settings)),
-                    rmse_db=rmse(own_residual_db(measured, fitted, bench.data.settings)),
+                    start_rmse_db=rmse(own_residual_db(measured, start, bench.data.settings.rss)),
+                    rmse_db=rmse(own_residual_db(measured, fitted, bench.data.settings.rss)),
                     transferred_offset_db=offset,
                     transferred_rmse_db=rmse(measured + offset - fitted),
                     own=("offset_db", *_own_lag(bench.clocks[i], point)),

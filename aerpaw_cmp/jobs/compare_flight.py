@@ -439,7 +439,7 @@ def link_geometry(site: Site, tower: str, replayed: Replayed, rt: RtSettings) ->
     ):  # fmt: skip
         out[name] = replayed.spread(seen[name])
     if replayed.track is not None:
-        out["heading_deg"] = np.where(replayed.valid, replayed.track.heading_deg, np.nan)
+        out["heading_deg"] = replayed.spread(replayed.track.heading_deg)
     if len(site.trees) and rt.foliage != "none":
         depth = direct_foliage_m(replayed.source_m(site), replayed.poses.position_m, site.trees)
         out["foliage_depth_m"] = replayed.spread(depth)
@@ -543,7 +543,7 @@ def _repeated_rank(
     elapsed = rss.seconds(time)
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
-    heading = None if replayed.track is None else replayed.track.heading_deg[rows]
+    heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
     found = {}
     for name, turned in (("same_heading", heading), ("any_heading", None)):
         if name == "same_heading" and turned is None:

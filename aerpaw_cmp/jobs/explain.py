@@ -30,6 +30,7 @@ from ..propagation.image import planes_of
 from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
+from ..site.site import Site
 from .replay import (
     _poses,
     _track_poses,
@@ -56,6 +57,30 @@ class OtherEngine:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class OtherPower:
+    """What diffraction, scattering and refraction add to a link: Sionna's paths, whose power alone counts.
+
+    Parameters
+    ----------
+    interactions : tuple of str
+        As asked for, without reflection.
+    paths : int
+    kinds : dict of str to int
+        Paths by what they are made of.
+    power_dbm : float, optional
+        Sum of their powers; None where there is none.
+    level_dbm : float, optional
+        Coherent level of the reflections with that power added; None out of coverage.
+    """
+
+    interactions: tuple[str, ...]
+    paths: int
+    kinds: dict[str, int]
+    power_dbm: float | None
+    level_dbm: float | None
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class Explanation:
     """One link at one instant.
 
@@ -69,6 +94,8 @@ class Explanation:
         Line of sight or ground reflections that are not there, and why.
     differences : tuple of OtherEngine, optional
         Where both engines were asked.
+    other_interactions : OtherPower, optional
+        Where ``rt.interactions`` names more than reflections; ``level_dbm`` and ``paths`` leave them out.
     """
 
     flight: str
@@ -88,6 +115,7 @@ class Explanation:
     absent: tuple[tuple[str, str], ...]
     differences: tuple[OtherEngine, ...] | None
     notes: tuple[str, ...]
+    other_interactions: OtherPower | None = None
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON."""
@@ -96,6 +124,8 @@ class Explanation:
         result["absent"] = [{"path": path, "reason": reason} for path, reason in self.absent]
         if self.differences is not None:
             result["differences"] = [dataclasses.asdict(one) for one in self.differences]
+        if self.other_interactions is not None:
+            result["other_interactions"] = dataclasses.asdict(self.other_interactions)
         for name in ("level_dbm", "power_sum_dbm", "measured_db"):
             if result[name] is not None and not np.isfinite(result[name]):
                 result[name] = None
@@ -146,15 +176,18 @@ def run_explain(
         place, known = data.tower_at(tower, instant)
         _known(known, series, at)
         data = dataclasses.replace(data, site=site_with_tower_at(data.site, tower, place[0]))
-    chosen = settings.rt.engine if engine in (None, "both") else engine
-    found = replay_poses(data.site, settings.rt, link, pose, engine=chosen, progress=progress)  # type: ignore[arg-type]
+    rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
+    chosen = rt.engine if engine in (None, "both") else engine
+    others = bool(rt.other_interactions) and chosen == "sionna" and isinstance(series, RssSeries)
+    found = replay_poses(data.site, rt, link, pose, engine=chosen, others=others, progress=progress)  # type: ignore[arg-type]
+    other, found = _other_power(found, link), found.of_reflections()
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
-    paths = _paths(data, settings.rt, found, link, pose, source)
+    paths = _paths(data.site, rt, found, link, pose, source)
     differences = None
     if engine == "both":
-        differences = tuple(_differences(data, settings.rt, found, link, pose, source, progress))
+        differences = tuple(_differences(data, rt, found, link, pose, source, progress))
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
     if found.pairs_differ is not None and found.pairs_differ.any():
@@ -180,6 +213,22 @@ def run_explain(
         absent=tuple(_absent(found, source, pose.position_m[0])),
         differences=differences,
         notes=(*notes, *(f"left out: {what}" for what in found.left_out)),
+        other_interactions=other,
+    )
+
+
+def _other_power(found: Replay, link: Link) -> OtherPower | None:
+    """What other interactions than reflections add to the one link of a replay."""
+    other = found.other
+    if other is None:
+        return None
+    power = float(other.power[0, 0])
+    return OtherPower(
+        interactions=tuple(name for name in other.asked if name != "reflection"),
+        paths=int(other.paths[0, 0]),
+        kinds=dict(other.kinds),
+        power_dbm=_level(link.transmit_power_dbm + 10.0 * float(np.log10(power))) if power > 0.0 else None,
+        level_dbm=_level(float(found.rss_dbm[0, 0])),
     )
 
 
@@ -284,16 +333,16 @@ SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
 
 
 def _paths(
-    data: FlightData, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
+    site: Site, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
 ) -> tuple[ExplainedPath, ...]:
     """The paths with their terms, foliage and roughness apart."""
-    through = path_loss(data.site, rt.model_copy(update=SMOOTH), link.carrier_hz)
+    through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
     further = {}
     if through is not None:
         further["foliage"] = through(found.paths, source[None], pose.position_m)
     if rt.reflection_loss_db:
         further["rough surfaces"] = rt.reflection_loss_db * found.paths.depth.astype(np.float64)
-    rough = roughness_loss(data.site, rt, link.carrier_hz)
+    rough = roughness_loss(site, rt, link.carrier_hz)
     if rough is not None:
         further["rough ground"] = rough(found.paths, source[None], pose.position_m)
     return explain_paths(found.paths, found.faces, source, pose, link, further)
@@ -309,7 +358,7 @@ def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[t
 def _elsewhere(found: Replay) -> str:
     if found.engine == "sionna":
         return f"nothing is in its way: not found with {found.samples} samples per tower"
-    return "geometry allows it: stopped by the terrain, or the ground of another tower"
+    return "geometry allows it: stopped by the terrain, the ground of another tower, or left out by rt.power_cut_db"
 
 
 def _differences(
@@ -323,7 +372,7 @@ def _differences(
     ours, theirs = engines["image"], engines["sionna"]
     target = pose.position_m[0]
     mine, others = _by_plane(ours, theirs)
-    explained = {p.planes: p for p in _paths(data, rt, ours, link, pose, source)}
+    explained = {p.planes: p for p in _paths(data.site, rt, ours, link, pose, source)}
     missing = [key for key in mine if key not in others]
     more: set[tuple[int, ...]] = set()
     if missing:
@@ -338,7 +387,7 @@ def _differences(
         else:
             reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
         yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    levels = {p.planes: p for p in _paths(data, rt, theirs, link, pose, source)}
+    levels = {p.planes: p for p in _paths(data.site, rt, theirs, link, pose, source)}
     for key, sequence in others.items():
         if key in mine:
             continue

@@ -245,7 +245,7 @@ class _Climber:
 
     def _poses(self, series: _Series, attitude: str) -> Poses:
         whole, track = series.replayed.poses, series.replayed.track
-        turn = whole.rotation if track is None else attitude_rotation(track, attitude)[series.replayed.valid]
+        turn = whole.rotation if track is None else attitude_rotation(track, attitude)
         return Poses(whole.position_m[series.picked], np.ascontiguousarray(turn[series.picked]))
 
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError, UsageError
-from ..report.data import ReportData
+from ..report.data import InputFile, ReportData
 
 METRICS = "metrics.json"
 
@@ -64,7 +64,7 @@ def _from(folder: Path, place: Path) -> str:
     return os.path.relpath(os.path.realpath(place), os.path.realpath(folder))
 
 
-def refuse_changed(before: Sequence[Mapping[str, Any]], record: ReportData) -> None:
+def refuse_changed(before: Sequence[Mapping[str, Any]], inputs: Sequence[InputFile]) -> None:
     """Stop where an input is another than at the first report.
 
     Raises
@@ -72,7 +72,7 @@ def refuse_changed(before: Sequence[Mapping[str, Any]], record: ReportData) -> N
     InputError
         With the first that is.
     """
-    now = {(one.path, one.role): one.sha256 for one in record.inputs}
+    now = {(one.path, one.role): one.sha256 for one in inputs}
     for one in before:
         key = (one["path"], one["role"])
         if now.get(key) != one["sha256"] and "packaged" not in one["role"]:

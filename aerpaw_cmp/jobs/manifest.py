@@ -42,14 +42,13 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
     for key, text, place in named_files(content, roots):
         if key != "site.file":
             found.setdefault(place.resolve(), _entry(text, place, key))
-    for entry, place in _site_inputs(settings, flight.parent):
+    for entry, place in _site_inputs(settings.site.file, flight.parent):
         found.setdefault(place.resolve(), entry)
     return tuple(found.values())
 
 
-def _site_inputs(settings: FlightFile, folder: Path) -> Iterator[tuple[InputFile, Path]]:
+def _site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
     """The site file and what it names."""
-    name = settings.site.file
     path = folder / name
     if path.is_file():
         yield _entry(name, path, "site file"), path

@@ -19,9 +19,10 @@ from ..common.errors import UsageError
 from ..common.outputs import OutputFolder
 from ..common.stages import Stages
 from ..flight.data import FlightData
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses, single_element
-from ..propagation.tracer import replay
+from ..propagation.tracer import estimate_search, replay
+from ..site.site import Site
 from ..site.siteyaml import load_site
 
 MEASURED = {
@@ -204,33 +205,35 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
     groups: dict[tuple[str, str], list[Any]] = {}
     for series in data.rss:
         groups.setdefault((series.tower, series.settings_key), []).append(series)
-    rss, rank, attitude = [], [], data.settings.rt.attitude
+    rss, rank, site, rt = [], [], data.site, data.settings.rt
     for (tower, _), members in groups.items():
         assert data.track is not None
         track = data.track.pose_at(np.concatenate([series.time for series in members]))
-        poses = Poses(track.position_m[track.valid], attitude_rotation(track, attitude)[track.valid])
+        poses = Poses(track.position_m[track.valid], attitude_rotation(track, rt.attitude)[track.valid])
         name = f"replay RSS {tower} {', '.join(series.channel for series in members)}"
-        rss.append(_tried(data, name, members[0].link.build([tower], data.folder), poses))
+        rss.append(_tried(site, rt, name, members[0].link.build([tower], data.folder), poses))
     for one in data.rank:
         position, valid = rank_positions(one, data.track)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         link = data.settings.link.rank.build([one.tower], data.folder)
-        rank.append(_tried(data, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
+        rank.append(_tried(site, rt, f"replay rank {one.tower}", link, Poses(position[valid], rotation)))
     return rss, rank
 
 
-def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStage:
+def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> PlannedStage:
     """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
     from .replay import replay_poses
 
-    work, n = f"{len(poses)} poses, engine {data.settings.rt.engine}", len(poses)
-    if data.settings.rt.engine != "image" or n == 0:
+    work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
+    if rt.engine != "image" or n == 0:
         return PlannedStage(name=name, work=work, seconds=None if n else 0.0)
+    if (planned := _by_first_faces(site, rt, name, work, link, poses)) is not None:
+        return planned
 
     def tried(count: int) -> float:
         few = np.unique(np.linspace(0, n - 1, min(n, count)).astype(int))
         some = Poses(poses.position_m[few], np.ascontiguousarray(poses.rotation[few]))
-        return _cpu_seconds(lambda: replay_poses(data.site, data.settings.rt, link, some))
+        return _cpu_seconds(lambda: replay_poses(site, rt, link, some))
 
     few, more = TRIED_POSES
     if n <= more:
@@ -238,6 +241,16 @@ def _tried(data: FlightData, name: str, link: Link, poses: Poses) -> PlannedStag
     small, large = tried(few), tried(more)
     per_pose = max(large - small, 0.2 * large) / (more - few)  # a hiccup in the small one does not make poses free
     return PlannedStage(name=name, work=work, seconds=large + per_pose * (n - more))
+
+
+def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
+    """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
+    start = time.process_time()
+    estimate = estimate_search(site, link, poses, max_depth=rt.max_depth, power_cut_db=rt.power_cut_db, threads=1)
+    if estimate is None:
+        return None
+    setup = time.process_time() - start  # reading, merging and trees, which are kept for the next stage
+    return PlannedStage(name=name, work=f"{work}; path search {estimate}", seconds=setup + estimate.seconds)
 
 
 def map_plan(

@@ -22,6 +22,7 @@ from ..flight.track import Track, TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
+from ..propagation.effort import Estimate
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
@@ -45,7 +46,7 @@ class Clock:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Replayed:
-    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; the replay has those only."""
+    """One series, replayed: ``valid`` (n,) says at which samples a pose was known; all else has those alone."""
 
     link: Link
     poses: Poses
@@ -100,7 +101,7 @@ def replay_rss(
         tower = data.rss[members[0]].tower
         link = data.rss[members[0]].link.build([tower], data.folder)
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
-        places, tracks = _towers_and_poses(data, tower, times)
+        valid, places, tracks = _towers_and_poses(data, tower, times)
         poses = [_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
@@ -108,12 +109,12 @@ def replay_rss(
         towers_m = None if tower not in data.nodes else np.concatenate(places)
         whole = replay_poses(data.site, rt, link, joined, towers_m=towers_m, progress=progress)
         start = 0
-        for index, track, part, place in zip(members, tracks, poses, places, strict=True):
+        for index, here, track, part, place in zip(members, valid, tracks, poses, places, strict=True):
             stop = start + len(part)
             out[index] = Replayed(
                 link=link,
                 poses=part,
-                valid=track.valid,
+                valid=here,
                 replay=part_of(whole, start, stop),
                 track=track,
                 clock=shifts[index],
@@ -125,15 +126,16 @@ def replay_rss(
 
 def _towers_and_poses(
     data: FlightData, tower: str, times: Sequence[Times]
-) -> tuple[list[FloatArray], list[TrackPoses]]:
-    """Places of a tower and poses of the UAV at instants; poses are valid where both are known, places are of those."""
-    places, tracks = [], []
+) -> tuple[list[BoolArray], list[FloatArray], list[TrackPoses]]:
+    """At which instants a tower and the UAV are known; their places and poses at those."""
+    valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
         track = _track_poses(data.track, time).where(known)
-        tracks.append(track)
+        valid.append(track.valid)
+        tracks.append(track.pick(track.valid))
         places.append(place if len(place) == 1 and tower not in data.nodes else place[track.valid])
-    return places, tracks
+    return valid, places, tracks
 
 
 def _joined_poses(poses: Sequence[Poses]) -> Poses:
@@ -344,11 +346,11 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         place, known = data.tower_at(series.tower, series.time)
         valid = valid & known
         towers_m = place[valid] if series.tower in data.nodes else None
-        track = None if data.track is None else _track_poses(data.track, series.time)
-        rotation = np.tile(np.eye(3), (len(position), 1, 1))
+        track = None if data.track is None else _track_poses(data.track, series.time).pick(valid)
+        rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
-        poses = Poses(position[valid], np.ascontiguousarray(rotation[valid]))
+        poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
         found = replay_poses(
@@ -379,10 +381,9 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
 
 
 def _poses(track: TrackPoses, attitude: str) -> Poses:
-    rotation = attitude_rotation(track, attitude)
-    if track.valid.all():  # the very arrays of the track: a long flight has one copy of them
-        return Poses(track.position_m, np.ascontiguousarray(rotation))
-    return Poses(track.position_m[track.valid], np.ascontiguousarray(rotation[track.valid]))
+    """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
+    some = track.pick(track.valid)
+    return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))
 
 
 def replay_poses(
@@ -394,6 +395,7 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     others: bool | None = None,
+    check_power_cut: bool = True,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -411,6 +413,8 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
+    check_power_cut : bool
+        Say in ``left_out`` what ``rt.power_cut_db`` costs.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -439,6 +443,7 @@ def replay_poses(
             max_depth=rt.max_depth,
             loss=path_loss(site, rt, link.carrier_hz),
             crowns=crowns,
+            power_cut_db=rt.power_cut_db,
             visibility=rt.visibility,
             threads=rt.threads,
             device=rt.device,
@@ -446,11 +451,12 @@ def replay_poses(
         )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
-        parts = []
+        parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
             some = Poses(poses.position_m[rows], poses.rotation[rows])
-            parts.append(replay_poses(site, rt, link, some, engine=engine))
+            first, listener = not parts, silent if parts else progress
+            parts.append(replay_poses(site, rt, link, some, engine=engine, check_power_cut=first, progress=listener))
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
@@ -466,6 +472,9 @@ def replay_poses(
         crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
+        power_cut_db=rt.power_cut_db,
+        check_power_cut=check_power_cut,
+        on_estimate=lambda estimate: _tell(progress, name, estimate),
         visibility=rt.visibility if engine == "image" else "centre",
         threads=rt.threads,
         device=rt.device,
@@ -479,13 +488,19 @@ def replay_poses(
     return found
 
 
+def _tell(progress: Progress, name: str, estimate: Estimate) -> None:
+    """Say what a search will take, where it is more than a moment."""
+    if estimate.seconds > 1.0:
+        progress(f"path search {name}: {estimate}")
+
+
 def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
     """Refuse what a tower that moves cannot be replayed with.
 
     Raises
     ------
     UsageError
-        Engine sionna; ``rt.relevance_db``.
+        Engine sionna; ``rt.relevance_db``; ``rt.power_cut_db``.
     """
     if engine != "image":
         raise UsageError(
@@ -498,6 +513,12 @@ def _check_moving(rt: RtSettings, engine: Engine, name: str) -> None:
             f"rt.relevance_db with towers.{name}, which moves",
             expected="a tower that stands still, or no rt.relevance_db",
             cause="which buildings matter is told for one place of the tower",
+        )
+    if rt.power_cut_db is not None:
+        raise UsageError(
+            f"rt.power_cut_db with towers.{name}, which moves",
+            expected="a tower that stands still, or no rt.power_cut_db",
+            cause="what the cut costs is checked for one place of the tower",
         )
 
 

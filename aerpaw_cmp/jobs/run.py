@@ -245,7 +245,7 @@ def run_report(
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
-            refuse_changed(same_inputs, record)
+            refuse_changed(same_inputs, record.inputs)
         if target is not None:
             target.write(sealed(recommended_text(load_flight(flight), found.ladder, flight.name)))
         with output.filling() as place:

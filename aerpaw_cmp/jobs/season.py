@@ -40,7 +40,7 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     data = dataclasses.replace(data, rss=tuple(rows))
     if not rows:
         return dataclasses.replace(data, season=Season(reports=dict(reports or {})))
-    started = started_of(data)
+    started = started_of(rows)
     order = sorted(data.flights, key=lambda name: (name not in started, started.get(name, 0)))
     links = list(dict.fromkeys(row.link for row in rows))
     ranking = rank_settings(rows, list(data.settings), order, "")
@@ -60,10 +60,10 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
     )
 
 
-def started_of(data: CampaignData) -> dict[str, int]:
+def started_of(rows: Iterable[RssRow]) -> dict[str, int]:
     """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
     found: dict[str, int] = {}
-    for row in data.rss:
+    for row in rows:
         if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
             found[row.flight] = min(row.start_ns, found.get(row.flight, row.start_ns))
     return found

@@ -90,7 +90,7 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
     if replayed.track is not None and any(p.name != "iso" for p in link.uav_array.patterns):
         for mode, name in (("logged", "logged attitude"), ("level", "heading only"), ("ignored", "attitude ignored")):
             if mode != rt.attitude:
-                rotation = attitude_rotation(replayed.track, mode)[replayed.valid]
+                rotation = attitude_rotation(replayed.track, mode)
                 changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
     found = {
         name: level_dbm(other, evaluate(site, replayed, loss, link=other, poses=poses), field)

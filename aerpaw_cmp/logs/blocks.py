@@ -17,18 +17,24 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from ..common.errors import InputError
-from ..common.units import AnyArray
+from ..common.units import AnyArray, IntArray
 from .readers import InBlocks, Reader, ReadOptions
 from .records import Attribute, ReadResult, RejectedLine, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
 
-BLOCK_BYTES = 12 << 20
+BLOCK_BYTES = 4 << 20
 FROM_BYTES = 24 << 20
 """Smaller files are read in one piece."""
 _CHUNK = 4 << 20
+_AT_ONCE = 1 << 20
+"""Rows that a step over a whole column takes at a time: what it needs beside the column stays small."""
+_DOUBLING = 1 << 22
+"""Rows up to which a column doubles its room; above, it grows by a sixteenth, in place."""
 _MOST_RATIO = 1100
 """Deflate makes a file at most 1032 times smaller."""
 _SUMMED = re.compile(
@@ -98,9 +104,11 @@ def by_lines(
     def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
         gathered = Gathered()
         top_of = None if head is None else lambda data: head(data, options)
+        before: tuple[bytes, ReadResult | None] = b"", None
         for front, data in _blocks(_unmarked(chunks), apart, top_of, keep):
-            before = read(front, options) if front else None
-            gathered.add(read(front + data, options), before)
+            if front != before[0]:
+                before = front, read(front, options)
+            gathered.add(read(data, options), before[1])
         result = gathered.result()
         return result if settle is None else settle(result)
 
@@ -153,10 +161,10 @@ def _blocks(
     head: Callable[[bytes], int] | None,
     keep: Sequence[re.Pattern[bytes]],
 ) -> Iterator[tuple[bytes, bytes]]:
-    """Blocks of whole lines, each behind the lines from before that it needs."""
+    """Blocks of whole lines behind the lines from before that they need: these, and both as one piece."""
     parts: list[bytes] = []
     size, enough = 0, BLOCK_BYTES
-    top, kept, last = b"", [b""] * len(keep), b""
+    top, kept, front = b"", [b""] * len(keep), b""
     begun = False
     for chunk in chunks:
         parts.append(chunk)
@@ -165,36 +173,38 @@ def _blocks(
             continue
         data = b"".join(parts)
         cut = _cut(data, apart)
-        if not begun and head is not None and cut is not None and head(data) > cut:
+        if cut is not None and (cut <= len(front) or (not begun and head is not None and head(data) > cut)):
             cut = None
         if cut is None:  # one run of suppressed samples, or one line: more is needed
             parts, size, enough = [data], len(data), 2 * size
             continue
-        yield _front(top, kept, last), data[:cut]
+        yield front, data[:cut]
         if not begun and head is not None:
             top = data[: head(data)]
-        kept = [_last_line(pattern, data, cut) or line for pattern, line in zip(keep, kept, strict=True)]
+        kept = [_last_line(p, data, len(front), cut) or line for p, line in zip(keep, kept, strict=True)]
         last = data[data.rfind(b"\n", 0, cut - 1) + 1 : cut] if apart is not None else b""
-        begun, parts, size, enough = True, [data[cut:]], len(data) - cut, BLOCK_BYTES
+        front = _front(top, kept, last)
+        begun, parts, size, enough = True, [front, data[cut:]], len(data) - cut, BLOCK_BYTES
     data = b"".join(parts)
-    if data or not begun:
-        yield _front(top, kept, last), data
+    if len(data) > len(front) or not begun:
+        yield front, data
 
 
 def _front(top: bytes, kept: Sequence[bytes], last: bytes) -> bytes:
     return b"".join([top, *dict.fromkeys(kept), last])
 
 
-def _last_line(pattern: re.Pattern[bytes], data: bytes, end: int) -> bytes:
-    """The last line that the pattern finds, none as empty bytes; looked for from the end."""
+def _last_line(pattern: re.Pattern[bytes], data: bytes, start: int, end: int) -> bytes:
+    """The last line between two places that the pattern finds, none as empty bytes; looked for from the end."""
     window = 1 << 16
     while True:
-        begin = data.rfind(b"\n", 0, max(end - window, 0)) + 1 if end > window else 0
+        begin = data.rfind(b"\n", start, max(end - window, start)) + 1 if end - start > window else start
+        begin = max(begin, start)
         places = [found.start() for found in pattern.finditer(data, begin, end)]
         if places:
             first = data.rfind(b"\n", 0, places[-1]) + 1
             return data[first : data.find(b"\n", first) + 1]
-        if begin == 0:
+        if begin == start:
             return b""
         window *= 8
 
@@ -224,7 +234,7 @@ class Gathered:
         self.rejected: list[RejectedLine] = []
         self.warnings = _Warnings()
         self.order: list[tuple[str, str]] = []
-        self.parts: dict[tuple[str, str], list[dict[str, AnyArray]]] = {}
+        self.records: dict[tuple[str, str], _Records] = {}
         self.attributes: dict[tuple[str, str], dict[str, Attribute]] = {}
 
     def add(self, result: ReadResult, before: ReadResult | None) -> None:
@@ -252,24 +262,21 @@ class Gathered:
         added = []
         for stream in result.streams:
             key = (stream.kind, stream.name)
-            frame = stream.frame
-            if front:
-                frame = frame[frame["line"].to_numpy() > front]
-            if len(frame):
+            columns = _behind(stream.frame, front)
+            if len(columns["line"]):
                 added.append(key)
-                columns = {name: frame[name].to_numpy(copy=True) for name in frame.columns}  # each alone can be freed
-                columns["line"] += shift
-                self.parts.setdefault(key, []).append(columns)
+                columns["line"] = columns["line"] + shift
+                self.records.setdefault(key, _Records()).extend(columns)
                 self.attributes[key] = _joined(self.attributes.get(key), stream.attributes)
         self.order = in_order(self.order, added)
 
     def result(self) -> ReadResult:
-        """All blocks as one result; parts are freed column by column."""
+        """All blocks as one result."""
         streams = []
         for key in self.order:
-            frame = _concatenated(self.parts.pop(key))
+            frame = self.records.pop(key).frame()
             streams.append(Stream(key[0], key[1], frame, self.attributes[key]))  # type: ignore[arg-type]
-        back = _steps_back(streams[0].frame) if streams else 0
+        back = steps_back(streams[0].frame["time"].to_numpy()) if streams else 0
         return ReadResult(
             self.reader,
             tuple(streams),
@@ -314,30 +321,121 @@ def _joined(known: dict[str, Attribute] | None, more: Any) -> dict[str, Attribut
     return made
 
 
-def _concatenated(parts: list[dict[str, AnyArray]]) -> pd.DataFrame:
-    """Columns one behind the other, at most one of them held twice; a column that one part lacks is NaN there."""
-    import numpy as np
-    import pandas as pd
+class _Column:
+    """A column that grows: its values are held once, as the system moves the pages of a large array, not its bytes."""
 
-    names: list[str] = []
-    for part in parts:
-        names = in_order(names, list(part)) if list(part) != names else names
-    lengths = [len(part["line"]) for part in parts]
-    content: dict[str, Any] = {}
-    for name in names:
-        pieces = [part.pop(name, None) for part in parts]
-        joined = np.concatenate(
-            [np.full(n, np.nan) if piece is None else piece for n, piece in zip(lengths, pieces, strict=True)]
-        )
-        content[name] = pd.Series(joined, dtype=object, copy=False) if joined.dtype == object else joined
-    made: pd.DataFrame = pd.DataFrame(content, copy=False)
-    return made
+    def __init__(self, dtype: Any) -> None:
+        self.values: AnyArray = np.empty(0, dtype=dtype)
+        self.count = 0
+
+    def extend(self, piece: AnyArray) -> None:
+        """Values behind those that are there; the type becomes one that holds both."""
+        dtype = np.result_type(self.values.dtype, piece.dtype)
+        if dtype != self.values.dtype:
+            self.values = self.values.astype(dtype)
+        end = self.count + len(piece)
+        if end > len(self.values):
+            self._grow(end)
+        self.values[self.count : end] = piece
+        self.count = end
+
+    def _grow(self, need: int) -> None:
+        if need > _DOUBLING:
+            self.values.resize(need + need // 16, refcheck=False)
+            return
+        wider = np.empty(max(need, min(2 * len(self.values), _DOUBLING)), dtype=self.values.dtype)
+        wider[: self.count] = self.values[: self.count]
+        self.values = wider
+
+    def array(self) -> AnyArray:
+        """The column; it takes no more values."""
+        self.values.resize(self.count, refcheck=False)
+        return self.values
 
 
-def _steps_back(frame: pd.DataFrame) -> int:
-    import numpy as np
+class _Flags(_Column):
+    """Flags as small numbers of their few texts; the same text is one object in the end."""
 
-    return int((np.diff(frame["time"].to_numpy().astype(np.int64)) < 0).sum())
+    def __init__(self, dtype: Any = np.uint8) -> None:
+        super().__init__(dtype)
+        self.texts = {"": 0}
+
+    def extend(self, piece: AnyArray) -> None:
+        """Numbers of the texts behind those that are there."""
+        import pandas as pd
+
+        codes = np.zeros(len(piece), dtype=np.uint8)
+        if piece.tolist().count("") < len(piece):  # the quickest look at objects
+            marked = np.flatnonzero(piece != "")
+            place, found = pd.factorize(piece[marked])
+            number = np.array([self.texts.setdefault(text, len(self.texts)) for text in found])
+            codes = codes.astype(np.min_scalar_type(len(self.texts)))
+            codes[marked] = number[place]
+        super().extend(codes)
+
+    def array(self) -> AnyArray:
+        """The column of texts."""
+        texts = np.array(list(self.texts), dtype=object)
+        made = np.empty(self.count, dtype=object)
+        for first in range(0, self.count, _AT_ONCE):
+            made[first : first + _AT_ONCE] = texts[self.values[first : min(first + _AT_ONCE, self.count)]]
+        return made
+
+
+class _Records:
+    """The records of a stream, block behind block; a column that a block lacks is NaN there."""
+
+    def __init__(self) -> None:
+        self.columns: dict[str, _Column] = {}
+        self.count = 0
+
+    def extend(self, more: dict[str, AnyArray]) -> None:
+        """Those of the next block."""
+        if list(self.columns) != list(more):
+            names = in_order(list(self.columns), list(more))
+            self.columns = {name: self.columns.get(name) or self._new(name, more[name].dtype) for name in names}
+        length = len(more["line"])
+        for name, column in self.columns.items():
+            column.extend(more[name] if name in more else np.full(length, np.nan))
+        self.count += length
+
+    def _new(self, name: str, dtype: Any) -> _Column:
+        column = _Flags() if name == "flag" else _Column(dtype)
+        if self.count:
+            column.extend(np.full(self.count, np.nan))
+        return column
+
+    def frame(self) -> pd.DataFrame:
+        """All of them, each column an array of its own."""
+        import pandas as pd
+
+        content: dict[str, Any] = {}
+        for name in list(self.columns):
+            values = self.columns.pop(name).array()
+            content[name] = pd.Series(values, dtype=object, copy=False) if values.dtype == object else values
+        made: pd.DataFrame = pd.DataFrame(content, copy=False)
+        return made
+
+
+def _behind(frame: pd.DataFrame, front: int) -> dict[str, AnyArray]:
+    """Columns of the records whose lines lie behind the first ``front``."""
+    columns = {str(name): frame[name].to_numpy() for name in frame.columns}
+    if not front:
+        return columns
+    mine = columns["line"] > front
+    first = len(mine) - int(np.count_nonzero(mine))
+    keep: Any = slice(first, None) if mine[first:].all() else mine
+    return {name: column[keep] for name, column in columns.items()}
+
+
+def steps_back(time: AnyArray) -> int:
+    """How often the instants (n,) of a log step back."""
+    stamp: IntArray = np.asarray(time, dtype="datetime64[ns]").view(np.int64)
+    steps = 0
+    for first in range(0, len(stamp) - 1, _AT_ONCE):
+        piece = stamp[first : first + _AT_ONCE + 1]
+        steps += int(np.count_nonzero(piece[1:] < piece[:-1]))
+    return steps
 
 
 class _Warnings:

@@ -15,7 +15,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pandas as pd
 
-from ..common.units import AnyArray, BoolArray
+from ..common.units import AnyArray, BoolArray, IntArray
 from .records import ReadResult, Stream
 
 
@@ -128,7 +128,8 @@ def _apply(stream: Stream, frame: pd.DataFrame, limit: Limit, warnings: list[str
         if name not in names:
             continue
         value = frame[name].to_numpy(dtype=np.float64)
-        if not len(value) or (low <= np.fmin.reduce(value) and np.fmax.reduce(value) <= high):
+        least = np.fmin.reduce(value) if len(value) else np.nan
+        if np.isnan(least) or (low <= least and np.fmax.reduce(value) <= high):
             continue
         beyond = (value < low) | (value > high)
         if beyond.any() and (first is None or int(np.argmax(beyond)) < first[0]):
@@ -174,7 +175,9 @@ def _within_ports(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
 
 def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> pd.DataFrame:
     """Flag a few stamps that lie days from all the others."""
-    stamp = frame["time"].to_numpy("datetime64[ns]").astype(np.int64)
+    stamp: IntArray = frame["time"].to_numpy("datetime64[ns]").view(np.int64)
+    if len(stamp) < 2 or _one_run(stamp):
+        return frame
     timed = ~np.isnat(frame["time"].to_numpy("datetime64[ns]"))
     if timed.sum() < 2 or float(stamp[timed].max()) - float(stamp[timed].min()) <= APART_S * 1e9:
         return frame
@@ -196,6 +199,21 @@ def _near_in_time(stream: Stream, frame: pd.DataFrame, warnings: list[str]) -> p
     return _marked(frame, bad, "time_out_of_range", [])
 
 
+def _one_run(stamp: IntArray) -> bool:
+    """Whether all stamps [ns] lie within a day, or follow each other at less; nothing beside them is held."""
+    low, high = int(stamp.min()), int(stamp.max())
+    if low == np.iinfo(np.int64).min:  # a record without a time
+        return False
+    if high - low <= APART_S * 1e9:
+        return True
+    step = 1 << 20
+    for first in range(0, len(stamp) - 1, step):
+        part = np.diff(stamp[first : first + step + 1].astype(np.float64))
+        if part.min() < 0 or part.max() > APART_S * 1e9:
+            return False
+    return True
+
+
 def _sentence(stream: Stream, count: int, flag: str, text: str) -> str:
     rows = "1 row is" if count == 1 else f"{count} rows are"
     return f"{stream.kind} {stream.name!r}: {rows} flagged {flag}; {text}"
@@ -206,7 +224,7 @@ def _marked(frame: pd.DataFrame, bad: BoolArray, flag: str, void: list[str]) -> 
     for i in np.flatnonzero(bad):
         words = str(column[i]).split(";") if column[i] else []
         column[i] = ";".join([*words, flag] if flag not in words else words)
-    out: pd.DataFrame = frame.copy()
+    out: pd.DataFrame = frame.copy(deep=False)  # what is marked gets new columns
     out["flag"] = pd.Series(column, index=frame.index, dtype=object)
     for name in void:
         out[name] = np.where(bad, np.nan, frame[name].to_numpy(dtype=np.float64))

@@ -49,13 +49,13 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     streams = tuple(_stream(part) for part in parts.values())
     warnings = dict.fromkeys(text for file in group for text in file.result.warnings)
     result = ReadResult(
-        group[0].result.reader,
-        streams,
-        before,
-        sum(file.result.accepted for file in group),
-        sum(file.result.blank for file in group),
-        tuple(rejected),
-        (f"{len(group)} files of this folder were joined", *warnings),
+        reader=group[0].result.reader,
+        streams=streams,
+        lines=before,
+        accepted=sum(file.result.accepted for file in group),
+        blank=sum(file.result.blank for file in group),
+        rejected=tuple(rejected),
+        warnings=(f"{len(group)} files of this folder were joined", *warnings),
     )
     return IngestedFile(folder, digest, result)
 

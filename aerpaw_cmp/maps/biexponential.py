@@ -165,7 +165,15 @@ class _Projection:
         low, high, total = bounds
         if not (0 < slow < fast and low < high and total > max(2 * low, low)):
             raise UsageError(f"bounds {bounds} and {rate_bounds_per_m}", expected="bounds that leave room, rates > 0")
-        return cls(d, y, np.sqrt(w / w.mean()), low, high, total, (float(np.log(slow)), float(np.log(fast))))
+        return cls(
+            d=d,
+            y=y,
+            root_weight=np.sqrt(w / w.mean()),
+            low=low,
+            high=high,
+            total=total,
+            log_rates=(float(np.log(slow)), float(np.log(fast))),
+        )
 
     def amplitudes(self, log_rates: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Best bounded amplitudes (..., 2) and weighted residuals (..., n) for logarithms of rates (..., 2)."""

@@ -151,7 +151,16 @@ def _levels(book: Any, maps: Mapping[str, MapResult]) -> None:
         ("rss_mimo", "received level, arrays at both ends", lambda m: m.rss_mimo_dbm),
     )
     for name, meaning, part in kinds:
-        _write(book, maps, name, ("tower", "height"), meaning, DBM, "dBm", part)
+        _write(
+            book=book,
+            maps=maps,
+            name=name,
+            between=("tower", "height"),
+            meaning=meaning,
+            unit=DBM,
+            shown="dBm",
+            part=part,
+        )
 
 
 def _ranks(book: Any, maps: Mapping[str, MapResult]) -> None:
@@ -161,7 +170,16 @@ def _ranks(book: Any, maps: Mapping[str, MapResult]) -> None:
     )
     for name, meaning, part in kinds:
         said = f"{meaning}, at most {RATIO_LIMIT_DB:g} dB"
-        _write(book, maps, name, ("tower", "height_of_rank"), said, DB, "dB", _limited(part))
+        _write(
+            book=book,
+            maps=maps,
+            name=name,
+            between=("tower", "height_of_rank"),
+            meaning=said,
+            unit=DB,
+            shown="dB",
+            part=_limited(part),
+        )
     meanings = ("out_of_coverage", *(f"rank_{i}" for i in range(1, HIGHEST_RANK + 1)))
     for joint in (False, True):
         by_tower = () if joint else ("tower",)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -150,6 +151,7 @@ def audit(
     expected: Expected | None = None,
     reference_links: int = REFERENCE_LINKS,
     complete: bool = True,
+    power_cut_db: float | None = None,
 ) -> Audit:
     """Check a replay by another engine, on the whole scene (nothing left out).
 
@@ -173,11 +175,15 @@ def audit(
         Poses that the second implementation computes.
     complete : bool
         Whether the replay claims to have every path.
+    power_cut_db : float, optional
+        As given to the replay: the other engine leaves the same paths out, and none is claimed to be complete.
 
     Returns
     -------
     Audit
     """
+    complete = complete and power_cut_db is None
+    cut: dict[str, Any] = {"power_cut_db": power_cut_db, "check_power_cut": False}
     replay = replay.of_reflections()  # the others have no second implementation: they are listed apart
     chosen = _spread(poses, None if links is None else -(-links // max(1, len(replay.towers))))
     other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
@@ -193,6 +199,7 @@ def audit(
         loss=loss,
         crowns=crowns,
         cache_dir=cache_dir,
+        **cut,
     )
     rays = checked.samples or (FIELD_SAMPLES if samples == "auto" else samples)
     field = None
@@ -203,7 +210,9 @@ def audit(
             field = against_reference(
                 site, poses, replay, few_kinds, expected, ks=ks, max_depth=max_depth, complete=complete
             )
-        field += per_pair(site, link, poses, replay, chosen, ks=ks, max_depth=max_depth, loss=loss, crowns=crowns)
+        field += per_pair(
+            site, link, poses, replay, chosen, ks=ks, max_depth=max_depth, loss=loss, crowns=crowns, **cut
+        )
         if site.scene is None:
             field += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
         field += against_sionna(

@@ -10,6 +10,7 @@ import numpy as np
 from numba import njit
 
 from ..common.units import FloatArray
+from .numba_options import OPTIONS
 from .surfaces import BoxTree
 
 DEEPEST = 64
@@ -29,7 +30,7 @@ def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
     return BoxTree(*_build(lower, upper, leaf))
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     n = len(lower)
     most = max(1, 2 * n)
@@ -82,7 +83,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many.
 
@@ -122,8 +123,8 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
+@njit(**OPTIONS)
+def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
@@ -135,6 +136,8 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
         Normals pointing inwards, and offsets [m].
     many : int
         How many of them count.
+    reach : (10,)
+        A point, the corners of a box, and the longest way from the one to the other over a box that counts [m].
     found : (items,) int
         Gets the items; has room for all of the tree.
 
@@ -152,6 +155,8 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
         node = todo[waiting]
         if box_outside(lower, upper, node, planes, many):
             continue
+        if np.isfinite(reach[9]) and way_over_box(lower, upper, node, reach) > reach[9]:
+            continue
         if child[node] >= 0:
             todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
             waiting += 2
@@ -162,7 +167,34 @@ def within_planes(tree, planes, many, found):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
+def way_over_box(lower, upper, node, reach):  # type: ignore[no-untyped-def]
+    """Shortest way [m] from a point to a box of a tree and on to another box; less where only a bound is known.
+
+    Parameters
+    ----------
+    lower, upper : (nodes, 3)
+        Corners of the boxes of a tree [m].
+    node : int
+        Which box.
+    reach : (10,)
+        As for :func:`within_planes`.
+
+    Returns
+    -------
+    float
+    """
+    to2 = on2 = 0.0
+    for axis in range(3):
+        low, high = lower[node, axis], upper[node, axis]
+        to = max(low - reach[axis], reach[axis] - high, 0.0)
+        on = max(low - reach[6 + axis], reach[3 + axis] - high, 0.0)
+        to2 += to * to
+        on2 += on * on
+    return np.sqrt(to2) + np.sqrt(on2)
+
+
+@njit(**OPTIONS)
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
     """Whether a box lies wholly outside one of the planes.
 
@@ -193,7 +225,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
     """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
 

@@ -110,7 +110,7 @@ def channel_matrices(
     if kernels is not None:
         from .compiled_field import evaluate
 
-        tables = _Materials.of(faces, link.carrier_hz)
+        tables = FaceMaterials.of(faces, link.carrier_hz)
         electric = (tables.permittivity, tables.thickness_m)
         h, path_power = evaluate(kernels, paths, faces, electric, sources_m, poses, link, loss_db, threads, device)
     else:
@@ -128,10 +128,10 @@ def _in_numpy(
     ports, uav = len(arrays[0]), len(link.uav_array)
     h = np.zeros((len(poses) * len(arrays), uav, ports), dtype=np.complex128)
     path_power = np.zeros(len(paths))
-    tables = _Materials.of(faces, link.carrier_hz)
+    tables = FaceMaterials.of(faces, link.carrier_hz)
     # a stable order by tower gives each chunk one tower array; additions go to rows, whose order does not matter
     for rows, tower in _chunks(paths, len(arrays), uav * ports):
-        one = _chunk_field(paths, rows, faces, tables, sources_m[tower], arrays[tower], poses, link)
+        one = chunk_field(paths, rows, faces, tables, sources_m[tower], arrays[tower], poses, link)
         if loss_db is not None:
             one *= amplitude_from_db(-loss_db[rows])[:, None, None]
         path_power[rows] = (one.real**2 + one.imag**2).mean(axis=(1, 2))
@@ -171,21 +171,41 @@ def _chunks(paths: PathSet, towers: int, pairs: int) -> Iterator[tuple[IntArray,
             yield rows[start : start + step], tower
 
 
-def _chunk_field(
+def chunk_field(
     paths: PathSet,
     rows: IntArray,
     faces: Faces,
-    tables: _Materials,
+    tables: FaceMaterials,
     source_m: FloatArray,
     array: Array,
     poses: Poses,
     link: Link,
     record: Callable[[str, AnyArray], None] | None = None,
 ) -> ComplexArray:
-    """Complex amplitude (rows, uav elements, tower elements) of some paths of one tower.
+    """Complex amplitudes of some paths of one tower.
 
-    ``record`` is told what it is made of: "wave" (3, rows, uav elements, tower elements) after the tower and after each
-    reflection, "spreading", and "uav", the field vectors of the UAV's elements.
+    Parameters
+    ----------
+    paths : PathSet
+    rows : (rows,) int
+        Which of them.
+    faces : Faces
+    tables : FaceMaterials
+        Of the faces, at the carrier of the link.
+    source_m : (3,)
+        Centre of the tower's array [m].
+    array : Array
+        Of the tower.
+    poses : Poses
+    link : Link
+    record : callable, optional
+        Gets what it is made of: "wave" (3, rows, uav elements, tower elements) after the tower and after each
+        reflection, "spreading", and "uav", the field vectors of the UAV's elements.
+
+    Returns
+    -------
+    (rows, uav elements, tower elements) complex
+        Spreading, patterns, reflections and carrier phase: what a path adds to H.
     """
     depth = int(paths.depth[rows].max(initial=0))
     wavelength = wavelength_m(link.carrier_hz)
@@ -299,7 +319,7 @@ def _reflect(
     direction: FloatArray,
     normal: FloatArray,
     index: IntArray,
-    tables: _Materials,
+    tables: FaceMaterials,
     wavelength: float,
 ) -> ComplexArray:
     """The wave after one reflection; paths whose ``index`` is -1 keep theirs.
@@ -365,14 +385,15 @@ def reflection_coefficients(
 
 
 @dataclass(frozen=True, slots=True)
-class _Materials:
+class FaceMaterials:
     """Permittivity and thickness per face; the entry at -1 is a harmless one for paths without a face."""
 
     permittivity: ComplexArray
     thickness_m: FloatArray
 
     @classmethod
-    def of(cls, faces: Faces, carrier_hz: float) -> _Materials:
+    def of(cls, faces: Faces, carrier_hz: float) -> FaceMaterials:
+        """Those of all faces at a carrier."""
         known = {name: face_material(name) for name in set(faces.material)}
         eta = [known[name].relative_permittivity(carrier_hz) for name in faces.material]
         thick = [known[name].thickness_m for name in faces.material]

@@ -62,17 +62,24 @@ def search_kernels_for(work: int) -> ModuleType | None:
     return _chosen("search_kernels", work)
 
 
+def beams() -> State:
+    """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.growth`), or why it cannot run."""
+    if switch() == "never":
+        return State(None, f"{SWITCH}=never")
+    return load("growth")
+
+
 def _chosen(name: str, work: int) -> ModuleType | None:
     chosen = switch()
     if chosen == "never" or (chosen == "auto" and work < ENOUGH_WORK):
         return None
     state = load(name)
     if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
-        _warn_once(state.reason)
+        warn_once(state.reason)
     return state.kernels
 
 
-@lru_cache(maxsize=2)
+@lru_cache(maxsize=4)
 def load(name: str) -> State:
     """Import kernels and try them; whatever goes wrong there is a reason to do without, not an error.
 
@@ -93,7 +100,8 @@ def load(name: str) -> State:
 
 
 @lru_cache(maxsize=1)
-def _warn_once(reason: str) -> None:
+def warn_once(reason: str) -> None:
+    """Say why compiled code is not there."""
     warnings.warn(f"{reason}: the replay runs in NumPy, some ten times slower", RuntimeWarning, stacklevel=4)
 
 

@@ -23,7 +23,7 @@ from ..common.units import (
     wavelength_m,
 )
 from .arrays import Link, Poses
-from .channel import _chunk_field, _Materials, reflection_coefficients
+from .channel import FaceMaterials, chunk_field, reflection_coefficients
 from .image import images_of, scene_tolerance_m, trace_back
 from .obstacles import first_obstacle, why_not_there
 from .paths import Faces, PathSet
@@ -127,8 +127,8 @@ def explain_paths(
     for row in rows:
         seen.clear()
         one = paths.select(np.array([row]))
-        tables = _Materials.of(faces, link.carrier_hz)
-        field = _chunk_field(
+        tables = FaceMaterials.of(faces, link.carrier_hz)
+        field = chunk_field(
             one, np.zeros(1, np.int64), faces, tables, source_m, array, poses, link, lambda *step: seen.append(step)
         )
         further = {name: float(loss[row]) for name, loss in further_db.items()}
@@ -191,7 +191,7 @@ def _explained(
 
 def _bounce(faces: Faces, face: int, point: FloatArray, leg: FloatArray, link: Link, loss_db: float) -> Bounce:
     cosine = float(abs(faces.normal[face] @ leg) / np.linalg.norm(leg))
-    tables = _Materials.of(faces, link.carrier_hz)
+    tables = FaceMaterials.of(faces, link.carrier_hz)
     te, tm = reflection_coefficients(
         np.array(cosine), tables.permittivity[face], tables.thickness_m[face], wavelength_m(link.carrier_hz)
     )

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +22,10 @@ from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .boxtree import box_missed, box_outside, box_tree, within_planes
 from .compiled import in_threads, thread_count
+from .effort import Effort, Estimate, OnEstimate
 from .image import MINIMUM_LENGTH_M, merge
 from .merging import WINDOW
+from .numba_options import OPTIONS
 from .paths import PathSet
 from .surfaces import Surfaces
 
@@ -77,33 +78,7 @@ class _Rules(NamedTuple):
     margin: float
     side: float
     beams: bool
-    longest: float
     shadows: bool
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Effort:
-    """What a search took.
-
-    Parameters
-    ----------
-    sequences : int
-        Sequences of at least one face that were followed.
-    candidates : int
-        Paths before anything was asked to hide them.
-    hidden : int
-        First faces in the shadow of one convex face, over all sources.
-    seconds : float
-        Wall clock.
-    estimate_s : float
-        What was expected after the first faces.
-    """
-
-    sequences: int = 0
-    candidates: int = 0
-    hidden: int = 0
-    seconds: float = 0.0
-    estimate_s: float = 0.0
 
 
 def grow_paths(
@@ -116,10 +91,10 @@ def grow_paths(
     excluded: BoolArray | None = None,
     beams: bool = True,
     shadows: bool = True,
-    longest_m: float = np.inf,
+    longest_m: float | FloatArray = np.inf,
     threads: int | None = None,
     progress: Progress | None = None,
-    on_estimate: Callable[[str, float], None] | None = None,
+    on_estimate: OnEstimate | None = None,
     solids: bool = False,
 ) -> tuple[PathSet, Effort]:
     """All paths with at most ``max_depth`` reflections.
@@ -140,14 +115,14 @@ def grow_paths(
         False follows every sequence of faces: the same paths, for tests.
     shadows : bool
         False follows first faces that one convex face hides wholly, too.
-    longest_m : float
-        Leave out paths longer than this [m]: the power cut.
+    longest_m : float or (towers, poses)
+        Leave out paths longer than this [m]: the power cut. Faces over which no path is short enough are not followed.
     threads : int, optional
         Default: the cores that this process may use.
     progress : callable, optional
         Called with the share done.
     on_estimate : callable, optional
-        Called once, after the first faces, with the estimate of time and memory in words and its seconds.
+        Called once, before the first source is searched, with the estimate of time and memory.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
         all. What is found are candidates for :mod:`aerpaw_cmp.propagation.prisms`, coincident ones among them.
@@ -164,18 +139,15 @@ def grow_paths(
     found: list[PathSet] = []
     effort = Effort()
     margin = SOLID_MARGIN if solids else 0.0
-    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, margin, SIDE_M, beams, float(longest_m), shadows)
+    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, margin, SIDE_M, beams, shadows)
+    longest = np.broadcast_to(np.asarray(longest_m, dtype=np.float64), (len(sources_m), len(targets_m)))
     for tower, source in enumerate(sources_m):
-        gap = np.linalg.norm(targets_m - source, axis=1)
-        alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
-        if excluded is not None:
-            alive &= ~excluded[tower]
-        poses = np.flatnonzero(alive)
+        poses = _searched(source, targets_m, None if excluded is None else excluded[tower])
         if not len(poses):
             continue
         front_only = np.full(len(surfaces), solids)
         mirrors = _mirrors(surfaces, None if usable is None else usable[tower], front_only)
-        one = _Search(mirrors, surfaces, np.ascontiguousarray(source), targets_m[poses], rules)
+        one = _Search(mirrors, surfaces, source, targets_m[poses], longest[tower, poses], rules)
         found.append(_pad(one.direct(), poses, tower, max_depth))
         if max_depth:
             first, hidden = one.first_faces()
@@ -184,7 +156,10 @@ def grow_paths(
                 if progress:
                     progress((tower + done) / len(sources_m))
 
-            parts, spent = one.run(first, thread_count(threads), share, on_estimate if tower == 0 else None)
+            if on_estimate:
+                on_estimate(one.estimate(first, thread_count(threads)).times(len(sources_m) - tower))
+                on_estimate = None
+            parts, spent = one.run(first, thread_count(threads), share)
             found += [_pad(part, poses, tower, max_depth) for part in parts]
             effort = Effort(
                 sequences=effort.sequences + spent.sequences,
@@ -203,6 +178,58 @@ def grow_paths(
         seconds=time.perf_counter() - started,
         estimate_s=effort.estimate_s,
     )
+
+
+def _searched(source: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> IntArray:
+    """Poses that may have paths from a source."""
+    gap = np.linalg.norm(targets_m - source, axis=1)
+    alive = np.isfinite(gap) & (gap >= MINIMUM_LENGTH_M)
+    return np.flatnonzero(alive if excluded is None else alive & ~excluded)
+
+
+def estimate(
+    surfaces: Surfaces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    max_depth: int = 2,
+    usable: BoolArray | None = None,
+    excluded: BoolArray | None = None,
+    longest_m: float | FloatArray = np.inf,
+    threads: int | None = None,
+    solids: bool = False,
+) -> Estimate | None:
+    """What :func:`grow_paths` would take, from the first 64 faces of the first source; None where nothing is searched.
+
+    Parameters are those of :func:`grow_paths`.
+
+    Parameters
+    ----------
+    surfaces : Surfaces
+    sources_m, targets_m : (towers, 3), (poses, 3)
+    max_depth : int
+    usable : (towers, faces) bool, optional
+    excluded : (towers, poses) bool, optional
+    longest_m : float or (towers, poses)
+    threads : int, optional
+    solids : bool
+
+    Returns
+    -------
+    Estimate or None
+    """
+    rules = _Rules(
+        max_depth, 2.0 * surfaces.merge_m, END_M, SOLID_MARGIN if solids else 0.0, SIDE_M, beams=True, shadows=True
+    )
+    longest = np.broadcast_to(np.asarray(longest_m, dtype=np.float64), (len(sources_m), len(targets_m)))
+    for tower, source in enumerate(sources_m):
+        poses = _searched(source, targets_m, None if excluded is None else excluded[tower])
+        if not len(poses) or not max_depth:
+            continue
+        mirrors = _mirrors(surfaces, None if usable is None else usable[tower], np.full(len(surfaces), solids))
+        one = _Search(mirrors, surfaces, source, targets_m[poses], longest[tower, poses], rules)
+        return one.estimate(one.first_faces()[0], thread_count(threads)).times(len(sources_m) - tower)
+    return None
 
 
 def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray | None = None) -> _Mirrors:
@@ -231,10 +258,17 @@ class _Search:
     """The search of one source."""
 
     def __init__(
-        self, mirrors: _Mirrors, surfaces: Surfaces, source: FloatArray, targets: FloatArray, rules: _Rules
+        self,
+        mirrors: _Mirrors,
+        surfaces: Surfaces,
+        source: FloatArray,
+        targets: FloatArray,
+        longest: FloatArray,
+        rules: _Rules,
     ) -> None:
-        self.mirrors, self.source, self.rules = tuple(mirrors), source, tuple(rules)
+        self.mirrors, self.source, self.rules = tuple(mirrors), np.ascontiguousarray(source), tuple(rules)
         self.targets = np.ascontiguousarray(targets)
+        self.longest, self.window = np.ascontiguousarray(longest), mirrors.window
         self.corners, self.tree = surfaces.corners_m, tuple(surfaces.tree)
         self.face_tree = tuple(surfaces.face_tree)
         self.target_tree = tuple(box_tree(self.targets, self.targets))
@@ -248,52 +282,62 @@ class _Search:
     def first_faces(self) -> tuple[IntArray, int]:
         """First faces worth following, in an order whose beginning is a fair sample; how many hide from the source."""
         good, hidden = _first_faces(self.mirrors, self.face_tree, self.source, self.rules)
+        good &= self._near_enough()
         return np.random.default_rng(0).permutation(np.flatnonzero(good)), int(hidden)
 
-    def run(
-        self, first: IntArray, threads: int, share: Progress, on_estimate: Callable[[str, float], None] | None
-    ) -> tuple[list[_Found], Effort]:
+    def _near_enough(self) -> BoolArray:
+        """Faces over which a path to the box of the targets may be short enough."""
+        outline, longest = self.window, self.longest.max()
+        if not np.isfinite(longest):
+            return np.ones(len(outline), dtype=np.bool_)
+        low, high = outline.min(axis=1), outline.max(axis=1)
+        ways = np.zeros(len(outline))
+        for near, far in ((self.source, self.source), (self.targets.min(axis=0), self.targets.max(axis=0))):
+            ways += np.linalg.norm(np.maximum(np.maximum(low - far, near - high), 0.0), axis=1)
+        return np.asarray(~(ways > longest + SLACK_M))
+
+    def follow(self, some: IntArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
+        """Paths whose first face is one of some, and how many sequences and candidates there were."""
+        return _follow(  # type: ignore[no-any-return]
+            self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree, self.longest,
+            self.source, some, self.rules,
+        )  # fmt: skip
+
+    def estimate(self, first: IntArray, threads: int) -> Estimate:
+        """What it will take to follow the faces ``first``; some of them are tried."""
+        some = first[:FIRST_CHUNK]
+        self.follow(some[:1])  # the first call compiles, or loads what was compiled
+        begun = time.thread_time()  # what others do on this machine is not told beforehand
+        sequences = self.follow(some)[3][0]
+        seconds = time.thread_time() - begun
+        share = len(first) / max(1, len(some))
+        return Estimate(
+            seconds=seconds * share / max(1, threads if len(first) > FIRST_CHUNK else 1),
+            sources=1,
+            first_faces=len(first),
+            sequences=int(sequences * share),
+            memory_mib=memory_mib(self),
+        )
+
+    def run(self, first: IntArray, threads: int, share: Progress) -> tuple[list[_Found], Effort]:
         """Follow all sequences that begin with the faces ``first``."""
         found: list[_Found] = []
         totals = np.zeros(2, np.int64)
-        estimate = 0.0
         begun = time.perf_counter()
-
-        def chunk(some: IntArray) -> tuple[IntArray, IntArray, FloatArray, IntArray]:
-            return _follow(  # type: ignore[no-any-return]
-                self.mirrors, self.face_tree, self.corners, self.tree, self.targets, self.target_tree,
-                self.source, some, self.rules,
-            )  # fmt: skip
-
-        def take(result: tuple[IntArray, IntArray, FloatArray, IntArray]) -> None:
-            pose, faces, points, counts = result
-            depth = (faces >= 0).sum(axis=1)
-            for d in np.unique(depth):
-                rows = depth == d
-                found.append((pose[rows], faces[rows, :d], points[rows, :d]))
-            totals[:] += counts
-
-        done = 0
+        done, estimate = 0, 0.0
         for part, size in _chunks(first, threads):
-            for result in in_threads(chunk, part, threads):
-                take(result)
+            for pose, faces, points, counts in in_threads(self.follow, part, threads):
+                depth = (faces >= 0).sum(axis=1)
+                for d in np.unique(depth):
+                    rows = depth == d
+                    found.append((pose[rows], faces[rows, :d], points[rows, :d]))
+                totals[:] += counts
+            if not done:
+                estimate = (time.perf_counter() - begun) * len(first) / size / max(1, threads)
             done += size
-            if done <= FIRST_CHUNK < len(first):
-                _follow_again = time.perf_counter()  # the first call compiles, or loads what was compiled
-                for some in part:
-                    chunk(some)
-                estimate = (time.perf_counter() - _follow_again) * len(first) / size / max(1, threads)
-                if on_estimate:
-                    on_estimate(
-                        f"about {estimate:.0f} s for each source: {len(first)} first faces, some "
-                        f"{int(totals[0] * len(first) / size)} sequences, streamed in {memory_mib(self):.0f} MiB",
-                        estimate,
-                    )
             share(done / len(first))
         spent = time.perf_counter() - begun
-        return found, Effort(
-            sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate or spent, seconds=spent
-        )
+        return found, Effort(sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate, seconds=spent)
 
 
 def memory_mib(search: _Search) -> float:
@@ -389,7 +433,7 @@ def reflection_points(
 # ---------------------------------------------------------------- compiled
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
     normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
     count, depth = sequence.shape
@@ -425,7 +469,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
     return vertices, good
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
     """Whether a triangle cuts the segment ``a`` - ``b``.
 
@@ -516,7 +560,7 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     none = np.zeros(3)
@@ -525,12 +569,12 @@ def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-d
     return free
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
     return normal[f, 0] * p[0] + normal[f, 1] * p[1] + normal[f, 2] * p[2] - offset[f]
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
     """Which faces may come first (faces,), and how many of the others are hidden by one convex face."""
     normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
@@ -543,14 +587,14 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
         height = _height(normal, offset, f, source)
         if (abs(height) <= rules[4] and rules[3] == 0.0) or (front_only[f] and height < -rules[4]):
             continue
-        if rules[7] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack):
+        if rules[6] and _wholly_hidden(mirrors, face_tree, source, f, rules, stack):
             hidden += 1
             continue
         good[f] = True
     return good, hidden
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
     """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
     _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
@@ -582,7 +626,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     """Whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
 
@@ -610,7 +654,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
     """Whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
     for k in range(WINDOW):
@@ -626,7 +670,7 @@ def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     """Side planes of the beam from ``apex`` through an outline, added behind the first ``count``; how many then."""
     m0 = m1 = m2 = 0.0
@@ -655,7 +699,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     """Whether one plane has the whole outline outside."""
     for p in range(many):
@@ -670,7 +714,7 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
+@njit(**OPTIONS)
 def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
     """Whether a point of the plane of face ``f`` lies in one of its triangles."""
     a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
@@ -691,12 +735,16 @@ def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped
     return False
 
 
-@njit(cache=True, nogil=True, error_model="numpy")
-def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, firsts, rules):  # type: ignore[no-untyped-def]
-    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams."""
+@njit(**OPTIONS)
+def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, source, firsts, rules):  # type: ignore[no-untyped-def]
+    """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
+
+    ``longest`` (targets,) is the length of the longest path that counts. A path from an image over a face to a target
+    is no shorter than the way from the image to the face's box and on to the box of all targets.
+    """
     normal, offset, along, across, window, _, plane, front_only, usable, first, flat = mirrors
     t_lower, t_upper, t_child, t_start, t_count, t_items = target_tree
-    max_depth, side, beams, longest = rules[0], rules[4], rules[5], rules[6]
+    max_depth, side, beams = rules[0], rules[4], rules[5]
     faces_n = len(normal)
     space = 256
     out_pose = np.empty(space, np.int64)
@@ -716,6 +764,9 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
     points = np.zeros((max_depth, 3))
     stack = np.empty(64, np.int64)
     none = np.zeros(3)
+    reach = np.empty(10)
+    reach[3:6], reach[6:9] = t_lower[0], t_upper[0]
+    reach[9] = longest.max()
     next_faces[0, : len(firsts)] = firsts
     waiting[0] = len(firsts)
     level = 0
@@ -795,7 +846,7 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                 point = targets[r]
                 good = True
                 x0, x1, x2 = point[0] - image[0], point[1] - image[1], point[2] - image[2]
-                if x0 * x0 + x1 * x1 + x2 * x2 > longest * longest:
+                if x0 * x0 + x1 * x1 + x2 * x2 > longest[r] * longest[r]:
                     continue
                 for step in range(level, -1, -1):
                     g = chain[step]
@@ -845,10 +896,36 @@ def _follow(mirrors, face_tree, corners, tree, targets, target_tree, source, fir
                     out_points[total, step] = points[step]
                 total += 1
         if level + 1 < max_depth:
-            waiting[level + 1] = within_planes(face_tree, mine, many[level], next_faces[level + 1])
+            reach[:3] = image
+            waiting[level + 1] = within_planes(face_tree, mine, many[level], reach, next_faces[level + 1])
             turn[level + 1] = 0
             level += 1
     return out_pose[:total].copy(), out_faces[:total].copy(), out_points[:total].copy(), counts
 
 
-__all__ = ["Effort", "grow_paths", "reflection_points", "segment_cut", "without_coincident"]
+def try_out() -> None:
+    """Compile, or read what was compiled before, and ask whether a triangle hides one of two points.
+
+    Raises
+    ------
+    RuntimeError
+        If it hides anything else.
+    """
+    triangle = np.array([[[5.0, -9.0, -9.0], [5.0, 9.0, -9.0], [5.0, 0.0, 9.0]]])
+    tree = tuple(box_tree(triangle.min(axis=1), triangle.max(axis=1)))
+    rules = tuple(_Rules(1, 1e-3, END_M, 0.0, SIDE_M, beams=True, shadows=True))
+    free = _direct(triangle, tree, np.zeros(3), np.array([[9.0, 0.0, 0.0], [-9.0, 0.0, 0.0]]), rules)
+    if free.tolist() != [False, True]:
+        raise RuntimeError(f"compiled code sees {free.tolist()} where one of two points is hidden")
+
+
+__all__ = [
+    "Effort",
+    "Estimate",
+    "estimate",
+    "grow_paths",
+    "reflection_points",
+    "segment_cut",
+    "try_out",
+    "without_coincident",
+]

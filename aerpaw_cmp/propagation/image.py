@@ -111,12 +111,15 @@ def find_paths(
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
     alive = _alive(sources_m, targets_m, excluded)
-    ends = _Ends.of(faces, targets_m, np.asarray(alive.any(axis=0)), tolerance_m)
+    of_any = np.asarray(alive.any(axis=0))
+    shared = _Ends.of(faces, targets_m, of_any, tolerance_m)
 
     def sequences(tower: int) -> list[Sequences]:
         usable_faces = np.ones(len(faces), np.bool_) if usable is None else usable[tower]
         if not alive[tower].any():
             return []
+        few = 2 * alive[tower].sum() < of_any.sum()  # a tower with poses of its own
+        ends = _Ends.of(faces, targets_m, alive[tower], tolerance_m) if few else shared
         return Sequences.of(faces, box, facing, sources_m[tower], ends, usable_faces, max_depth, budget, tolerance_m)
 
     found: list[PathSet] = []
@@ -176,7 +179,7 @@ def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
 
 @dataclass(frozen=True, slots=True)
 class _Ends:
-    """What the growth of sequences asks of the targets, of all towers at once: no path is lost by one too many.
+    """What the growth of sequences asks of the targets, of most towers at once: no path is lost by one too many.
 
     Parameters
     ----------

@@ -18,25 +18,13 @@ from __future__ import annotations
 
 import inspect
 import math
-from typing import Any
 
 import numpy as np
 from numba import njit
 
 from ..common.units import FloatArray, IntArray
 from ..site.antennas import HALF_WAVE_DIPOLE_GAIN
-
-
-def _can_keep() -> bool:
-    """Whether compiled code can be kept: beside this file, in the user's cache folder, or in ``NUMBA_CACHE_DIR``."""
-    try:
-        njit(cache=True)(_can_keep)
-    except RuntimeError:  # no folder that can be written
-        return False
-    return True
-
-
-OPTIONS: dict[str, Any] = {"cache": _can_keep(), "nogil": True, "error_model": "numpy", "fastmath": False}
+from .numba_options import OPTIONS
 
 LANES = 64
 """Element pairs of a path evaluated at once; a power of two, so that rows of the workspace cannot overlap."""

@@ -130,3 +130,24 @@ class PathSet:
         """No path at all."""
         zero = np.zeros(0, dtype=np.int64)
         return cls(zero, zero, zero, np.zeros((0, max_depth), dtype=np.int64), np.zeros((0, max_depth, 3)))
+
+
+def path_lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+    """Length of each path along its reflection points.
+
+    Parameters
+    ----------
+    paths : PathSet
+    sources_m, targets_m : (towers, 3), (poses, 3)
+
+    Returns
+    -------
+    (paths,) [m]
+    """
+    total, last = np.zeros(len(paths)), sources_m[paths.tower]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        end = paths.vertices_m[:, step] if step < paths.vertices_m.shape[1] else targets_m[paths.pose]
+        used = np.asarray(np.isfinite(end).all(axis=1))
+        total[used] += np.linalg.norm(end[used] - last[used], axis=1)
+        last = np.where(used[:, None], end, last)
+    return total

@@ -11,8 +11,9 @@ import numpy as np
 
 from ..common.units import BoolArray, FloatArray
 from .boxtree import box_tree
+from .effort import Effort, OnEstimate
 from .faces import corners, triangles
-from .growth import Effort, Progress, grow_paths
+from .growth import Progress, grow_paths
 from .image import images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .merging import WINDOW
 from .paths import Faces, PathSet
@@ -36,7 +37,9 @@ def find_paths(
     excluded: BoolArray | None = None,
     extent_m: FloatArray | None = None,
     threads: int | None = None,
+    longest_m: float | FloatArray = np.inf,
     progress: Progress | None = None,
+    on_estimate: OnEstimate | None = None,
 ) -> tuple[PathSet, Effort]:
     """As :func:`aerpaw_cmp.propagation.image.find_paths`, for scenes with too many sequences for it.
 
@@ -55,7 +58,11 @@ def find_paths(
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
     threads : int, optional
         Default: the cores that this process may use.
+    longest_m : float or (towers, poses)
+        Longer paths may be left out [m].
     progress : callable, optional
+    on_estimate : callable, optional
+        Told before the search what it will take.
 
     Returns
     -------
@@ -71,8 +78,10 @@ def find_paths(
         max_depth=max_depth,
         usable=usable,
         excluded=excluded,
+        longest_m=longest_m,
         threads=threads,
         progress=progress,
+        on_estimate=on_estimate,
         solids=True,
     )
     hiding = Occlusion(faces, tolerance_m)

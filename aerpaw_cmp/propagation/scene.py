@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.util import find_spec
 
 import numpy as np
 
@@ -15,6 +14,7 @@ from ..site.meshes import building_mesh
 from ..site.mitsuba import TriangleScene
 from ..site.scenes import added
 from ..site.site import Site
+from . import compiled
 from .arrays import Link, Poses
 from .crowns import Crowns
 from .faces import inside_solids, site_faces
@@ -33,6 +33,7 @@ class Settings:
     variant: str | None = None
     threads: int | None = None
     device: str = "auto"
+    power_cut_db: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -137,11 +138,11 @@ def surfaces_of(site: Site) -> Surfaces | None:
 @lru_cache(maxsize=2)
 def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
     """Faces of a scene; the same scene is merged once."""
-    if find_spec("numba") is None:
+    if compiled.beams().kernels is None:
         raise UsageError(
-            "the site is a scene of triangles, and numba is not installed",
-            expected="pip install 'aerpaw-cmp[fast]'",
-            cause="its thousands of faces are searched by compiled code",
+            f"the site is a scene of triangles, but {compiled.beams().reason}",
+            expected="numba that works: pip install 'aerpaw-cmp[fast]'",
+            cause="its thousands of faces are searched by compiled code alone",
         )
     from .merging import merged  # compiled: loaded where there is a scene
 

@@ -13,7 +13,7 @@ import numpy as np
 from numba import njit
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .kernels import OPTIONS
+from .numba_options import OPTIONS
 
 POLYGON, SEAM = 1, 2
 """Flags of a path that is to be decided elsewhere: whether its points lie on their faces; whether a seam hides it."""

@@ -19,10 +19,10 @@ from __future__ import annotations
 import gc
 import inspect
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -34,7 +34,7 @@ from .arrays import Array, Link, Poses
 from .faces import inside, triangles
 from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
-from .paths import Faces, PathSet
+from .paths import Faces, PathSet, path_lengths
 from .surfaces import Surfaces
 
 SPECULAR_TABLE_SLOTS = 2**24
@@ -62,6 +62,8 @@ WELD_M = 1e-3
 """Corners of triangles this near are one: Sionna diffracts where two triangles share an edge."""
 EDGE_TOLERANCE_M = 1e-3
 """A float32 reflection point may lie this far outside its face."""
+
+Taken = TypeVar("Taken")
 
 
 def load_variant(prefer: str | None = None) -> str:
@@ -379,12 +381,11 @@ class _Finder:
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = slots
         return True
 
-    def solve(self, targets_m: FloatArray, max_depth: int, samples: int) -> dict[str, Any]:
-        """Arrays of one batch for the real (not padding) targets: valid, kind, shape, primitive, gain."""
-        return self.searched(targets_m, max_depth, samples)[1]
-
     def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> tuple[Any, dict[str, Any]]:
-        """Sionna's paths of one batch, searched until there was room for all, and what :meth:`solve` gives."""
+        """Sionna's paths of one batch, searched until there was room for all, and what they are as arrays.
+
+        Arrays, for the real (not padding) targets: valid, kind, shape, primitive, gain.
+        """
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         while max_depth and self._more_room():
@@ -440,30 +441,29 @@ def find_paths(
     -------
     PathSet
     """
-    if not 1 <= batch <= LARGEST_BATCH:
-        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
-    load_variant(variant)
-    alive = np.isfinite(targets_m).all(axis=1)
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m)
-    pieces: list[PathSet] = []
-    groups = list(_groups(faces, sources_m, usable))
-    for number, (towers, chosen) in enumerate(groups):
-        wanted = alive if excluded is None else alive & ~excluded[towers].all(axis=0)
-        poses = np.flatnonzero(wanted)
-        if not len(poses):
-            continue
-        reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        built = _build(faces, chosen, reach, carrier_hz, surfaces=surfaces)
-        with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch) as finder:
-            for start in range(0, len(poses), batch):
-                some = poses[start : start + batch]
-                raw = finder.solve(targets_m[some], max_depth, samples)
-                _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-                pose, tower, sequence = _sequences(raw, built.face_of, some, towers, max_depth)
-                pieces.append(_refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces))
-                if progress:
-                    progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
-        del built
+
+    def take(_: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> PathSet:
+        pose, tower, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
+        return _refine(faces, sources_m, targets_m, pose, tower, sequence, tolerance_m, surfaces)
+
+    pieces = list(
+        _in_batches(
+            take,
+            faces,
+            sources_m,
+            targets_m,
+            carrier_hz=carrier_hz,
+            max_depth=max_depth,
+            samples=samples,
+            batch=batch,
+            usable=usable,
+            excluded=excluded,
+            surfaces=surfaces,
+            variant=variant,
+            progress=progress,
+        )
+    )
     found = merge(pieces, max_depth, faces if surfaces is None else None)
     if surfaces is not None:
         from .growth import without_coincident
@@ -502,9 +502,6 @@ def find_others(
     OtherPaths
         Of each batch.
     """
-    if not 1 <= batch <= LARGEST_BATCH:
-        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
-    load_variant(variant)
     flags = {
         "diffraction": search.diffraction,
         "refraction": search.refraction,
@@ -512,6 +509,57 @@ def find_others(
     }
     if search.diffraction:
         flags["diffraction_lit_region"] = False  # where the direct path is there, phases would decide
+
+    def take(found: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> OtherPaths:
+        part = _others(found, raw, built.face_of, poses, towers)
+        return part if excluded is None else part.select(~excluded[part.tower, part.pose])
+
+    yield from _in_batches(
+        take,
+        faces,
+        sources_m,
+        targets_m,
+        carrier_hz=carrier_hz,
+        max_depth=max_depth,
+        samples=samples,
+        batch=batch,
+        usable=usable,
+        excluded=excluded,
+        surfaces=surfaces,
+        variant=variant,
+        progress=progress,
+        flags=flags,
+        wedges=search.diffraction,
+        scattering=search.scattering_coefficient if search.scattering else 0.0,
+    )
+
+
+def _in_batches(
+    take: Callable[[Any, dict[str, Any], _Scene, IntArray, IntArray], Taken],
+    faces: Faces,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    *,
+    carrier_hz: float,
+    max_depth: int,
+    samples: int,
+    batch: int,
+    usable: BoolArray | None,
+    excluded: BoolArray | None,
+    surfaces: Surfaces | None,
+    variant: str | None,
+    progress: Progress | None,
+    flags: dict[str, bool] | None = None,
+    wedges: bool = False,
+    scattering: float = 0.0,
+) -> Iterator[Taken]:
+    """What ``take(paths of Sionna, arrays, scene, poses, towers)`` makes of each batch.
+
+    Sionna's own objects hold memory of the device: they are let go before the next batch.
+    """
+    if not 1 <= batch <= LARGEST_BATCH:
+        raise UsageError(f"batch {batch}", expected=f"1 to {LARGEST_BATCH} poses per call")
+    load_variant(variant)
     alive = np.isfinite(targets_m).all(axis=1)
     groups = list(_groups(faces, sources_m, usable))
     for number, (towers, chosen) in enumerate(groups):
@@ -519,17 +567,15 @@ def find_others(
         if not len(poses):
             continue
         reach = 4.0 * float(max(np.abs(targets_m[poses]).max(), np.abs(sources_m).max(), 100.0))
-        scattering = search.scattering_coefficient if search.scattering else 0.0
-        built = _build(
-            faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=search.diffraction, scattering=scattering
-        )
+        built = _build(faces, chosen, reach, carrier_hz, surfaces=surfaces, wedges=wedges, scattering=scattering)
         with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch, flags=flags) as finder:
             for start in range(0, len(poses), batch):
                 some = poses[start : start + batch]
                 found, raw = finder.searched(targets_m[some], max_depth, samples)
                 _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-                part = _others(found, raw, built.face_of, some, towers)
-                yield part if excluded is None else part.select(~excluded[part.tower, part.pose])
+                part = take(found, raw, built, some, towers)
+                del found, raw
+                yield part
                 if progress:
                     progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
         del built
@@ -644,7 +690,7 @@ def own_coefficients(
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
     kept = ~excluded[paths.tower, paths.pose]
     paths, gain = paths.select(kept), gain[kept]
-    length = _lengths(paths, sources_m, poses.position_m)
+    length = path_lengths(paths, sources_m, poses.position_m)
     cycles = length / wavelength_m(probe.carrier_hz)
     return Coefficients(paths, gain * np.exp(-2j * np.pi * (cycles - np.round(cycles)))[:, None, None], length)
 
@@ -677,17 +723,6 @@ def _raw_paths(
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
     return PathSet(pose, source, (sequence >= 0).sum(axis=1), sequence, points), gain
-
-
-def _lengths(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-    """Length of each path along its reflection points (paths,) [m]."""
-    total, last = np.zeros(len(paths)), sources_m[paths.tower]
-    for step in range(paths.vertices_m.shape[1] + 1):
-        end = paths.vertices_m[:, step] if step < paths.vertices_m.shape[1] else targets_m[paths.pose]
-        used = np.asarray(np.isfinite(end).all(axis=1))
-        total[used] += np.linalg.norm(end[used] - last[used], axis=1)
-        last = np.where(used[:, None], end, last)
-    return total
 
 
 def own_channels(

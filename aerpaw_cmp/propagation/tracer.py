@@ -21,8 +21,9 @@ from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import Fields, channel_matrices, mean_pair_power, rss_dbm
-from .compiled import ENOUGH_WORK, in_threads
+from .compiled import ENOUGH_WORK, beams, in_threads, switch, warn_once
 from .crowns import Crowns
+from .effort import Estimate, OnEstimate
 from .faces import inside_solids, smaller_than_fresnel_zone
 from .interactions import (
     SCATTERING_SAMPLES,
@@ -33,6 +34,7 @@ from .interactions import (
     path_powers,
 )
 from .paths import Faces, PathSet
+from .power_cut import CHECKED_POSES, ROUNDING, longest_m, loss_in_words, within_cut
 from .relevance import idle_objects, in_words
 from .samples import Choice, Samples, enough_samples, spread
 from .scene import Scene, Settings
@@ -174,8 +176,11 @@ def replay(
     whole: Whole | None = None,
     interactions: Sequence[str] = ("reflection",),
     scattering_coefficient: float | None = None,
+    power_cut_db: float | None = None,
+    check_power_cut: bool = True,
     only: BoolArray | None = None,
     progress: Callable[[float], None] | None = None,
+    on_estimate: OnEstimate | None = None,
 ) -> Replay:
     """Replay a flight.
 
@@ -223,10 +228,17 @@ def replay(
         (:mod:`aerpaw_cmp.propagation.interactions`).
     scattering_coefficient : float, optional
         Of every material, where "scattering" is asked for.
+    power_cut_db : float, optional
+        Leave out paths at least this much weaker than free space over their link by their length alone
+        (:mod:`aerpaw_cmp.propagation.power_cut`).
+    check_power_cut : bool
+        Search a few poses without the cut and say in ``left_out`` what it costs.
     only : (towers, poses) bool, optional
         Links that count; the others have no path and are not searched for.
     progress : callable, optional
         Called with the share done.
+    on_estimate : callable, optional
+        Told before a search among thousands of faces what it will take; without one, a long search is a warning.
 
     Returns
     -------
@@ -248,6 +260,8 @@ def replay(
         )
     if relevance_db is not None and not relevance_db > 0.0:
         raise UsageError(f"relevance_db {relevance_db:g}", expected="a positive number of dB")
+    if power_cut_db is not None and not power_cut_db > 0.0:
+        raise UsageError(f"power_cut_db {power_cut_db:g}", expected="a positive number of dB")
     searches = other_searches(interactions, scattering_coefficient)
     if searches and (engine != "sionna" or max_depth == 0):
         raise UsageError(
@@ -266,20 +280,33 @@ def replay(
     scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
     left_out += [*refused, *_buried_towers(site, link)]
     variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
-    settings = Settings(engine, max_depth, 0 if samples == "auto" else samples, batch, variant, threads, device)
+    settings = Settings(
+        engine=engine,
+        max_depth=max_depth,
+        samples=0 if samples == "auto" else samples,
+        batch=batch,
+        variant=variant,
+        threads=threads,
+        device=device,
+        power_cut_db=power_cut_db,
+    )
     choice = None
     cache = _cache(engine, cache_dir)
     if engine == "sionna" and samples == "auto":
         choice = _choose_samples(scene, link, poses, settings, cache)
         settings = replace(settings, samples=choice.samples)
-    paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress)
+    paths, search_seconds, from_cache = _search_or_read(scene, link, poses, settings, cache, progress, on_estimate)
     left_out += cache.warnings if cache else []
+    if power_cut_db is not None and check_power_cut:
+        left_out += _loss_of_cut(site, scene, link, poses, settings, loss, cache)
     paths, blocked = _above_terrain(site, scene, poses, paths)
     left_out += blocked
     if crowns is not None and scene.surfaces is not None:
         left_out += ["reflections off crowns: they are not searched in a scene of triangles"]
     elif crowns is not None:
         scene, bounces = scene.with_bounces(site, poses, crowns, max_depth)
+        if power_cut_db is not None:
+            bounces = within_cut(bounces, scene.sources_m, poses.position_m, power_cut_db)
         paths = image.merge([paths, bounces], max_depth, None)
         left_out += ["paths over a crown and a building, or over two crowns"] if max_depth > 1 else []
     others = None
@@ -320,8 +347,8 @@ class Whole:
     pairs: int
 
 
-POSES_PER_PART = 8192
-"""Poses replayed at once by :func:`replay_parts`: some 40 MB for five towers with 4 x 4 elements."""
+POSES_PER_PART = 2048
+"""Poses replayed at once by :func:`replay_parts`: some 15 MB for five towers with 4 x 4 elements."""
 
 
 def replay_parts(
@@ -379,7 +406,7 @@ LEVELS_AT_ONCE = 1024
 """Poses of which a thread makes levels at once."""
 
 LONG_SEARCH_S = 60.0
-"""A search that will take longer is announced."""
+"""A search that will take longer is a warning where nobody asked to be told."""
 
 MANY_FACES = 400
 """Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
@@ -466,6 +493,30 @@ def _choose_samples(scene: Scene, link: Link, poses: Poses, settings: Settings, 
     return enough_samples(pilot, scene.faces, len(some))
 
 
+def _loss_of_cut(
+    site: Site, scene: Scene, link: Link, poses: Poses, settings: Settings, loss: Loss | None, cache: PathCache | None
+) -> list[str]:
+    """What the power cut costs at a few poses, spread over the flight, that are searched without it."""
+    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), CHECKED_POSES)
+    cut_db = settings.power_cut_db
+    if not len(some) or cut_db is None:
+        return []
+    few = Poses(poses.position_m[some], poses.rotation[some])
+    part = replace(scene, excluded=scene.excluded[:, some])
+    whole, _, _ = _search_or_read(part, link, few, replace(settings, power_cut_db=None), cache, None)
+    whole, _ = _above_terrain(site, part, few, whole)
+    kept = within_cut(whole, scene.sources_m, few.position_m, cut_db)
+    level = []
+    for paths in (whole, kept):
+        loss_db = None if loss is None else loss(paths, scene.sources_m, few.position_m)
+        h = channel_matrices(paths, scene.faces, scene.sources_m, few, link, loss_db, threads=settings.threads).h
+        level.append(rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm))
+    both = np.isfinite(level[0]) & np.isfinite(level[1])
+    lost = int((np.isfinite(level[0]) & ~np.isfinite(level[1])).sum())
+    change = level[1][both] - level[0][both]
+    return [loss_in_words(cut_db, len(whole), len(whole) - len(kept), len(some), change, lost)]
+
+
 REACH_M = 100_000.0
 """Poses further than this from every tower [m] are no poses of the site."""
 
@@ -532,6 +583,7 @@ def _search_or_read(
     settings: Settings,
     cache: PathCache | None,
     progress: Callable[[float], None] | None,
+    on_estimate: OnEstimate | None = None,
 ) -> tuple[PathSet, float, bool]:
     """Paths, the seconds of their search, and whether they were read from the cache."""
     key = cache.key(scene, poses.position_m, link.carrier_hz, settings) if cache else ""
@@ -539,7 +591,7 @@ def _search_or_read(
     if kept:
         return *kept, True
     started = time.perf_counter()
-    paths = _search(scene, link, poses, settings, progress)
+    paths = _search(scene, link, poses, settings, progress, on_estimate)
     seconds = time.perf_counter() - started
     if cache:
         cache.save(key, paths, seconds)
@@ -552,40 +604,107 @@ def _search(
     poses: Poses,
     settings: Settings,
     progress: Callable[[float], None] | None,
+    on_estimate: OnEstimate | None = None,
 ) -> PathSet:
-    """Paths by the engine that the settings name."""
-    if settings.engine == "image" and scene.surfaces is not None:
-        from .growth import grow_paths  # compiled: loaded where there is a scene
+    """Paths by the engine that the settings name, those left out that the power cut does."""
+    paths = _by_engine(scene, link, poses, settings, progress, on_estimate)
+    if settings.power_cut_db is None:
+        return paths
+    return within_cut(paths, scene.sources_m, poses.position_m, settings.power_cut_db)
 
-        def long_search(words: str, seconds: float) -> None:
-            if seconds > LONG_SEARCH_S:
-                warnings.warn(f"the path search takes {words}", RuntimeWarning, stacklevel=2)
 
-        return grow_paths(
-            scene.surfaces,
-            scene.sources_m,
-            poses.position_m,
-            max_depth=settings.max_depth,
-            usable=scene.usable,
-            excluded=scene.excluded,
-            threads=settings.threads,
-            on_estimate=long_search,
-            progress=progress,
-        )[0]
-    if settings.engine == "image" and settings.max_depth > 1 and len(scene.faces) > MANY_FACES and find_spec("numba"):
-        from .prisms import find_paths  # compiled: loaded where there are many faces
+def _longest_m(scene: Scene, poses: Poses, settings: Settings) -> float | FloatArray:
+    """Longest path that need be searched for, a little more than counts."""
+    if settings.power_cut_db is None:
+        return float(np.inf)
+    return longest_m(scene.sources_m, poses.position_m, settings.power_cut_db) * (1.0 + ROUNDING)
 
-        return find_paths(
-            scene.faces,
-            scene.sources_m,
-            poses.position_m,
-            max_depth=settings.max_depth,
-            usable=scene.usable,
-            excluded=scene.excluded,
-            extent_m=scene.extent_m,
-            threads=settings.threads,
-            progress=progress,
-        )[0]
+
+def _long_search(estimate: Estimate) -> None:
+    if estimate.seconds > LONG_SEARCH_S:
+        warnings.warn(f"the path search takes {estimate}", RuntimeWarning, stacklevel=2)
+
+
+def _by_beams(scene: Scene, settings: Settings) -> bool:
+    """Whether the image engine searches by compiled beams: a scene of triangles, or many faces."""
+    if settings.engine != "image":
+        return False
+    if scene.surfaces is not None:
+        return True
+    if settings.max_depth < 2 or len(scene.faces) <= MANY_FACES or find_spec("numba") is None:
+        return False
+    state = beams()
+    if state.kernels is None and switch() != "never":
+        warn_once(state.reason)
+    return state.kernels is not None
+
+
+def estimate_search(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    *,
+    max_depth: int = 2,
+    power_cut_db: float | None = None,
+    threads: int | None = None,
+) -> Estimate | None:
+    """What the path search of the image engine will take, from its first faces.
+
+    Parameters
+    ----------
+    site, link, poses, max_depth, power_cut_db, threads
+        As for :func:`replay`.
+
+    Returns
+    -------
+    Estimate or None
+        None where there are few faces: a replay of some poses tells it.
+    """
+    poses, _ = _within_reach(site, poses)
+    scene = Scene.of(site, link, poses)
+    settings = Settings("image", max_depth, power_cut_db=power_cut_db)
+    if not _by_beams(scene, settings):
+        return None
+    from . import growth, prisms  # compiled: loaded where there are many faces
+
+    solids = scene.surfaces is None
+    return growth.estimate(
+        scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
+        scene.sources_m,
+        poses.position_m,
+        max_depth=max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        longest_m=_longest_m(scene, poses, settings),
+        threads=threads,
+        solids=solids,
+    )
+
+
+def _by_engine(
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    settings: Settings,
+    progress: Callable[[float], None] | None,
+    on_estimate: OnEstimate | None,
+) -> PathSet:
+    if _by_beams(scene, settings):
+        from . import growth, prisms  # compiled: loaded where there are many faces
+
+        options: dict[str, Any] = {
+            "max_depth": settings.max_depth,
+            "usable": scene.usable,
+            "excluded": scene.excluded,
+            "longest_m": _longest_m(scene, poses, settings),
+            "threads": settings.threads,
+            "on_estimate": on_estimate or _long_search,
+            "progress": progress,
+        }
+        ends = scene.sources_m, poses.position_m
+        if scene.surfaces is not None:
+            return growth.grow_paths(scene.surfaces, *ends, **options)[0]
+        return prisms.find_paths(scene.faces, *ends, extent_m=scene.extent_m, **options)[0]
     if settings.engine == "image":
         return image.find_paths(
             scene.faces,

@@ -17,7 +17,7 @@ from ..compare.rank import RankFit
 from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
-from ..flight.settings import FlightFile, LogSettings
+from ..flight.settings import LogSettings
 from ..logs.ingest import IngestedFile
 from . import data as record
 from .export import merge
@@ -79,7 +79,7 @@ def report_data(
         track=track_of(data),
         waypoints=waypoints_of(data),
         rss=tuple(
-            dataclasses.replace(rss_panel(one), source=source_of(series, settings))
+            dataclasses.replace(rss_panel(one), source=source_of(series, settings.logs))
             for one, series in zip(result.rss, data.rss, strict=True)
         ),
         paths=tuple(paths),
@@ -168,11 +168,11 @@ def _tower_columns(tower_m: FloatArray | None) -> dict[str, FloatArray]:
     return {f"tower_{name}_m": tower_m[:, axis] for axis, name in enumerate(("east", "north", "up"))}
 
 
-def source_of(series: RssSeries, settings: FlightFile) -> record.Source | None:
+def source_of(series: RssSeries, logs: Sequence[LogSettings]) -> record.Source | None:
     """Where the samples of a series stand in its logs."""
     if len(series.line) != len(series.time):
         return None
-    return record.Source(files=tuple(log.path for log in settings.logs), file=series.log, line=series.line)
+    return record.Source(files=tuple(log.path for log in logs), file=series.log, line=series.line)
 
 
 def _baseline(name: str, model: ModelLevel, paired: PairedDifference | None) -> record.Baseline:

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import datetime
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..common.units import FloatArray
-from .campaign_data import CampaignData, PlaceMap, SettingRank
-from .explorer import scene
+from .campaign_data import CampaignData, FlownTrack, PlaceMap, Season, SettingRank
+from .explorer import plan_of
 from .map_explorer import ramp
 from .packed import PackedArrays, step_for
 
@@ -42,15 +42,16 @@ def payload(data: CampaignData, most_rows: int = MOST_ROWS) -> dict[str, Any] | 
     columns = [np.array([getattr(row, name) for row in rows]) for name in ("rmse_db", "held_out_rmse_db", "offset_db")]
     step = step_for(np.concatenate(columns), FINEST_DB)
     own, held, offset = (arrays.add_steps(column, step) for column in columns)
+    track_step = _track_step(data.tracks)
     messages = list(dict.fromkeys(f.message for f in data.failures))
     by_name = {f"{tower} {channel}".strip(): i for (tower, channel), i in links.items()}
     first = next((settings[r.setting] for r in data.season.over_all() if r.setting in settings), 0)
     return {
         "settings": list(kept),
-        "changes": [_changes(data, name) for name in kept],
+        "changes": [_changes(data.settings[name]) for name in kept],
         "first": first,
         "reference": settings[data.reference],
-        "flights": [_flight(data, name) for name in data.flights],
+        "flights": [_flight(data.season, name) for name in data.flights],
         "links": [{"tower": t, "channel": c, "name": f"{t} {c}".strip()} for t, c in links],
         "held_out": data.season.held_out,
         "ranked_by": "held" if data.season.held_out else "own",
@@ -79,11 +80,11 @@ def payload(data: CampaignData, most_rows: int = MOST_ROWS) -> dict[str, Any] | 
         "places": [_places(p, links, arrays, data.cell_m, step) for p in data.season.places],
         "cell_m": data.cell_m,
         "reach": reach_of(data.season.places),
-        "track_step": _track_step(data),
-        "tracks": {flights[t.flight]: _track(t.position_m, arrays, _track_step(data)) for t in data.tracks},
+        "track_step": track_step,
+        "tracks": {flights[t.flight]: _track(t.position_m, arrays, track_step) for t in data.tracks},
         "failures": [[flights.get(f.flight, -1), f.setting, messages.index(f.message)] for f in data.failures],
         "messages": messages,
-        "site": None if data.site is None else _plan(data),
+        "site": None if data.site is None else plan_of(data.site),
         "ramp": ramp("RdBu_r"),
         "packed": arrays.content(),
     }  # fmt: skip
@@ -107,14 +108,14 @@ def _settings_that_fit(data: CampaignData, most_rows: int) -> tuple[list[str], s
     return [name for name in data.settings if name in kept], words
 
 
-def _changes(data: CampaignData, name: str) -> str:
-    return ", ".join(f"{key}: {value}" for key, value in data.settings[name].items()) or "nothing changed"
+def _changes(overrides: Mapping[str, Any]) -> str:
+    return ", ".join(f"{key}: {value}" for key, value in overrides.items()) or "nothing changed"
 
 
-def _flight(data: CampaignData, name: str) -> dict[str, Any]:
-    start = data.season.started.get(name)
+def _flight(season: Season, name: str) -> dict[str, Any]:
+    start = season.started.get(name)
     seconds = None if start is None else datetime.datetime.fromisoformat(start.replace("Z", "+00:00")).timestamp()
-    return {"name": name, "t": None if seconds is None else 1000.0 * seconds, "href": data.season.reports.get(name)}
+    return {"name": name, "t": None if seconds is None else 1000.0 * seconds, "href": season.reports.get(name)}
 
 
 def _ranked(entry: SettingRank, settings: dict[str, int], links: dict[str, int]) -> dict[str, Any]:
@@ -150,8 +151,8 @@ def reach_of(places: Sequence[PlaceMap]) -> float:
     return float(max(np.percentile(values, 98), 0.1)) if len(values) else 1.0
 
 
-def _track_step(data: CampaignData) -> float:
-    parts = [t.position_m[:, :2].ravel() for t in data.tracks]
+def _track_step(tracks: Sequence[FlownTrack]) -> float:
+    parts = [t.position_m[:, :2].ravel() for t in tracks]
     return step_for(np.concatenate(parts), 0.1) if parts else 0.1
 
 
@@ -160,12 +161,6 @@ def _track(position_m: FloatArray, arrays: PackedArrays, step: float) -> list[in
     good = position_m[np.isfinite(position_m[:, :2]).all(axis=1)]
     shown = good[np.unique(np.linspace(0, max(len(good) - 1, 0), TRACK_POINTS).astype(int))] if len(good) else good
     return [arrays.add_steps(shown[:, 0], step), arrays.add_steps(shown[:, 1], step)]
-
-
-def _plan(data: CampaignData) -> dict[str, Any]:
-    assert data.site is not None
-    whole = scene(data.site)
-    return {**whole, "trees": [], "buildings": [faces[-1:] for faces in whole["buildings"]]}
 
 
 def number(value: float) -> float | None:

@@ -225,5 +225,11 @@ def scene(site: Site) -> dict[str, Any]:
     }
 
 
+def plan_of(site: Site) -> dict[str, Any]:
+    """:func:`scene` for a plan: no trees (foliage is in the levels), roofs alone of buildings."""
+    whole = scene(site)
+    return {**whole, "trees": [], "buildings": [faces[-1:] for faces in whole["buildings"]]}
+
+
 def _number(value: float) -> float | None:
     return float(value) if np.isfinite(value) else None

@@ -30,15 +30,15 @@ class Headline:
 
 def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
-    scored = _scored(data)
-    first = _rss_sentence(scored) if scored else _rank_sentence(data)
+    scored = _scored(data.rss)
+    first = _rss_sentence(scored) if scored else _rank_sentence(data.rank)
     if not first:
         return ("Nothing could be compared: no sample has a measurement, a pose and a path at once.", _trust(data))
     return first, " ".join(part for part in (_fails(scored), _trust(data)) if part)
 
 
-def _scored(data: ReportData) -> list[RssPanel]:
-    return [panel for panel in data.rss if panel.n and math.isfinite(panel.rmse_db)]
+def _scored(panels: Sequence[RssPanel]) -> list[RssPanel]:
+    return [panel for panel in panels if panel.n and math.isfinite(panel.rmse_db)]
 
 
 def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
@@ -87,8 +87,8 @@ def _rss_sentence(panels: Sequence[RssPanel]) -> str:
     )
 
 
-def _rank_sentence(data: ReportData) -> str:
-    for panel in data.rank:
+def _rank_sentence(panels: Sequence[RankPanel]) -> str:
+    for panel in panels:
         at = _best_k(panel)
         if at is not None:
             return (
@@ -146,7 +146,7 @@ def _trust(data: ReportData) -> str:
 def headlines(data: ReportData) -> list[Headline]:
     """At most four numbers, each with its interval and what it must be held against."""
     found = []
-    panels = _scored(data)
+    panels = _scored(data.rss)
     if panels:
         found += [_error(panels), *_difference(panels)]
     for panel in data.rank:

@@ -176,10 +176,10 @@ def by_section(pictures: Sequence[Picture]) -> dict[str, list[Picture]]:
     return sections
 
 
-def ladder_table(data: ReportData) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
+def ladder_table(ladder: Sequence[LadderRow]) -> list[tuple[str, bool, float, dict[str, LadderRow]]]:
     """Model, whether recommended, seconds, and its rows by tower and channel."""
     table: dict[str, dict[str, LadderRow]] = {}
-    for row in data.ladder:
+    for row in ladder:
         table.setdefault(row.model, {})[f"{row.tower} {row.channel}".strip()] = row
     return [
         (model, any(r.recommended for r in rows.values()), max(r.seconds for r in rows.values()), rows)
@@ -216,9 +216,9 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         notes=list(dict.fromkeys([*data.site.notes, *data.notes])),  # a flight repeats what its site says
         ranks=RANKS,
         headline=words.headline(data),
-        verdicts=words.verdicts(data),
-        ladder_verdict=words.ladder_verdict(data),
-        ladder=ladder_table(data),
+        verdicts=words.verdicts(data.rss, data.rank),
+        ladder_verdict=words.ladder_verdict(data.ladder),
+        ladder=ladder_table(data.ladder),
         warnings=words.warnings(data),
         baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
         speed_ks=sorted({k for row in data.speed for k in row.rank_disagreement}),

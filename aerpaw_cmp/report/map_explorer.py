@@ -7,17 +7,16 @@ What the script shows of a layer (share covered, median, shares of ranks) it com
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
 from ..common.geodesy import SiteFrame
 from ..common.units import FloatArray
-from ..site.site import Site
 from .canvas import rank_colour
 from .data import RANKS
-from .explorer import scene
+from .explorer import plan_of
 from .maps_data import JOINT, MapLayer, MapsData
 from .maps_figures import grouped
 from .names import k_key
@@ -152,7 +151,7 @@ def _packed(data: MapsData, layers: Sequence[MapLayer], stride: int) -> dict[str
         "half": [half_width(east) if len(east) > 1 else half_width(data.east_m),
                  half_width(north) if len(north) > 1 else half_width(data.north_m)],
         "degrees": geographic(data.site.frame, data.east_m, data.north_m),
-        "site": _plan(data.site),
+        "site": plan_of(data.site),
         "borders": [listed(line) for line in data.borders_m],
         "joint": JOINT,
         "quantities": quantities,
@@ -272,9 +271,3 @@ def geographic(frame: SiteFrame, east_m: FloatArray, north_m: FloatArray) -> dic
         "middle": middle.tolist(), "reach": reach.tolist(), "powers": [list(pair) for pair in powers],
         "lat": by_lat.tolist(), "lon": by_lon.tolist(), "worst_m": worst,
     }  # fmt: skip
-
-
-def _plan(site: Site) -> Mapping[str, Any]:
-    """The site for a plan: no trees (foliage is in the layers), roofs alone of buildings."""
-    whole = scene(site)
-    return {**whole, "trees": [], "buildings": [faces[-1:] for faces in whole["buildings"]]}

@@ -70,18 +70,18 @@ def _listed(names: list[str]) -> str:
     return names[0] if len(names) == 1 else ", ".join(names[:-1]) + " and " + names[-1]
 
 
-def verdicts(data: ReportData) -> list[str]:
+def verdicts(rss: Sequence[RssPanel], rank: Sequence[RankPanel]) -> list[str]:
     """One or two sentences per panel: how well the ray tracing predicts, and against what."""
-    return [rss_verdict(panel) for panel in data.rss] + [rank_verdict(panel) for panel in data.rank]
+    return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
 
 AS_SET, FREE_SPACE = "as set in flight.yaml", "free space"
 """Names of two rungs of the ladder."""
 
 
-def ladder_verdict(data: ReportData) -> str:
+def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
     """What the scene needs: whether the replay as set is worth its trouble, and which model does better."""
-    rows = [row for row in data.ladder if math.isfinite(row.rmse_heldout_db)]
+    rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
     chosen = next((row.model for row in rows if row.recommended), None)
     if chosen is None:
         return ""

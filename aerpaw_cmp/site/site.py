@@ -103,7 +103,15 @@ class Trees:
     def none(cls) -> Trees:
         """No tree."""
         empty = np.zeros(0)
-        return cls(empty, empty, empty, empty, empty, empty, empty)
+        return cls(
+            east_m=empty,
+            north_m=empty,
+            ground_m=empty,
+            height_m=empty,
+            crown_diameter_m=empty,
+            crown_base_m=empty,
+            trunk_diameter_m=empty,
+        )
 
 
 @dataclass(frozen=True, slots=True)

@@ -110,11 +110,11 @@ def result(
     stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, **about))
     accepted = len(frame)
     return ReadResult(
-        reader,
-        (stream,) if accepted else (),
-        messages + broken,
-        accepted,
-        messages + broken - accepted - len(damaged),
-        tuple(sorted(damaged, key=lambda line: line.number)),
-        tuple(warnings),
+        reader=reader,
+        streams=(stream,) if accepted else (),
+        lines=messages + broken,
+        accepted=accepted,
+        blank=messages + broken - accepted - len(damaged),
+        rejected=tuple(sorted(damaged, key=lambda line: line.number)),
+        warnings=tuple(warnings),
     )

@@ -70,9 +70,14 @@ class Table:
     def take(self, pick: AnyArray) -> Table:
         """Some of them, by index or mask."""
         return Table(
-            self.row[pick], self.rat[pick], self.pci[pick], self.arfcn[pick], self.rsrp_dbm[pick], self.serving[pick],
-            self.beside[:, pick],
-        )  # fmt: skip
+            row=self.row[pick],
+            rat=self.rat[pick],
+            pci=self.pci[pick],
+            arfcn=self.arfcn[pick],
+            rsrp_dbm=self.rsrp_dbm[pick],
+            serving=self.serving[pick],
+            beside=self.beside[:, pick],
+        )
 
 
 def table(readings: Iterable[Reading]) -> Table:

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.units import AnyArray
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Attribute, Kind
 
@@ -17,6 +18,8 @@ _INTEGERS = ("fix", "satellites")
 
 def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray]) -> pd.DataFrame:
     """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1).
+
+    Its columns are copies, each an array of its own: streams of one log share their times.
 
     Parameters
     ----------
@@ -32,20 +35,20 @@ def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Ma
     """
     count = len(time)
     content: dict[str, Any] = {
-        "time": np.asarray(time, dtype="datetime64[ns]"),
-        "line": np.asarray(line, dtype=np.int64),
+        "time": np.array(time, dtype="datetime64[ns]"),
+        "line": np.array(line, dtype=np.int64),
         # object, not pandas' string type: no scan of the column, the same on every pandas
-        "flag": pd.Series(flag, dtype=object),
+        "flag": pd.Series(np.array(flag, dtype=object), dtype=object, copy=False),
     }
     for name in COLUMNS[kind]:
         if name in _INTEGERS:
-            content[name] = np.asarray(values.get(name, np.full(count, -1)), dtype=np.int64)
+            content[name] = np.array(values[name], dtype=np.int64) if name in values else np.full(count, -1)
         else:
-            content[name] = np.asarray(values.get(name, np.full(count, np.nan)), dtype=np.float64)
+            content[name] = np.array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
     for name, column in values.items():
         if name not in content:
-            content[name] = column
-    made: pd.DataFrame = pd.DataFrame(content)
+            content[name] = np.array(column)
+    made: pd.DataFrame = pd.DataFrame(content, copy=False)
     return made
 
 
@@ -63,6 +66,5 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
 
 def steps_back(records: pd.DataFrame) -> list[str]:
     """Warning where the clock of a log runs backwards."""
-    time = records["time"].to_numpy().astype(np.int64)
-    back = int((np.diff(time) < 0).sum())
+    back = blocks.steps_back(records["time"].to_numpy())
     return [f"time steps back at {back} places"] if back else []

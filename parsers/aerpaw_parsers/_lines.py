@@ -100,12 +100,14 @@ def split(data: bytes) -> Lines:
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
     ends = np.flatnonzero(buffer == 10).astype(np.int64)
-    starts = np.concatenate(([0], ends + 1)).astype(np.int64)
+    starts = np.empty(len(ends) + 1, dtype=np.int64)
+    starts[0] = 0
+    np.add(ends, 1, out=starts[1:])
     if len(data) and data[-1] != 10:
         ends = np.append(ends, len(data))
     else:
         starts = starts[:-1]
-    if len(ends):
+    if len(ends) and b"\r" in data:
         before = buffer[np.maximum(ends - 1, 0)]
         ends = np.where((ends > starts) & (before == 13), ends - 1, ends)
     return Lines(data, starts, ends)
@@ -169,6 +171,8 @@ def remainder(
     """
     left = np.ones(len(lines), dtype=bool)
     left[accepted] = False
+    if not left.any() and blank is None:
+        return 0, []
     known = lines.blank & left
     if blank is not None:
         known[blank] = True
@@ -199,14 +203,19 @@ def numbers(column: AnyArray) -> AnyArray:
 
 def flags(count: int) -> AnyArray:
     """Empty flag column."""
-    return np.full(count, "", dtype=object)
+    column = np.empty(count, dtype=object)
+    column.fill("")  # one object; np.full would make one per row
+    return column
 
 
 def add_flag(column: AnyArray, mask: BoolArray, reason: str) -> None:
     """Add a reason where the mask holds, in place."""
     if mask.any():
         old = column[mask]
-        column[mask] = [f"{text};{reason}" if text else reason for text in old]
+        if (old != "").any():
+            column[mask] = [f"{text};{reason}" if text else reason for text in old]
+        else:
+            column[mask] = reason  # one object for all rows
 
 
 def first_lines(head: bytes, count: int = 40) -> list[bytes]:

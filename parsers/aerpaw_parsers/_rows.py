@@ -133,14 +133,15 @@ class Rows:
             Further attributes.
         """
         shown = self.flag if flag is None else flag
-        if pick is None:
-            pick = np.flatnonzero(np.ones(len(self), dtype=bool) if where is None else where)
-            values, shown = {key: np.asarray(column)[pick] for key, column in values.items()}, shown[pick]
-        elif flag is None:
-            shown = self.flag[pick]
-        if not len(pick):
+        time, row = self.time, self.row
+        if pick is not None:
+            time, row, shown = time[pick], row[pick], shown[pick] if flag is None else flag
+        elif where is not None and not where.all():
+            time, row, shown = time[where], row[where], shown[where]
+            values = {key: np.asarray(column)[where] for key, column in values.items()}
+        if not len(row):
             return None
-        frame = _frames.frame(kind, self.time[pick], self.row[pick] + 1, shown, values)
+        frame = _frames.frame(kind, time, row + 1, shown, values)
         attributes = ({"clock": "relative"} if self.relative else {}) | dict(about or {}) | attributes
         return Stream(kind, name, frame, _frames.attributes(self.options, **attributes))
 
@@ -254,7 +255,8 @@ def built(
     blank, rejected = _lines.remainder(lines, known, reason, blank=markup)
     rejected += before
     blank += int(comment.sum())
-    rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
+    if comment.any():
+        rows, column = rows[~comment], {name: cells[~comment] for name, cells in column.items()}
     relative, instants, valid = times(column.pop("time"), options, clock=clock, reader=reader)
     rejected += lines.reject_all(rows[~valid], NO_DATE if clock == "wall" else NO_TIME)
     flag = _lines.flags(len(rows))
@@ -264,20 +266,13 @@ def built(
     warnings = list(instants.warnings)
     if relative and len(rows):
         warnings.append(RELATIVE)
+    at, time = np.flatnonzero(~comment), instants.time
+    column = {name: cells for name, cells in column.items() if name != "time"}
+    if not valid.all():
+        rows, at, time, flag = rows[valid], at[valid], time[valid], flag[valid]
+        column = {name: cells[valid] for name, cells in column.items()}
     return Rows(
-        reader,
-        options,
-        len(lines),
-        rows[valid],
-        instants.time[valid],
-        flag[valid],
-        {name: cells[valid] for name, cells in column.items()},
-        blank,
-        rejected,
-        warnings,
-        relative,
-        np.flatnonzero(~comment)[valid],
-        lines.data,
+        reader, options, len(lines), rows, time, flag, column, blank, rejected, warnings, relative, at, lines.data
     )
 
 

@@ -188,7 +188,15 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
         repeats += foot  # words below the table, as Nemo writes them
         rejected = [line for line in rejected if line.number - 1 not in foot]
     comments = np.array([*range(at + 1), *repeats], dtype=np.int64)
-    return Sheet(lines, names, np.array(number, dtype=np.int64), cells, comments, rejected, separator != ",")
+    return Sheet(
+        lines=lines,
+        names=names,
+        row=np.array(number, dtype=np.int64),
+        cells=cells,
+        blank_rows=comments,
+        rejected=rejected,
+        comma=separator != ",",
+    )
 
 
 TIME_NAMES = (

@@ -110,15 +110,19 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         If the zone is missing or unknown.
     """
     where = zone(name, needed_by=needed_by)
-    wall_s = wall_ns // 1_000_000_000
-    buckets, inverse = _unique_buckets(wall_s)
-    first = np.array([_offset_s(int(b) * _BUCKET_S, where, 0) for b in buckets], dtype=np.int64)
-    second = np.array([_offset_s(int(b) * _BUCKET_S, where, 1) for b in buckets], dtype=np.int64)
+    starts, buckets, index = _runs(wall_ns)
+    first, second = (np.array([_offset_s(int(b) * _BUCKET_S, where, fold) for b in buckets.tolist()], dtype=np.int64)
+                     for fold in (0, 1))  # fmt: skip
+    length = np.diff(np.append(starts, len(wall_ns)))
+    if np.array_equal(first, second):
+        utc = (wall_ns - np.repeat(first[index] * 1_000_000_000, length)).view("datetime64[ns]")
+        return Instants(utc, np.zeros(len(utc), dtype=bool), np.zeros(len(utc), dtype=bool))
+    inverse = np.repeat(index, length)
     ambiguous = (first > second)[inverse]
     nonexistent = (first < second)[inverse]
     offset = first[inverse]
     if ambiguous.any():
-        stepped = np.concatenate(([False], np.diff(wall_s) <= -1800))
+        stepped = np.concatenate(([False], np.diff(wall_ns // 1_000_000_000) <= -1800))
         offset = np.where(ambiguous & (np.cumsum(stepped) > 0), second[inverse], offset)
     warnings = []
     if ambiguous.any():
@@ -134,14 +138,15 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
     return Instants(utc, ambiguous, nonexistent, tuple(warnings))
 
 
-def _unique_buckets(wall_s: IntArray) -> tuple[IntArray, AnyArray]:
-    """Distinct quarter hours and the index of each time; logs run forward, so runs come before sorting."""
-    bucket = wall_s // _BUCKET_S
-    if len(bucket) == 0:
-        return bucket, np.zeros(0, dtype=np.int64)
-    change = np.concatenate(([True], bucket[1:] != bucket[:-1]))
-    unique, index = np.unique(bucket[change], return_inverse=True)
-    return unique, index[np.cumsum(change) - 1]
+def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:
+    """Where runs of times within a quarter of an hour begin, the distinct quarters, and that of each run."""
+    if len(wall_ns) == 0:
+        none = np.zeros(0, dtype=np.int64)
+        return none, none, none
+    bucket = wall_ns // (_BUCKET_S * 1_000_000_000)
+    starts = np.flatnonzero(np.concatenate(([True], bucket[1:] != bucket[:-1])))
+    unique, index = np.unique(bucket[starts], return_inverse=True)
+    return starts, unique, index
 
 
 def wall_to_utc(wall_ns: IntArray, options: ReadOptions, *, needed_by: str) -> Instants:
@@ -167,27 +172,55 @@ def parse_digits(cells: AnyArray, fraction: int) -> tuple[IntArray, BoolArray]:
     valid : bool array, shape (n,)
         Is it a date of the calendar and a time of the day?
     """
-    places = [0, 1, 2, 3, 5, 6, 8, 9, 11, 12, 14, 15, 17, 18, *range(20, 20 + fraction)]
-    digit = cells[:, places].T.astype(np.int32) - 48
+    count = len(cells)
+    if count == 0:
+        return np.zeros(0, dtype=np.int64), np.zeros(0, dtype=bool)
+    # logs run forward: the date and the minute of a run of times are read once
+    half = np.ascontiguousarray(cells[:, :16]).view(np.uint64)
+    starts = np.flatnonzero(np.concatenate(([True], (half[1:, 0] != half[:-1, 0]) | (half[1:, 1] != half[:-1, 1]))))
+    length = np.diff(np.append(starts, count))
+    minute, dated = _minutes(cells[starts, :16])
+    valid = np.repeat(dated, length)
+    second, good = _whole(cells[:, 17:19])
+    valid &= good & (second < 60) & (cells[:, 16] == 58)
+    wall = np.repeat(minute, length) + second * np.int64(1_000_000_000)
+    if fraction:
+        part, good = _whole(cells[:, 20 : 20 + fraction])
+        valid &= good & (cells[:, 19] == 46)
+        wall += part * np.int64(10 ** (9 - fraction))
+    wall[~valid] = 0
+    return wall, valid
+
+
+def _whole(cells: AnyArray) -> tuple[IntArray, BoolArray]:
+    """Digits, uint8 of shape (n, up to 9), as whole numbers; second, whether they are digits."""
+    total, worst = np.zeros(len(cells), dtype=np.int64), np.zeros(len(cells), dtype=np.uint8)
+    for column in cells.T:
+        digit = column - np.uint8(48)
+        np.maximum(worst, digit, out=worst)
+        total *= 10
+        total += digit
+    return total, worst <= 9
+
+
+def _minutes(cells: AnyArray) -> tuple[IntArray, BoolArray]:
+    """``YYYY-mm-dd HH:MM``, uint8 of shape (n, 16), to wall nanoseconds, and whether it is such a minute."""
+    digit = cells[:, [0, 1, 2, 3, 5, 6, 8, 9, 11, 12, 14, 15]].T.astype(np.int32) - 48
     valid = np.all((digit >= 0) & (digit <= 9), axis=0)
-    for place, allowed in ((4, b"-/"), (7, b"-/"), (10, b" T"), (13, b":"), (16, b":"), (19, b".")):
-        if place < cells.shape[1]:
-            valid &= (cells[:, place] == allowed[0]) | (cells[:, place] == allowed[-1])
+    for place, allowed in ((4, b"-/"), (7, b"-/"), (10, b" T"), (13, b":")):
+        valid &= (cells[:, place] == allowed[0]) | (cells[:, place] == allowed[-1])
     year = digit[0] * 1000 + digit[1] * 100 + digit[2] * 10 + digit[3]
-    month, day, hour, minute, second = (digit[i] * 10 + digit[i + 1] for i in (4, 6, 8, 10, 12))
+    month, day, hour, minute = (digit[i] * 10 + digit[i + 1] for i in (4, 6, 8, 10))
     inside = np.clip(month, 1, 12)
     leap = (year % 4 == 0) & ((year % 100 != 0) | (year % 400 == 0))
     days = _MONTH_DAYS[inside] - ((inside == 2) & ~leap)
     # datetime64[ns] spans 1678-2262; a log outside 1970-2261 is a clock that was never set
     valid &= (year >= 1970) & (year <= 2261) & (month == inside) & (day >= 1) & (day <= days)
-    valid &= (hour < 24) & (minute < 60) & (second < 60)
+    valid &= (hour < 24) & (minute < 60)
     months = (year.astype(np.int64) - 1970) * 12 + inside - 1
     date = months.astype("datetime64[M]").astype("datetime64[D]").astype(np.int64) + day - 1
-    seconds = date * 86_400 + hour * 3600 + minute * 60 + second
-    nanos = np.zeros(len(cells), dtype=np.int64)
-    for i in range(fraction):
-        nanos += digit[14 + i].astype(np.int64) * 10 ** (8 - i)
-    return np.where(valid, seconds * 1_000_000_000 + nanos, 0), valid
+    wall = (date * 86_400 + hour * 3600 + minute * 60) * 1_000_000_000
+    return np.where(valid, wall, 0), valid
 
 
 def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
@@ -207,6 +240,51 @@ def parse_texts(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolAr
     valid, zoned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     if count == 0:
         return wall, valid, offset, zoned
+    left = np.arange(count)
+    if (end := _end_of_digits(bytes(column[0]))) is not None:
+        # most logs write one layout: that of the first time, whose valid rows need no second look
+        tail = bytes(column[0])[end:]
+        seconds = _zone_s(tail)
+        alike = _alike(column, end)
+        if seconds is not None and alike is not None:
+            wall, valid = parse_digits(alike[0][:, :end], max(end - 20, 0))
+            valid &= alike[1]
+            wall[~valid] = 0
+            if tail:
+                offset[valid], zoned[valid] = seconds, True
+            left = np.flatnonzero(~valid)
+            if not len(left):
+                return wall, valid, offset, zoned
+    wall[left], valid[left], offset[left], zoned[left] = _any_layout(column[left])
+    return wall, valid, offset, zoned
+
+
+def _end_of_digits(text: bytes) -> int | None:
+    """Where the seconds of a time end, None where it is none."""
+    found = _SECONDS.match(text)
+    return None if found is None else found.end()
+
+
+_SECONDS = re.compile(TIME)
+
+
+def _alike(column: AnyArray, end: int) -> tuple[AnyArray, BoolArray] | None:
+    """Texts as bytes, uint8 of shape (n, width), and which end as the first one does behind its seconds."""
+    width = column.dtype.itemsize
+    if width < end:
+        return None
+    cells = np.ascontiguousarray(column).view(np.uint8).reshape(len(column), width)
+    alike = np.ones(len(column), dtype=bool)
+    for i in range(end, width):
+        alike &= cells[:, i] == cells[0, i]
+    return cells, alike
+
+
+def _any_layout(column: AnyArray) -> tuple[IntArray, BoolArray, IntArray, BoolArray]:
+    """:func:`parse_texts` of times of several layouts."""
+    count = len(column)
+    wall, offset = np.zeros(count, dtype=np.int64), np.zeros(count, dtype=np.int64)
+    valid, zoned = np.zeros(count, dtype=bool), np.zeros(count, dtype=bool)
     width = max(column.dtype.itemsize, 30)
     cells = column.astype(f"S{width}").view(np.uint8).reshape(count, width)
     digits = (cells[:, 20:29] >= 48) & (cells[:, 20:29] <= 57)

@@ -148,7 +148,9 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
         beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
         rat, serving = np.full(len(row), cell.rat, dtype=object), np.full(len(row), cell.serving)
-        tables.append(_cells.Table(row, rat, pci, arfcn, level[row], serving, beside))
+        tables.append(
+            _cells.Table(row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, beside=beside)
+        )
     return _cells.joined(tables)
 
 

@@ -212,7 +212,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     rejected = tuple(RejectedLine(int(i) + 1, "the row has no time", "") for i in np.flatnonzero(~valid))
     warnings += instants.warnings
     streams = _streams(kept, keep, instants, options, clock)
-    return ReadResult("flight_mat", streams, count, len(keep), 0, rejected, tuple(warnings))
+    return ReadResult(
+        reader="flight_mat",
+        streams=streams,
+        lines=count,
+        accepted=len(keep),
+        blank=0,
+        rejected=rejected,
+        warnings=tuple(warnings),
+    )
 
 
 def _streams(

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import re
+from collections.abc import Iterable, Mapping
 from dataclasses import replace
 from difflib import get_close_matches
 
@@ -15,12 +16,12 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
-from . import _frames, _lines, _time
+from . import _frames, _lines, _table, _time
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
@@ -112,11 +113,19 @@ def _number(cell: bytes) -> float:
 
 
 def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
-    texts = [cell.strip().strip('"').encode("ascii", "replace") for cell in cells]
+    texts = [_bare(cell) for cell in cells]
     if not _counts(texts):
         written = np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts] or [b"-"], dtype=np.bytes_)
         return _time.texts_to_utc(written[: len(texts)], options, needed_by="generic_csv")
-    seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts])
+    return _counted(np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts]), options)
+
+
+def _bare(cell: str) -> bytes:
+    return cell.strip().strip('"').encode("ascii", "replace")
+
+
+def _counted(seconds: FloatArray, options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
+    """Instants of times that are numbers; where they are none NaN."""
     origin = _time.origin_ns(options, needed_by="generic_csv")
     valid = np.isfinite(seconds) & (np.abs(seconds) < (9e8 if origin is not None else 9.2e9))
     whole = np.floor(np.where(valid, seconds, 0))
@@ -128,7 +137,7 @@ def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyA
     return _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
 
 
-def _counts(texts: list[bytes]) -> bool:
+def _counts(texts: Iterable[bytes]) -> bool:
     """Whether times are numbers: the first that is a time in either form decides."""
     for text in texts:
         if _PLAIN.fullmatch(text):
@@ -194,36 +203,141 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
         return ReadResult("generic_csv", (), len(lines), 0, len(lines))
     header = _header(lines, first)
     kind, where = _checked(options, header)
-    rows, cells, rejected = _table(lines, first, len(header))
-    column = {name: [line[i] for line in cells] for name, i in where.items()}
-    instants, valid = _times(column.pop("time"), options)
+    table = _at_once(lines, first, len(header), where, options) or _one_by_one(lines, first, where, header, options)
+    rows, rejected, instants, valid, numbers = table
     rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
     flag = _lines.flags(len(rows))
     instants.flag(flag)
-    comma = _separator(lines.raw(first)) != ","
-    numbers = {name: _numbers(texts, comma) for name, texts in column.items()}
     odd = np.any([np.isposinf(numbers[name]) for name in _VALUE[kind]], axis=0)
     _lines.add_flag(flag, odd, "no_number")
-    values, extra = _values(kind, {k: np.where(np.isposinf(v), np.nan, v) for k, v in numbers.items()}, flag, options)
+    numbers = {k: np.where(np.isposinf(v), np.nan, v) if np.isposinf(v).any() else v for k, v in numbers.items()}
+    values, extra = _values(kind, numbers, flag, options)
     if lines.unterminated:
         _lines.add_flag(flag, rows == len(lines) - 1, _lines.UNTERMINATED)
-    frame = _frames.frame(kind, instants.time, rows + 1, flag, values)[valid].reset_index(drop=True)
+    frame = _frames.frame(kind, instants.time, rows + 1, flag, values)
+    if not valid.all():
+        frame = frame[valid].reset_index(drop=True)
     stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
     warnings = [*instants.warnings, *_frames.steps_back(frame)]
     if kind == "rss" and options.unit is None:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
-        "generic_csv",
-        (stream, *_track(kind, frame, options)) if len(frame) else (),
-        len(lines),
-        len(frame),
-        int(blank.sum()) + 1,
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        tuple(warnings),
+        reader="generic_csv",
+        streams=(stream, *_track(kind, frame, options)) if len(frame) else (),
+        lines=len(lines),
+        accepted=len(frame),
+        blank=int(blank.sum()) + 1,
+        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
+        warnings=tuple(warnings),
     )
 
 
-def _table(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
+_Table = tuple[IntArray, list[RejectedLine], _time.Instants, BoolArray, dict[str, FloatArray]]
+"""0-based rows, other lines as rejected, times, whether they are some, and the mapped columns."""
+
+
+def _one_by_one(
+    lines: _lines.Lines, first: int, where: Mapping[str, int], header: list[str], options: ReadOptions
+) -> _Table:
+    """The table cell by cell, whatever it holds."""
+    rows, cells, rejected = _cells(lines, first, len(header))
+    column = {name: [line[i] for line in cells] for name, i in where.items()}
+    instants, valid = _times(column.pop("time"), options)
+    comma = _separator(lines.raw(first)) != ","
+    return rows, rejected, instants, valid, {name: _numbers(texts, comma) for name, texts in column.items()}
+
+
+def _at_once(
+    lines: _lines.Lines, first: int, width: int, where: Mapping[str, int], options: ReadOptions
+) -> _Table | None:
+    """The table column by column, or None where quotes or a cell beyond any number stand in the way."""
+    separator = _separator(lines.raw(first))
+    if b'"' in lines.data or b"\0" in lines.data:
+        return None
+    found = _table.fields(lines, width, ord(separator))
+    found = found.take(~lines.blank[found.rows] & (found.rows != first))
+    if not len(found.rows):
+        return None
+    left = ~lines.blank
+    left[found.rows] = left[first] = False
+    rejected = []
+    for i in np.flatnonzero(left).tolist():
+        count = lines.raw(i).count(separator.encode()) + 1
+        rejected.append(lines.reject(i, f"{count} fields where the header has {width} (torn line?)"))
+
+    def texts(column: int) -> AnyArray:
+        return _table.texts(lines, found.start(column), found.ends[:, column])
+
+    numbers = dict(where)
+    clock = texts(numbers.pop("time"))
+    names, columns = list(numbers), sorted(set(numbers.values()))
+    also = (b" :TZ/" + separator.encode()) if separator != "," else b" :TZ/"
+    plain = _table.numbers(lines, found.rows, width, columns, also=also, separator=separator) if _EXACT else None
+    if plain is not None:
+        value = {name: plain[columns.index(numbers[name])] for name in names}
+    else:
+        read = {name: _column(texts(numbers[name]), comma=separator != ",") for name in names}
+        value = {name: column for name, column in read.items() if column is not None}
+    times = _clock(clock, options)
+    if times is None or len(value) < len(names):
+        return None
+    return found.rows, rejected, *times, value
+
+
+_EXACT = int(pd.__version__.split(".")[0]) >= 3
+"""Whether pandas' parser reads each decimal as ``float`` does, to the last digit."""
+_MOST_BYTES = 400
+_OF_NUMBERS = np.zeros(256, dtype=np.bool_)
+_OF_NUMBERS[np.frombuffer(b"0123456789+-.eE\0", dtype=np.uint8)] = True
+
+
+def _column(cells: AnyArray, *, comma: bool) -> FloatArray | None:
+    """As :func:`_numbers`, of byte strings without NUL: numbers at once, each other text once; None if one is long."""
+    width = cells.dtype.itemsize
+    if width > _MOST_BYTES:
+        return None
+    byte = np.zeros((len(cells), width + 1), dtype=np.uint8)
+    byte[:, :width] = cells.view(np.uint8).reshape(len(cells), width)
+    if comma:
+        byte[byte == 44] = 46
+    begin = np.where((byte[:, 0] == 43) | (byte[:, 0] == 45), byte[:, 1], byte[:, 0])
+    number = begin - np.uint8(48) <= 9
+    for column in byte.T:
+        number &= _OF_NUMBERS[column]
+    shown = byte.view(f"S{width + 1}").ravel()
+    out = np.full(len(cells), np.nan)
+    try:
+        out[number] = shown[number].astype(np.float64)
+    except ValueError:  # such as 1e or 1.2.3
+        number[:] = False
+    known: dict[bytes, float] = {b"": np.nan}
+    for i in np.flatnonzero(~number & (byte[:, 0] > 0)).tolist():
+        text = bytes(cells[i])
+        if text not in known:
+            known[text] = float(_numbers([text.decode("utf-8", "replace")], comma)[0])
+        out[i] = known[text]
+    return out
+
+
+def _clock(cells: AnyArray, options: ReadOptions) -> tuple[_time.Instants, BoolArray] | None:
+    """As :func:`_times`, of byte strings without NUL; None where some are long."""
+    width = cells.dtype.itemsize
+    if width > _MOST_BYTES:
+        return None
+    byte = cells.view(np.uint8).reshape(len(cells), width)
+    last = byte[np.arange(len(cells)), np.maximum(np.char.str_len(cells) - 1, 0)]
+    odd = np.flatnonzero((byte.max(axis=1) > 126) | (byte[:, 0] <= 32) | (last <= 32))
+    if len(odd):  # blanks around, which are taken off, or letters of no time
+        bare = [_bare(bytes(cells[i]).decode("utf-8", "replace")) for i in odd.tolist()]
+        cells = cells.astype(f"S{max(width, *map(len, bare))}")
+        cells[odd] = bare
+    if not _counts(bytes(cell) for cell in cells):
+        return _time.texts_to_utc(cells, options, needed_by="generic_csv")
+    seconds = _column(cells, comma=False)
+    return None if seconds is None else _counted(np.where(np.isinf(seconds), np.nan, seconds), options)
+
+
+def _cells(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
     """Rows with as many fields as the header, and the rest as rejected lines."""
     numbers: list[int] = []
     cells: list[list[str]] = []
@@ -262,7 +376,7 @@ def _values(
     """Columns by the rules of the kind, and the attributes that go with them."""
     if kind == "rss":
         silent = ~(values["rss_db"] > options.floor_db)
-        _lines.add_flag(flag, silent & (flag != "no_number"), "out_of_coverage")
+        _lines.add_flag(flag, _no_words(silent, flag), "out_of_coverage")
         values["rss_db"] = np.where(silent, np.nan, values["rss_db"])
         return values, {"unit": options.unit or "dB re full scale"}
     if kind == "rank":
@@ -270,7 +384,7 @@ def _values(
         rank = ri + 1 if options.ri_base == "zero" else ri
         good = (rank >= 1) & (rank <= 8)
         none = np.isnan(ri) | ((ri == 0) & (options.ri_base == "one"))
-        _lines.add_flag(flag, none & (flag != "no_number"), "no_csi")
+        _lines.add_flag(flag, _no_words(none, flag), "no_csi")
         _lines.add_flag(flag, ~good & ~none, "ri_out_of_range")
         values["rank"] = np.where(good, rank, np.nan)
         return values, {"ri_base": options.ri_base}
@@ -283,6 +397,14 @@ def _values(
         if name in values:
             values[name] = np.where(np.isnan(values[name]), -1, values[name]).clip(-1, 255).astype(np.int64)
     return values, {}
+
+
+def _no_words(mask: BoolArray, flag: AnyArray) -> BoolArray:
+    """Rows of the mask whose flag is not that of a word alone."""
+    out: BoolArray = mask.copy()
+    rows = np.flatnonzero(mask)
+    out[rows] = flag[rows] != "no_number"
+    return out
 
 
 READER = Reader(

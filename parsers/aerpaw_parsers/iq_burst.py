@@ -64,7 +64,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         frame = _frames.frame("rss", instants.time, np.array([1]), flag, {"rss_db": level})
         attributes = _frames.attributes(options, channel=f"USRP{i + 1}", unit=options.unit or "dB re full scale")
         streams.append(Stream("rss", f"USRP{i + 1}", frame, {"frequency_hz": float(named[1]), **attributes}))
-    return ReadResult("iq_burst", tuple(streams), 1, 1, 0, (), instants.warnings)
+    return ReadResult(
+        reader="iq_burst", streams=tuple(streams), lines=1, accepted=1, blank=0, rejected=(), warnings=instants.warnings
+    )
 
 
 READER = Reader(

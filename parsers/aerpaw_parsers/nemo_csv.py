@@ -40,24 +40,27 @@ def _reason(line: bytes) -> str | None:
     return "a field is no number"
 
 
-def _plain(lines: _lines.Lines) -> tuple[IntArray, FloatArray]:
+def _plain(lines: _lines.Lines) -> tuple[IntArray, list[FloatArray]]:
     """Rows of plain numbers and their nine columns, at once."""
     rows = _table.rows_of(lines, 9)
     rows = rows[rows > 0]  # the header
     value = _table.numbers(lines, rows, 9)
     if value is None:
-        return rows[:0], np.empty((9, 0))
+        return rows[:0], [np.empty(0)] * 9
     valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1])
-    return rows[valid], value[:, valid]
+    return (rows, value) if valid.all() else (rows[valid], [column[valid] for column in value])
 
 
-def _columns(lines: _lines.Lines) -> tuple[IntArray, FloatArray]:
+def _columns(lines: _lines.Lines) -> tuple[IntArray, list[FloatArray]]:
     """Rows and their nine columns: the plain ones at once, the rest by the pattern."""
     rows, value = _plain(lines)
     odd, groups = _lines.match_rest(lines, _ROW, rows)
-    texts = np.stack([_lines.numbers(cells) for cells in _lines.columns(groups, 9)])
+    if not len(odd):
+        return rows, value
+    texts = [_lines.numbers(cells) for cells in _lines.columns(groups, 9)]
     order = np.argsort(np.concatenate((rows, odd)), kind="stable")
-    return np.concatenate((rows, odd))[order], np.concatenate((value, texts), axis=1)[:, order]
+    joined = [np.concatenate(pair)[order] for pair in zip(value, texts, strict=True)]
+    return np.concatenate((rows, odd))[order], joined
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

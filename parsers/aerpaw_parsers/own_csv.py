@@ -86,6 +86,10 @@ def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         mine: BoolArray = (query == name) & (status == "ok")
         columns = {"rank": "rank", "ri_raw": "ri raw", "cqi": "cqi", "mcs": "mcs", "uncertainty_s": "uncertainty s"}
         values = {key: _number(sheet, plain) for key, plain in columns.items()}
+        rank = values["rank"]
+        odd = mine & ~np.isnan(rank) & ~((rank >= 1) & (rank <= 8) & (rank == np.round(rank)))
+        rows.mark(odd, "ri_out_of_range")
+        values["rank"] = np.where(odd, np.nan, rank)
         name = name.removesuffix("_csi")
         if name == "nr5g" or np.isfinite(values["rank"][mine]).any():
             made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))

@@ -47,7 +47,13 @@ def _reading(row: int, cell: dict[str, Any], connected: float) -> _cells.Reading
     serving = str(cell.get("is_connected")).lower() == "true" or (rat == "lte" and pci == connected)
     arfcn = next((v for key in ("earfcn", "nrarfcn", "arfcn") if np.isfinite(v := _json.number(cell.get(key)))), np.nan)
     return _cells.Reading(
-        row, rat, pci, arfcn, level, serving, (quality, _json.number(cell.get("rssi")), ratio, np.nan)
+        row=row,
+        rat=rat,
+        pci=pci,
+        arfcn=arfcn,
+        rsrp_dbm=level,
+        serving=serving,
+        beside=(quality, _json.number(cell.get("rssi")), ratio, np.nan),
     )
 
 

@@ -19,15 +19,14 @@ from . import _cells, _lines, _rows, _time
 
 _STAMP = re.compile(rb"^(" + _time.TIME + rb")")
 _ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')
-_HEADER = re.compile(rb"\|\s*\|\s*(LTE|NR5G-NSA|NR5G-SA|servingcell)\s*\|(.*)\|\s*$")
+_HEAD = rb"^\|[ \t]*\|[ \t]*(%b)[ \t]*\|(.*)\|[ \t\r]*$"
+_TITLES = (b"LTE", b"NR5G-NSA", b"NR5G-SA", b"servingcell")
+_HEADER = re.compile(_HEAD % b"|".join(_TITLES))
 _KEPT = (
     re.compile(_STAMP.pattern, re.MULTILINE),
-    *(
-        re.compile(rb"^\|[ \t]*\|[ \t]*" + name + rb"[ \t]*\|", re.MULTILINE)
-        for name in (b"LTE", b"NR5G-NSA", b"NR5G-SA")
-    ),
+    *(re.compile(_HEAD % title, re.MULTILINE) for title in _TITLES),
 )
-"""Lines on which the rows below hang: the time of a table, and the head of each kind."""
+"""Lines on which the rows below hang: the time of a table, and the head of each kind; as :func:`_tables` knows them."""
 _CSI = ("lte_csi", "nr5g_csi")
 
 
@@ -51,7 +50,7 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
         line = lines.raw(i)
         if stamp := _STAMP.match(line):
             time = stamp[1]
-        if header := _HEADER.search(line):
+        if header := _HEADER.match(line):
             names[header[1]] = [cell.decode("ascii", "replace").strip() for cell in header[2].split(b"|")]
         row = _ROW.search(line)
         if row is None:
@@ -79,10 +78,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     kept = [found[i] for i in rows.at.tolist()]
     readings = [
         _cells.Reading(
-            i, "lte" if title == "LTE" else "nr", value.get("PCID", np.nan),
-            value.get("earfcn", value.get("ARFCN", np.nan)),
-            value.get("RSRP", np.nan), True,
-            (value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
+            row=i, rat="lte" if title == "LTE" else "nr", pci=value.get("PCID", np.nan),
+            arfcn=value.get("earfcn", value.get("ARFCN", np.nan)),
+            rsrp_dbm=value.get("RSRP", np.nan), serving=True,
+            beside=(value.get("RSRQ", np.nan), value.get("RSSI", np.nan), value.get("SINR", np.nan), np.nan),
         )
         for i, (_, _, title, value) in enumerate(kept) if "RSRP" in value
     ]  # fmt: skip

@@ -151,40 +151,48 @@ def _csi_rows(lines: _lines.Lines, options: ReadOptions, rejected: list[Rejected
     """CSI rows: those of the launched logger at once, others by the pattern; all columns but the first are numbers."""
     number, wall, value = _launched(lines)
     odd, groups = _lines.match_rest(lines, _CSI, number)
-    column = _lines.columns(groups, _CSI.groups)
-    parsed = _time.parse_texts(column[0])
-    order = np.argsort(np.concatenate((number, odd)), kind="stable")
-    number = np.concatenate((number, odd))[order]
-    wall = np.concatenate((wall, parsed[0]))[order]
-    valid = np.concatenate((np.ones(len(number) - len(odd), dtype=bool), parsed[1]))[order]
-    value = np.concatenate((value, np.stack([_values(cells) for cells in column[1:]])), axis=1)[:, order]
+    valid = np.ones(len(number), dtype=bool)
+    if len(odd):
+        column = _lines.columns(groups, _CSI.groups)
+        parsed = _time.parse_texts(column[0])
+        order = np.argsort(np.concatenate((number, odd)), kind="stable")
+        number = np.concatenate((number, odd))[order]
+        wall = np.concatenate((wall, parsed[0]))[order]
+        valid = np.concatenate((valid, parsed[1]))[order]
+        read = [_values(cells) for cells in column[1:]]
+        value = [np.concatenate(pair)[order] for pair in zip(value, read, strict=True)]
     if not len(number):
         return None
-    rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
-    instants = _time.wall_to_utc(wall[valid], options, needed_by="quectel_csv")
-    return _Rows(number[valid], instants, [np.zeros(0), *value[:, valid]])
+    if not valid.all():
+        rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
+        number, wall, value = number[valid], wall[valid], [column[valid] for column in value]
+    instants = _time.wall_to_utc(wall, options, needed_by="quectel_csv")
+    return _Rows(number, instants, [np.zeros(0), *value])
 
 
-def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, FloatArray]:
+def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, list[FloatArray]]:
     """Lines, wall clocks and eight numbers of rows as the launched logger writes them."""
     none = np.zeros(0, dtype=np.int64)
-    rows, starts, ends = _table.fields(lines, 11)
-    mine = ends[:, 0] - starts[:, 0] == 23
+    nothing = none, none, [np.empty(0)] * 8
+    found = _table.fields(lines, 11)
+    mine = found.width(0) == 23
     for place, token in _LAUNCHED:
-        mine &= ends[:, place] - starts[:, place] == len(token)
-    rows, starts = rows[mine], starts[mine]
+        mine &= found.width(place) == len(token)
+    found = found.take(mine)
     for place, token in _LAUNCHED:
         if (
-            not len(rows)
-            or (_table.cells_at(lines, starts[:, place], len(token)) != np.frombuffer(token, dtype=np.uint8)).any()
+            not len(found.rows)
+            or (_table.cells_at(lines, found.start(place), len(token)) != np.frombuffer(token, dtype=np.uint8)).any()
         ):
-            return none, none, np.empty((8, 0))
-    value = _table.numbers(lines, rows, 11, (2, 3, 4, 5, 7, 8, 9, 10), also=b'" :/QNWCFGlte_csinr5g')
+            return nothing
+    value = _table.numbers(lines, found.rows, 11, (2, 3, 4, 5, 7, 8, 9, 10), also=b'" :/QNWCFGlte_csinr5g')
     if value is None:
-        return none, none, np.empty((8, 0))
-    wall, valid = _time.parse_digits(_table.cells_at(lines, starts[:, 0], 23), 3)
-    keep = valid & np.isfinite(value).all(axis=0)
-    return rows[keep], wall[keep], value[:, keep]
+        return nothing
+    wall, valid = _time.parse_digits(_table.cells_at(lines, found.begin, 23), 3)
+    keep = valid & np.isfinite(sum(value))
+    if keep.all():
+        return found.rows, wall, value
+    return found.rows[keep], wall[keep], [column[keep] for column in value]
 
 
 def _values(cells: AnyArray) -> FloatArray:

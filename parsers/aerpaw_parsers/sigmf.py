@@ -132,7 +132,15 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     read_lines = np.unique(np.concatenate([stream.frame["line"].to_numpy() for stream in kept]))
     lost = np.setdiff1d(np.arange(1, count + 1), read_lines)
     rejected = tuple(RejectedLine(int(i), "a value without a time", "") for i in lost)
-    return ReadResult("sigmf", kept, count, len(read_lines), 0, rejected, tuple(dict.fromkeys(warnings)))
+    return ReadResult(
+        reader="sigmf",
+        streams=kept,
+        lines=count,
+        accepted=len(read_lines),
+        blank=0,
+        rejected=rejected,
+        warnings=tuple(dict.fromkeys(warnings)),
+    )
 
 
 def _levels(

@@ -210,13 +210,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     warnings: list[str] = []
     stream = _stream(samples, repeats, lines, options, warnings)
     return ReadResult(
-        "sounder_log",
-        (stream,) if stream is not None else (),
-        len(lines),
-        accepted,
-        len(blank),
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        tuple(warnings),
+        reader="sounder_log",
+        streams=(stream,) if stream is not None else (),
+        lines=len(lines),
+        accepted=accepted,
+        blank=len(blank),
+        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
+        warnings=tuple(warnings),
     )
 
 

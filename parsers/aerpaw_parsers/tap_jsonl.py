@@ -106,13 +106,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
         )
     comments = len(records) - len(exchanges)
     return ReadResult(
-        "tap_jsonl",
-        tuple(streams),
-        lines,
-        len(exchanges),
-        blank + comments,
-        tuple(rejected),
-        _warnings(records, rejected),
+        reader="tap_jsonl",
+        streams=tuple(streams),
+        lines=lines,
+        accepted=len(exchanges),
+        blank=blank + comments,
+        rejected=tuple(rejected),
+        warnings=_warnings(records, rejected),
     )
 
 

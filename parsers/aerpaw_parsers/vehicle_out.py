@@ -88,6 +88,8 @@ class _Rows:
 
     def join(self, other: _Rows) -> _Rows:
         """Rows of both, in file order."""
+        if not len(other.line):
+            return self
         order = np.argsort(np.concatenate((self.line, other.line)), kind="stable")
         return _Rows(
             *(
@@ -118,45 +120,42 @@ def _at_once(lines: _lines.Lines) -> _Rows:
     none = np.zeros(0, dtype=np.int64)
     nothing = _Rows(none, np.empty((len(_NUMBERS), 0)), none, none > 0, none, none > 0)
     for count, time in ((14, 11), (8, 5), (9, 6)):
-        rows, starts, ends = _table.fields(lines, count)
-        mine = ends[:, time] - starts[:, time] == 26
+        found = _table.fields(lines, count)
+        mine = found.width(time) == 26
         if 2 * mine.sum() <= len(lines):
             continue
-        rows, starts, ends = rows[mine], starts[mine], ends[mine]
-        if count == 14 and not _tuples_in_place(lines, starts, ends):
+        found = found.take(mine)
+        if count == 14 and not _tuples_in_place(lines, found):
             return nothing
         wanted = [i for i in range(count) if i != time]
-        value = _table.numbers(lines, rows, count, wanted, strip=b'"()', also=b" :T/")
+        value = _table.numbers(lines, found.rows, count, wanted, strip=b'"()', also=b" :T/")
         if value is None:
             return nothing
-        number = np.full((len(_NUMBERS), len(rows)), np.nan)
-        number[:4], number[-2:] = value[:4], value[-2:]
-        if count == 14:
-            number[4:10] = value[4:10]
-        wall, valid = _time.parse_digits(_table.cells_at(lines, starts[:, time], 26), 6)
-        whole = np.all(
-            (number[[0, 10, 11]] == np.floor(number[[0, 10, 11]])) & (np.abs(number[[0, 10, 11]]) < 1e12), axis=0
-        )
-        keep = valid & whole & ~np.isnan(number[1:4]).any(axis=0) & ~(np.abs(number[10:]) > 999).any(axis=0)
-        if count == 14:
-            keep &= ~np.isnan(number[4:10]).any(axis=0)
-        zero = np.zeros(int(keep.sum()), dtype=np.int64)
-        return _Rows(rows[keep], number[:, keep], wall[keep], valid[keep], zero, zero > 0)
+        unknown = np.full(len(found.rows), np.nan)
+        middle = value[4:10] if count == 14 else [unknown] * 6
+        number = np.stack([*value[:4], *middle, *value[-2:]])
+        wall, keep = _time.parse_digits(_table.cells_at(lines, found.start(time), 26), 6)
+        for whole, most in ((number[0], 1e12), (number[10], 1000.0), (number[11], 1000.0)):
+            keep &= (whole == np.floor(whole)) & (np.abs(whole) < most)
+        keep &= ~np.isnan(number[1:10] if count == 14 else number[1:4]).any(axis=0)
+        rows = found.rows
+        if not keep.all():
+            rows, number, wall = rows[keep], number[:, keep], wall[keep]
+        zero = np.zeros(len(rows), dtype=np.int64)
+        return _Rows(rows, number, wall, zero == 0, zero, zero > 0)
     return nothing
 
 
-def _tuples_in_place(lines: _lines.Lines, starts: IntArray, ends: IntArray) -> bool:
+def _tuples_in_place(lines: _lines.Lines, found: _table.Fields) -> bool:
     """Whether each row has its quotes and brackets where the two tuples are, and nowhere else."""
     at = lines.buffer
-    right = np.ones(len(starts), dtype=bool)
+    right = np.ones(len(found.rows), dtype=bool)
     for first, last in ((4, 6), (7, 9)):
-        opening, closing = starts[:, first], ends[:, last]
-        right &= (ends[:, first] - opening > 2) & (closing - starts[:, last] > 2)
+        opening, closing = found.start(first), found.ends[:, last]
+        right &= (found.ends[:, first] - opening > 2) & (closing - found.start(last) > 2)
         right &= (at[opening] == 34) & (at[opening + 1] == 40) & (at[closing - 1] == 34) & (at[closing - 2] == 41)
-    for sign, number in ((34, 4), (40, 2), (41, 2)):
-        places = np.flatnonzero(at == sign)
-        right &= np.searchsorted(places, ends[:, -1]) - np.searchsorted(places, starts[:, 0]) == number
-    return bool(right.all())
+    text = _table.bytes_of(lines, found.rows)
+    return bool(right.all()) and [text.count(sign) for sign in b'"()'] == [n * len(right) for n in (4, 2, 2)]
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -239,7 +238,7 @@ def _settled(result: ReadResult) -> ReadResult:
         return result
     frame = result.streams[0].frame
     flag = frame["flag"].to_numpy(dtype=object)
-    odd = flag[flag != ""].tolist()  # few: the flags are looked at one by one
+    odd = [text for text in flag.tolist() if text]  # few: the flags are looked at one by one
     zero, no_fix = (sum(name in text.split(";") for text in odd) for name in ("zero_attitude", "no_fix"))
     warnings = []
     if zero:

@@ -17,6 +17,8 @@ from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
 from tests.jobs.sent_by_pickle import SentByPickle
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ROUTES = {
     "first": [(-60, 10, 30), (-250, 60, 30), (-100, 260, 40), (160, 160, 40), (200, -150, 30), (-180, -160, 30)],
     "second": [(60, 30, 45), (-200, 160, 45), (-220, -90, 35), (20, -220, 35), (240, 20, 45), (60, 240, 45)],

@@ -26,6 +26,8 @@ from aerpaw_cmp.jobs.over_flights import RepeatSettings, pool_offsets, repeats, 
 from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import RankRow, RssRow, place_means
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 YAW_DEG = 110.0
 OFFSETS_DB = {"first": 12.3, "second": 9.1}
 FADING_DB = 1.0

@@ -16,6 +16,8 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.ladder import Model, recommended_settings
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 LW1 = (35.72750947, -78.69595819)
 ORIGIN = "2025-06-01T14:00:00Z"
 

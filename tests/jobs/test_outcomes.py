@@ -23,6 +23,8 @@ from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, 
 from aerpaw_cmp.jobs.workers import Here, Processes
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack, RankRow, RssRow
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 TYPES = (Outcome, RssRow, RankRow, FlownTrack)
 
 

@@ -17,6 +17,8 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = ["--timezone", "America/New_York"]
 MAP = {

@@ -1,14 +1,17 @@
 """A scene to a site.yaml, through replay, and back."""
 
+import json
+import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.common.errors import CheckError, UsageError
 from aerpaw_cmp.jobs.site_scene import is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.tracer import replay
@@ -101,3 +104,71 @@ def test_a_site_of_prisms_can_be_written(tmp_path: Path) -> None:
     files = run_site_export("lake_wheeler", tmp_path / "out", trees=False)
     assert files[0].name == "scene.xml"
     assert {f.stem for f in files[1:]} >= {"all_concrete", "all_medium_dry_ground"}
+
+
+FLIGHT = {
+    "flight": {
+        "name": "room", "synthetic": True,
+        "plan": {
+            "start": "2025-06-01T10:00:00", "seed": 4, "speed_mps": 4.0, "rss_interval_s": 2.0, "fading_db": 0.0,
+            "waypoints": [{"east_m": e, "north_m": 8.0, "height_m": h} for e, h in ((-18, 12), (6, 6))],
+            "offsets_db": {"T": {"USRP1": 12.3}},
+        },
+    },
+    "site": {"file": "site.yaml"},
+    "timezone": "UTC",
+    "logs": [
+        {"path": "vehicle.txt", "reader": "vehicle_out"},
+        {"path": "USRP1.txt", "reader": "sounder_log", "node": "T", "channel": "USRP1"},
+    ],
+    "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"layout": "single"}, "uav": {"layout": "single"}}},
+    "rt": {"audit_links": 3, "samples": 10_000, "cache": False, "power_cut_db": 30.0},
+    "rss": {"bootstrap": 10, "lag": "off"},
+    "report": {"speed_table": False},
+}  # fmt: skip
+
+
+@pytest.fixture
+def flown(room: Path, tmp_path: Path) -> Path:
+    run_scene_import(room, tmp_path / "site.yaml", origin="35.7,-78.7", towers=["T=-5,3,10"])
+    (tmp_path / "flight.yaml").write_text(yaml.safe_dump(FLIGHT))
+    assert main(["simulate", str(tmp_path / "flight.yaml"), "--quiet"]) == 0
+    return tmp_path / "flight.yaml"
+
+
+def test_the_plan_of_a_flight_in_a_scene_has_the_estimate(flown: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    capsys.readouterr()
+    assert main(["report", str(flown), "--dry-run", "--json", "--quiet"]) == 0
+    (stage,) = (s for s in json.loads(capsys.readouterr().out)["stages"] if s["name"].startswith("replay RSS"))
+    assert re.search(r"path search about \S+ s for 1 tower: \d+ first faces, some \d+ sequences, .* MiB", stage["work"])
+    assert stage["seconds"] >= 0.0
+
+
+@pytest.mark.sionna
+def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
+    flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Sionna gets the same triangles: no path is missing or too many, and the fields are its own."""
+    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
+    from aerpaw_cmp.propagation import sionna
+
+    try:
+        sionna.load_variant()
+    except (CheckError, UsageError) as error:
+        pytest.skip(f"no device for Dr.Jit: {error}")
+    out = tmp_path / "out"
+    assert main(["report", str(flown), "-o", str(out), "--figures", "none", "--strict", "--quiet"]) == 0
+    found = json.loads((out / "metrics.json").read_text())["rt"]
+    audit = found["audit"]
+    assert (audit["reference"], audit["missing_paths"], audit["extra_paths"]) == ("sionna", 0, 0)
+    assert audit["links"] == 3
+    assert audit["field"]["paths"] > 3
+    assert audit["field"]["power_max_db"] < 0.1
+    assert "the second implementation: it knows prisms, no scene of triangles" in audit["field"]["not_covered"]
+    assert any(text.startswith("rt.power_cut_db 30: ") for text in found["left_out"])
+    capsys.readouterr()
+    assert main(["explain", str(flown), "--time", "4", "--tower", "T", "--engine", "both", "--json", "--quiet"]) == 0
+    told = json.loads(capsys.readouterr().out)
+    assert told["differences"] == []
+    assert told["paths"][0]["path"] == "line of sight"
+    assert len(told["paths"]) > 1

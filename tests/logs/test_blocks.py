@@ -160,3 +160,48 @@ def test_a_large_member_of_an_archive_goes_through_blocks(tmp_path: Path, monkey
     (file,) = ingest(tmp_path / "a.zip", options=OPTIONS)
     same(file.result, whole.result)
     assert seen
+
+
+@pytest.mark.parametrize(
+    ("head", "damaged"), [(b"|    | LTE ", b"xy |    | LTE "), (b"SINR |\n", b"SINR ;\n")], ids=["inside", "endless"]
+)
+def test_a_damaged_head_of_a_drawn_table_counts_alike_in_blocks(head: bytes, damaged: bytes) -> None:
+    """One not at the start of its line was a head in one piece alone; one without an end hid the head before it."""
+    data = samples.QUECTEL_CONSOLE + samples.QUECTEL_CONSOLE.replace(head, damaged, 1)
+    assert damaged in data
+    whole = by_name("quectel_console").read(data, OPTIONS)
+    same(in_two("quectel_console", data.splitlines(keepends=True), OPTIONS), whole)
+    alone = samples.QUECTEL_CONSOLE.replace(head, damaged, 1)
+    same(
+        in_two("quectel_console", alone.splitlines(keepends=True), OPTIONS),
+        by_name("quectel_console").read(alone, OPTIONS),
+    )
+
+
+def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Beyond the size where its room is moved and not copied, with a type that widens on the way."""
+    monkeypatch.setattr(blocks, "_DOUBLING", 100)
+    monkeypatch.setattr(blocks, "_AT_ONCE", 37)
+    records = blocks._Records()
+    expected = []
+    for i, size in enumerate((30, 90, 1, 250, 7, 600)):
+        more = {
+            "line": np.arange(size),
+            "flag": np.array([f"reason_{i}_{n % 400}" if n % 3 else "" for n in range(size)], dtype=object),
+            "level": np.arange(size) + (0.5 if i > 2 else 0),
+        }
+        more["level"] = more["level"].astype(np.float64 if i > 2 else np.int64)
+        if i > 3:
+            more["beside"] = np.full(size, float(i))
+        expected.append(pd.DataFrame(more))
+        records.extend(more)
+    frame = records.frame()
+    pd.testing.assert_frame_equal(frame, pd.concat(expected, ignore_index=True).astype({"flag": object}))
+    texts = frame["flag"].tolist()
+    assert len({id(text) for text in texts}) == len(set(texts)) > 256, "one object per text"
+
+
+def test_steps_back_are_counted_over_the_edges(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(blocks, "_AT_ONCE", 3)
+    time = np.random.default_rng(3).integers(0, 5, 100)
+    assert blocks.steps_back(time.astype("datetime64[ns]")) == (np.diff(time) < 0).sum()

@@ -122,3 +122,11 @@ def test_our_own_exports_are_read_back() -> None:
     assert rank.frame["rank"].tolist()[0] == 2.0
     tap = read("own_csv", samples.TAP_EXPORT)
     assert [(one.kind, one.name) for one in tap.streams] == [("rank", "nr5g"), ("rss", "nr5g_rsrp")]
+
+
+@pytest.mark.parametrize("rank", ["-1", "0", "9", "1.5", "1e30"])
+def test_a_rank_that_is_none_in_a_tap_export_is_missing_and_flagged(rank: str) -> None:
+    data = samples.TAP_EXPORT.replace(b",ok,2,2,", f",ok,{rank},2,".encode(), 1)
+    (frame,) = (s.frame for s in read("own_csv", data).streams if s.kind == "rank")
+    assert np.isnan(frame["rank"].to_numpy()).all()
+    assert list(frame["flag"]) == ["ri_out_of_range"]

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_parsers import _table, vehicle_out
+from aerpaw_parsers import _table, generic_csv, vehicle_out
 from tests.parsers.samples import OPTIONS, SAMPLES
 
 CASES = [(reader, name) for reader in ("vehicle_out", "nemo_csv", "quectel_csv") for name in SAMPLES[reader]]
@@ -106,3 +106,41 @@ def test_damaged_samples(case: tuple[str, str], data: st.DataObject) -> None:
     fast_lines = {line for stream in fast.streams for line in stream.frame["line"]}
     assert len(fast_lines ^ slow_lines) <= 3
     assert slow_lines <= fast_lines
+
+
+TABLES = (
+    b"Time,Lat,Note,Level\n2025-03-02 10:00:00.250,35.7,a b,-80.5\n2025-03-02 10:00:01.250,,c,-1e1\n2025-03-02 10:00:02,1,nan,\n",
+    b"Time;Level\r\n0.5;-80,5\r\n1.5;n/a\r\n2.5;word\r\n \r\n",
+    b"Level\tTime\n-80.12345678901234\t2025-03-02T10:00:00.25-05:00\n+5.\t2025-03-02T10:00:00.2Z\n.5\t2025/03/02 10:00:00\n-inf\tx\n",
+)
+
+
+@given(st.sampled_from(TABLES), st.data())
+@settings(max_examples=200, deadline=None)
+def test_mapped_tables_by_columns_and_by_cells(table: bytes, data: st.DataObject) -> None:
+    """The whole result, damaged or not: cells that are no numbers, other numbers of fields, other forms of times."""
+    sample = bytearray(table)
+    for _ in range(data.draw(st.integers(0, 3))):
+        at = data.draw(st.integers(table.index(b"\n") + 1, len(sample) - 1))
+        new = data.draw(
+            st.sampled_from(
+                [b"", b"7", b",", b";", b"-", b".", b"e", b"\n", b"\r", b"x", b" ", b"\xe2\x80\x8b", b"inf"]
+            )
+        )
+        sample[at : at + data.draw(st.integers(0, 2))] = new
+    reader = by_name("generic_csv")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(generic_csv, "_at_once", lambda *_: None)
+        slow = reader.read(bytes(sample), OPTIONS)
+    fast = reader.read(bytes(sample), OPTIONS)
+    assert (fast.lines, fast.accepted, fast.blank, fast.rejected, fast.warnings) == (
+        slow.lines, slow.accepted, slow.blank, slow.rejected, slow.warnings,
+    )  # fmt: skip
+    for a, b in zip(fast.streams, slow.streams, strict=True):
+        pd.testing.assert_frame_equal(a.frame, b.frame, check_exact=True)
+
+
+def test_mapped_tables_are_read_by_columns(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(generic_csv, "_one_by_one", lambda *_: pytest.fail("cell by cell"))
+    for table, records in zip(TABLES, (3, 3, 3), strict=True):
+        assert by_name("generic_csv").read(table, OPTIONS).accepted == records

@@ -33,7 +33,7 @@ def main() -> None:
     loss = np.linspace(0.0, 9.0, len(few))
     os.environ["AERPAW_CMP_COMPILED"] = "never"
     numpy = channel.channel_matrices(few, scene.faces, scene.sources_m, poses, link, loss)
-    tables = channel._Materials.of(scene.faces, link.carrier_hz)
+    tables = channel.FaceMaterials.of(scene.faces, link.carrier_hz)
     electric = tables.permittivity, tables.thickness_m
     cuda_field._batch = lambda *_: 4  # several batches, the last one not full
     h, power = compiled_field.evaluate(

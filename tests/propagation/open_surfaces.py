@@ -7,6 +7,7 @@ whether it cuts a segment. Paths are told apart by where they reflect.
 from __future__ import annotations
 
 import itertools
+from functools import lru_cache
 from importlib.util import find_spec
 from pathlib import Path
 
@@ -82,11 +83,21 @@ def _back(corners, normal, offset, images, sequence, end):
 def _inside(corners, normal, points):
     """(..., mirrors) whether points (..., mirrors, 3) lie in the triangles."""
     result = np.ones(points.shape[:-1], dtype=bool)
+    for inward, least in _edges(corners.tobytes(), normal.tobytes()):
+        result &= (points * inward).sum(axis=-1) >= least
+    return result
+
+
+@lru_cache(maxsize=4096)
+def _edges(corners, normal):
+    """For each side: the inward unit vectors (mirrors, 3), and the least component along them of a point inside."""
+    corners, normal = np.frombuffer(corners).reshape(-1, 3, 3), np.frombuffer(normal).reshape(-1, 3)
+    found = []
     for k in range(3):
         edge = corners[:, (k + 1) % 3] - corners[:, k]
         inward = np.cross(normal, edge) / np.linalg.norm(edge, axis=1, keepdims=True)
-        result &= ((points - corners[:, k]) * inward).sum(axis=-1) >= -1e-6
-    return result
+        found.append((inward, (corners[:, k] * inward).sum(axis=-1) - 1e-6))
+    return found
 
 
 def _cut(corners, normal, offset, source, points, target):

@@ -27,6 +27,7 @@ from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import replay, replay_parts
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
+from aerpaw_cmp.site.mitsuba import TriangleScene
 from aerpaw_cmp.site.site import Building
 
 needs_numba = pytest.mark.skipif(
@@ -357,10 +358,10 @@ def test_cuda_without_a_device_is_one_message(monkeypatch, case):
 def fresh():
     """Nothing remembered, before and after."""
     compiled.load.cache_clear()
-    compiled._warn_once.cache_clear()
+    compiled.warn_once.cache_clear()
     yield
     compiled.load.cache_clear()
-    compiled._warn_once.cache_clear()
+    compiled.warn_once.cache_clear()
 
 
 def test_a_missing_numba_is_no_error(monkeypatch, fresh, case):
@@ -399,15 +400,62 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
 
 @needs_numba
 def test_without_a_folder_to_write_nothing_is_kept(monkeypatch):
-    from aerpaw_cmp.propagation import kernels
+    from aerpaw_cmp.propagation import numba_options
 
     def read_only(*args, **kwargs):
         raise OSError(30, "Read-only file system")
 
     monkeypatch.setattr("tempfile.TemporaryFile", read_only)
-    assert not kernels._can_keep()
+    assert not numba_options.can_keep()
     monkeypatch.undo()
-    assert kernels._can_keep()
+    assert numba_options.can_keep()
+
+
+NOTHING_CAN_BE_WRITTEN = """
+import json, tempfile
+def refuse(*args, **kwargs):
+    raise OSError(30, "Read-only file system")
+tempfile.TemporaryFile = refuse  # how numba finds a folder for its cache
+import numpy as np
+from aerpaw_cmp.propagation import boxtree, growth, kernels, merging, prisms, search_kernels
+from aerpaw_cmp.propagation.numba_options import OPTIONS
+height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
+print(json.dumps([OPTIONS["cache"], height]))
+"""
+
+
+@needs_numba
+def test_every_compiled_module_runs_where_nothing_can_be_written():
+    said = subprocess.run([sys.executable, "-c", NOTHING_CAN_BE_WRITTEN], capture_output=True, text=True, timeout=300)
+    assert said.returncode == 0, said.stderr
+    assert json.loads(said.stdout) == [False, 5.0]
+    assert said.stderr == ""
+
+
+@pytest.mark.parametrize("way", ["broken", "never"])
+def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
+    """Prisms fall back to the image engine, a broken numba told once; a scene of triangles is one message."""
+    site, link, poses, paths = case
+    monkeypatch.setattr(tracer, "MANY_FACES", 5)
+
+    def broken():
+        raise EOFError
+
+    growth = types.ModuleType("growth")
+    growth.try_out = broken
+    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.growth", growth)
+    for module in (compiled, tracer):
+        monkeypatch.setattr(module, "find_spec", lambda _: True)
+    monkeypatch.setenv(compiled.SWITCH, "never" if way == "never" else "auto")
+    with warnings.catch_warnings(record=True) as told:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            same_paths(replay(site, link, poses).paths, paths)
+    assert [str(one.message)[:24] for one in told] == (["compiled code cannot run"] if way == "broken" else [])
+    corners = np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0]])
+    mesh = TriangleScene(corners, np.array([[0, 1, 2]]), np.zeros(1, np.int64), ("floor",), ("concrete",))
+    with pytest.raises(UsageError, match=r"triangles, but (compiled code cannot run|AERPAW_CMP_COMPILED=never)"):
+        Scene.of(dataclasses.replace(site, scene=mesh), link, poses)
 
 
 def test_only_large_work_is_compiled(monkeypatch):

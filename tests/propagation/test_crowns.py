@@ -126,46 +126,54 @@ def triangles_of(site):
     return mesh.vertices_m[mesh.triangles].reshape(len(site.trees), -1, 3, 3)
 
 
-def blocked(site, tree, points, crown_step, covered):
+def woods_of(site):
+    """The crowns without each tree in turn, then those of all; and the trunks."""
+    rows = np.arange(len(site.trees))
+    stands = [Trees(*(getattr(site.trees, name)[rows != tree] for name in Trees.__slots__)) for tree in rows]
+    return [CrownIndex(stand) for stand in (*stands, site.trees)], CrownIndex(site.trees).trunks()
+
+
+def blocked(site, woods, tree, points, crown_step, covered):
     """Whether trees or buildings stop a polyline; the tree at vertex ``crown_step`` is taken out of the wood there."""
-    rest = np.arange(len(site.trees)) != tree
-    others = Trees(*(getattr(site.trees, name)[rest] for name in Trees.__slots__))
+    stands, trunks = woods
     for step, (a, b) in enumerate(itertools.pairwise(points)):
-        some = others if step in (crown_step, crown_step + 1) else site.trees
-        if CrownIndex(some).chords_m(a[None], b[None])[0] > 0:
+        some = stands[tree if step in (crown_step, crown_step + 1) else -1]
+        if some.chords_m(a[None], b[None])[0] > 0:
             return True
-        if CrownIndex(site.trees).trunks().chords_m(a[None], b[None])[0] > 0 or covered(site, a, b):
+        if trunks.chords_m(a[None], b[None])[0] > 0 or covered(site, a, b):
             return True
     return False
 
 
-def one_by_one(site, source, target, max_depth, covered):
+def one_by_one(site, woods, source, target, max_depth, covered):
     """Crown bounces of one link as {(kind, tree, rounded point)}: every triangle, barycentric coordinates."""
     found = set()
-    down = np.array([1.0, 1.0, -1.0])
+    down, solids = np.array([1.0, 1.0, -1.0]), triangles_of(site)
     for before, after in itertools.product((False, True), repeat=2):
         if 1 + before + after > max_depth:
             continue
         start, end = (source * down if before else source), (target * down if after else target)
-        for tree, solid in enumerate(triangles_of(site)):
-            for a, b, c in solid:
-                n = np.cross(b - a, c - a)
-                if n @ (start - a) <= 0 or n @ (end - a) <= 0:
-                    continue
-                image = start - 2 * (n @ (start - a)) / (n @ n) * n
-                weights = np.linalg.solve(np.column_stack([b - a, c - a, image - end]), image - a)
-                if weights[0] < 0 or weights[1] < 0 or weights[0] + weights[1] > 1:
-                    continue
-                point = image + weights[2] * (end - image)
-                if point[2] <= 0 and (before or after):
-                    continue
-                points = [source, point, target]
-                if after:
-                    points.insert(2, point + point[2] / (point[2] - end[2]) * (end - point))
-                if before:
-                    points.insert(1, start + start[2] / (start[2] - point[2]) * (point - start))
-                if not blocked(site, tree, points, int(before), covered):
-                    found.add((before, after, tree, *np.round(point, 5)))
+        # every triangle of every crown at once: its plane's image of the start, and where the line from there cuts it
+        a, b, c = np.moveaxis(solids, 2, 0)
+        n = np.cross(b - a, c - a)
+        fore, aft = (((one - a) * n).sum(axis=-1) for one in (start, end))
+        image = start - 2 * (fore / (n * n).sum(axis=-1))[..., None] * n
+        edges = np.stack([b - a, c - a, image - end], axis=-1)
+        ahead = (fore > 0) & (aft > 0)
+        weights = np.full(n.shape, -1.0)
+        weights[ahead] = np.linalg.solve(edges[ahead], (image - a)[ahead][..., None])[..., 0]
+        inside = (weights[..., 0] >= 0) & (weights[..., 1] >= 0) & (weights[..., 0] + weights[..., 1] <= 1)
+        for tree, side in np.argwhere(inside):
+            point = image[tree, side] + weights[tree, side, 2] * (end - image[tree, side])
+            if point[2] <= 0 and (before or after):
+                continue
+            points = [source, point, target]
+            if after:
+                points.insert(2, point + point[2] / (point[2] - end[2]) * (end - point))
+            if before:
+                points.insert(1, start + start[2] / (start[2] - point[2]) * (point - start))
+            if not blocked(site, woods, tree, points, int(before), covered):
+                found.add((before, after, int(tree), *np.round(point, 5)))
     return found
 
 
@@ -209,7 +217,8 @@ def test_every_bounce_is_found_and_none_is_invented(scenes, seed, height, kind):
     for pose, faces, vertices, tree in zip(off.pose, off.faces, off.vertices_m, off.tree, strict=True):
         at = int(np.flatnonzero(tree >= 0)[0])
         ours[pose].add((at == 1, at + 1 < 3 and faces[at + 1] == ground, tree[at], *np.round(vertices[at], 5)))
-    theirs = [one_by_one(site, source, target, 3, scenes.covered) for target in position]
+    woods = woods_of(site)
+    theirs = [one_by_one(site, woods, source, target, 3, scenes.covered) for target in position]
     assert ours == theirs
     assert len(off) == sum(map(len, theirs)) > 15
     assert {key[:2] for keys in theirs for key in keys} >= {(False, False), kind}

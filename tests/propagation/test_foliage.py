@@ -57,12 +57,19 @@ def sampled(start: np.ndarray, end: np.ndarray, stand: Trees, shape: str, count:
     point = start + share[:, None] * (end - start)
     base, top = stand.ground_m + stand.crown_base_m, stand.ground_m + stand.height_m
     total = 0
-    for i in range(len(stand)):
+    for i in _under(start, end, stand):
         r = np.hypot(point[:, 0] - stand.east_m[i], point[:, 1] - stand.north_m[i]) / (stand.crown_diameter_m[i] / 2)
         h = (point[:, 2] - base[i]) / (top[i] - base[i])
         limit = {"cone": 1 - h, "cylinder": np.ones_like(h), "ellipsoid": 2 * np.sqrt(np.clip(h * (1 - h), 0, None))}
         total += np.count_nonzero((h >= 0) & (h <= 1) & (r <= limit[shape]))
     return total / count * float(np.linalg.norm(end - start))
+
+
+def _under(start: np.ndarray, end: np.ndarray, stand: Trees) -> np.ndarray:
+    """Trees whose crown the line meets seen from above; the others hold no point of it."""
+    along = (end - start)[:2] / np.linalg.norm((end - start)[:2])
+    beside = (stand.east_m - start[0]) * along[1] - (stand.north_m - start[1]) * along[0]
+    return np.flatnonzero(np.abs(beside) <= stand.crown_diameter_m / 2)
 
 
 @pytest.mark.parametrize("shape", ["cone", "ellipsoid", "cylinder"])

@@ -11,12 +11,13 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import CheckError, UsageError
-from aerpaw_cmp.propagation import image, prisms
+from aerpaw_cmp.propagation import image, power_cut, prisms
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
 from aerpaw_cmp.propagation.obstacles import why_not_there
+from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.tracer import estimate_search, replay
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
@@ -84,9 +85,9 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     source = np.array([[0.0, 0.0, 30.0]])
     words: list[str] = []
     found = [
-        grow_paths(surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda text, _: words.append(text))[
-            0
-        ]
+        grow_paths(
+            surfaces, source, targets, max_depth=2, shadows=on, on_estimate=lambda told: words.append(str(told))
+        )[0]
         for on in (True, False)
     ]
     assert len(words) == 2
@@ -95,6 +96,41 @@ def test_the_whole_scene_has_the_same_paths_with_and_without_shadows():
     assert len(found[0]) == len(found[1]) > 50
     for column in ("pose", "faces"):
         assert np.array_equal(getattr(found[0], column), getattr(found[1], column))
+
+
+def cells(*open_cells):
+    """The square of the plane east = 5 between -5 and 5, cut at -1 and 1 so that corners meet, without some cells."""
+    cuts = (-5, -1, 1, 5)
+    some = [(i, j) for i in range(3) for j in range(3) if (i, j) not in open_cells]
+    return [
+        t
+        for i, j in some
+        for t in quad((5, cuts[i], cuts[j]), (0, cuts[i + 1] - cuts[i], 0), (0, 0, cuts[j + 1] - cuts[j]))
+    ]
+
+
+OCCLUDERS = {"a square": cells(), "an L": cells((1, 1), (1, 2), (2, 1), (2, 2)), "a frame": cells((1, 1))}
+
+
+@pytest.mark.parametrize("name", OCCLUDERS)
+def test_only_a_convex_face_leaves_out_what_its_outline_covers(name):
+    """A mirror is seen through the notch of an L and the hole of a frame: the outline alone would hide it wholly."""
+    mirror = quad((10, -0.6, -0.6), (0, 1.6, 0), (0, 0, 1.6))
+    occluder = OCCLUDERS[name]
+    scene = enumerate_.scene_of([*occluder, *mirror], shapes=[0] * len(occluder) + [1, 1])
+    surfaces, ends = merged(scene), (np.array([[0.0, 0, 0]]), np.array([[0.0, 0.5, 0.5]]))
+    assert len(surfaces) == 2
+    paths, effort = grow_paths(surfaces, *ends, max_depth=1)
+    everything, _ = grow_paths(surfaces, *ends, max_depth=1, shadows=False)
+    wrong, _ = grow_paths(replace(surfaces, convex=np.ones(len(surfaces), np.bool_)), *ends, max_depth=1)
+    if name == "a square":  # itself a mirror, at (5, 1/4, 1/4); the one behind it is not followed
+        assert effort.hidden == 1
+        assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[5.0, 0.25, 0.25]]
+    else:
+        assert effort.hidden == 0
+        assert [p[0].round(9).tolist() for p in paths.vertices_m[1:]] == [[10.0, 0.25, 0.25]]
+        assert len(wrong) == 1  # this scene does tell the two apart
+    np.testing.assert_array_equal(paths.faces, everything.faces)
 
 
 def test_a_mirror_works_on_both_sides_and_hides_from_both():
@@ -136,28 +172,46 @@ def test_flipped_and_degenerate_triangles_change_nothing():
     assert np.allclose(paths.vertices_m, expected.vertices_m, equal_nan=True)
 
 
-def test_the_power_cut_leaves_out_long_paths_only():
+@pytest.mark.parametrize("way", WAYS)
+@pytest.mark.parametrize("of_link", [False, True])
+def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
+    """Faces that no short path goes over are not followed; a limit may be one for all or one of each link."""
     rng = np.random.default_rng(5)
     walls = [
-        t for _ in range(10) for t in quad(rng.uniform(-30, 30, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
+        t for _ in range(25) for t in quad(rng.uniform(-60, 60, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
     ]
-    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(10), 2)))
-    source, targets = rng.uniform(-20, 20, (1, 3)), rng.uniform(-20, 20, (30, 3))
-    every, _ = grow_paths(surfaces, source, targets, max_depth=2)
-    some, _ = grow_paths(surfaces, source, targets, max_depth=2, longest_m=40.0)
+    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(25), 2)))
+    sources, targets = rng.uniform(-20, 20, (2, 3)), rng.uniform(-20, 20, (60, 3))
+    targets[7] = np.nan
+    longest = power_cut.longest_m(sources, targets, 8.0) if of_link else 40.0
+    every, effort = grow_paths(surfaces, sources, targets, max_depth=2, **way)
+    some, less = grow_paths(surfaces, sources, targets, max_depth=2, longest_m=longest, **way)
+    limit = np.broadcast_to(longest, (2, 60))[every.tower, every.pose]
+    kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
+    assert 0 < (kept.depth > 0).sum() < (every.depth > 0).sum()
+    assert less.sequences < effort.sequences or not way.get("beams", True)
+    for column in ("pose", "tower", "faces"):
+        assert np.array_equal(getattr(kept, column), getattr(some, column)), column
 
-    def length(paths):
-        total, last = np.zeros(len(paths)), np.broadcast_to(source[0], (len(paths), 3))
-        for step in range(3):
-            end = targets[paths.pose] if step == 2 else paths.vertices_m[:, step]
-            end = np.where(np.isfinite(end), end, targets[paths.pose])
-            total, last = total + np.linalg.norm(end - last, axis=1), end
-        return total
 
-    kept = every.select((length(every) <= 40.0) | (every.depth == 0))
-    assert 0 < len(kept) < len(every)
-    assert np.array_equal(kept.faces, some.faces)
-    assert np.array_equal(kept.pose, some.pose)
+def test_the_estimate_of_a_search_comes_without_the_search(scenes):
+    rng = np.random.default_rng(12)
+    spot = rng.uniform(-900, 900, (400, 2))
+    buildings = [
+        Building(f"b{k}", box(e, n, e + 14, n + 11), float(rng.uniform(5, 15))) for k, (e, n) in enumerate(spot)
+    ]
+    site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
+    poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
+    told = []
+    replay(site, scenes.link(site), poses, on_estimate=told.append)
+    before = estimate_search(site, scenes.link(site), poses)
+    assert [one.first_faces for one in told] == [before.first_faces]
+    assert before.first_faces > 500
+    assert before.sequences == told[0].sequences > 2 * before.first_faces
+    assert str(before).startswith("about ")
+    assert "2 towers" in str(before)
+    assert "MiB" in str(before)
+    assert estimate_search(scenes.site(buildings[:5]), scenes.link(scenes.site()), poses) is None
 
 
 def test_paths_can_be_recomputed_from_their_faces():

@@ -151,8 +151,8 @@ def _wrap(monkeypatch, where, name, change):
 FAULTS = {
     "reflections times -0.1": (channel, "_reflect", lambda wave: -0.1 * wave),
     "TE and TM exchanged": (channel, "reflection_coefficients", lambda r: r[::-1]),
-    "0.011 rad": (channel, "_chunk_field", lambda h: h * np.exp(0.011j)),
-    "0.11 dB": (channel, "_chunk_field", lambda h: h * 10 ** (0.11 / 20)),
+    "0.011 rad": (channel, "chunk_field", lambda h: h * np.exp(0.011j)),
+    "0.11 dB": (channel, "chunk_field", lambda h: h * 10 ** (0.11 / 20)),
     "nothing hides": (solids.Occlusion, "segments", np.zeros_like),
 }
 

@@ -7,6 +7,7 @@ A new number of a tower and channel is a field of ``RssFurther`` there and a fun
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,6 +15,8 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.forked import in_order
+from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
@@ -63,9 +66,15 @@ PASSES_WITHIN_M = 3.0
 """Two passes of one place, first and second half of a flight, come this near."""
 
 
+FEWEST_SERIES = 4
+"""Series below which a further process does not pay."""
+
+
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
-    found = tuple(compare_rss_series(data, s, r) for s, r in zip(data.rss, replays.rss, strict=True))
+    calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
+    found = tuple(in_order(calls, fewest=FEWEST_SERIES))
+    give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
         rss=found,
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),

@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray, wavelength_m
 from ..compare.result import ClockResult
@@ -149,10 +151,13 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+def estimate_clocks(
+    data: FlightData, progress: Progress = silent, meanwhile: Callable[[], object] | None = None
+) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
-    Predictions are the image engine's RSS along the track with at most one reflection.
+    Predictions are the image engine's RSS along the track with at most one reflection. ``meanwhile`` is what this
+    process may do while others estimate; it is not called where there is nothing to estimate.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
@@ -160,9 +165,16 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
     if isinstance(wanted, float):
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
-    for tower in dict.fromkeys(series.tower for series in data.rss):
-        progress(f"clock {tower}")
-        found[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+    towers = list(dict.fromkeys(series.tower for series in data.rss))
+    calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
+    # on a long flight the estimates are made here, one after the other: each of them holds as much as all else
+    processes = None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
+    with ahead(calls, processes) as estimates:
+        if meanwhile is not None:
+            meanwhile()
+        for tower in towers:
+            progress(f"clock {tower}")
+            found[tower] = next(estimates)
     return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -179,6 +191,9 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
     )
     return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
 
+
+SHARED_UP_TO = 200_000
+"""RSS samples of a flight up to which the clocks of its receivers are estimated by several processes."""
 
 BLOCK = 100_000
 """Instants of a clock's prediction that are replayed at once: bounds memory on flights of more than half an hour."""

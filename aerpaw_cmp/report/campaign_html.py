@@ -371,7 +371,7 @@ def write_campaign(
     """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
 
     With ``exports`` also the samples of the first setting in those formats
-    (:data:`aerpaw_cmp.report.exports.write.FORMATS`).
+    (:data:`aerpaw_cmp.report.exports.formats.FORMATS`).
 
     Parameters
     ----------

@@ -28,7 +28,7 @@ def blank_pictures() -> Iterator[None]:
 
     For tests that run a command to its end and look at no picture.
     """
-    from aerpaw_cmp.report import canvas, drawing
+    from aerpaw_cmp.report import canvas
 
     def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
         return blank(tuple(fig.get_size_inches()), tuple(formats), kind)
@@ -40,7 +40,7 @@ def blank_pictures() -> Iterator[None]:
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canvas, "save_as", save_as)
-        patch.setattr(drawing, "FEWEST", 10_000)  # in this process: a further one costs more than it saves
+        patch.setattr(canvas, "_FEWEST", 10_000)  # in this process: a further one costs more than it saves
         yield
 
 

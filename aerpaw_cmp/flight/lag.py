@@ -479,6 +479,24 @@ def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_d
     return np.column_stack([elevation, elevation**2, *waves, *tilted])
 
 
+def terms_from(place_m: FloatArray, position_m: FloatArray, heading_deg: FloatArray) -> FloatArray:
+    """:func:`direction_terms` (n, 12) of a UAV as seen from a tower.
+
+    Parameters
+    ----------
+    place_m : (1, 3) or (n, 3)
+        Of the tower [m].
+    position_m : (n, 3)
+        Of the UAV: east, north, up [m].
+    heading_deg : (n,)
+        Of its nose, clockwise from north.
+    """
+    line = position_m - place_m
+    azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+    elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
+    return direction_terms(azimuth, elevation, azimuth + 180.0 - heading_deg)
+
+
 def fit_lag(
     t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
 ) -> LagFit:

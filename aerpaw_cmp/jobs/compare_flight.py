@@ -23,6 +23,7 @@ from ..compare import rank as ranks
 from ..compare import rss, statistics
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.result import (
+    APPLIED,
     Censored,
     ExpectedOffset,
     Fit,
@@ -134,7 +135,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         span_db=settings.span_db,
         replicates=max(settings.bootstrap, 1),
         lag_s=float("nan") if clock is None else clock.found.radio_minus_telemetry_s,
-        fitted_on_scored=("lag_s",) if clock is not None and clock.found.applied == "estimated and applied" else (),
+        fitted_on_scored=("lag_s",) if clock is not None and clock.found.applied == APPLIED else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     position = _positions(replayed)

@@ -30,22 +30,16 @@ from ..propagation.image import planes_of
 from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
-<<<<<<< HEAD
 from ..site.site import Site
 from .replay import (
-    _poses,
-    _track_poses,
     attitude_rotation,
     estimate_clocks,
     path_loss,
     replay_poses,
     roughness_loss,
     telemetry_time,
+    valid_poses,
 )
-=======
-from ..site.site import Trees
-from .replay import attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time, valid_poses
->>>>>>> main
 
 MORE_SAMPLES = 10
 """Times the samples with which Sionna is asked again for paths that it lacks."""

@@ -14,13 +14,8 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
-<<<<<<< HEAD
 from ..common.units import BoolArray, FloatArray, wavelength_m
-from ..compare.result import ClockResult
-=======
-from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
->>>>>>> main
 from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
 from ..flight.lag import DIRECTION_TERMS, terms_from

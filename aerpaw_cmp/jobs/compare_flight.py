@@ -44,7 +44,7 @@ from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
-from .replay import FlightReplay, Replayed, direct_foliage_m
+from .replay import FlightReplay, Replayed, direct_foliage_m, processes_for
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -74,10 +74,12 @@ FEWEST_SERIES = 4
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
-    found = tuple(in_order(calls, fewest=FEWEST_SERIES))
-    give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
+    found = []
+    for one in in_order(calls, processes_for(data), fewest=FEWEST_SERIES):
+        found.append(one)
+        give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
-        rss=found,
+        rss=tuple(found),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(found)),
         serving=serving_of(data.rss, found),

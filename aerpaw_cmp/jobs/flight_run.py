@@ -20,7 +20,7 @@ from ..flight.data import FlightData
 from .audit_flight import audit_replays
 from .compare_flight import FEWEST_SERIES, compare_flight
 from .ladder import FlightLadder, flight_ladder
-from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
+from .replay import Clock, FlightReplay, estimate_clocks, processes_for, replay_rank, replay_rss
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -109,7 +109,10 @@ def run_flight(
     replays = replay_flight(data, stages, meanwhile=meanwhile)
     with ExitStack() as running:
         # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
-        climb = running.enter_context(beside(partial(flight_ladder, data, replays))) if ladder else None
+        climb: Callable[[], FlightLadder | None] | None = None
+        if ladder:
+            climb = partial(flight_ladder, data, replays)
+            climb = running.enter_context(beside(climb)) if processes_for(data) is None else climb
         with stages("compare"):
             result = compare_flight(data, replays)
         if audit:

@@ -167,9 +167,7 @@ def estimate_clocks(
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
-    # on a long flight the estimates are made here, one after the other: each of them holds as much as all else
-    processes = None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
-    with ahead(calls, processes) as estimates:
+    with ahead(calls, processes_for(data)) as estimates:
         if meanwhile is not None:
             meanwhile()
         for tower in towers:
@@ -193,7 +191,13 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
 
 
 SHARED_UP_TO = 200_000
-"""RSS samples of a flight up to which the clocks of its receivers are estimated by several processes."""
+"""RSS samples of a flight up to which its series are shared by several processes."""
+
+
+def processes_for(data: FlightData) -> int | None:
+    """Processes for the series of a flight: as many as are safe; one on a long flight, where each holds much memory."""
+    return None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
+
 
 BLOCK = 100_000
 """Instants of a clock's prediction that are replayed at once: bounds memory on flights of more than half an hour."""

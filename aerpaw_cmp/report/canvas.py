@@ -235,7 +235,7 @@ def write_figures(
     written: list[Path] = []
     if plates:
         load_matplotlib()
-    with ahead([partial(render, plate, formats, kind) for plate in plates], fewest=_FEWEST) as pictures:
+    with ahead([partial(render, plate, formats, kind) for plate in plates], fewest=FEWEST_FIGURES) as pictures:
         if meanwhile is not None:
             meanwhile()
         for picture in pictures:
@@ -253,7 +253,7 @@ def load_matplotlib() -> None:
     import matplotlib.figure  # noqa: F401
 
 
-_FEWEST = 4
+FEWEST_FIGURES = 4
 """Figures below which a further process does not pay."""
 
 

@@ -120,9 +120,10 @@ def planted(fault: Fault) -> Iterator[None]:
 
 def _forget() -> None:
     """What the package keeps of the functions as they were."""
-    from aerpaw_cmp.propagation import faces
+    from aerpaw_cmp.propagation import faces, foliage
 
     faces._building_faces.cache_clear()
+    foliage._last_index.clear()
 
 
 def _found(fault: Fault) -> tuple[Any, Any, str, Any, str]:

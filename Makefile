@@ -45,12 +45,16 @@ report: $(READY) $(LLVM)
 	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
+# mypy uses one core, so it runs beside pytest; what it says comes last
 test: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/mypy
 	$(BIN)/lint-imports
-	$(BIN)/python -m pytest -q -n auto --dist loadfile
+	@said=$$(mktemp); $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
+	echo "$(BIN)/python -m pytest -q -n auto --dist loadfile"; \
+	$(BIN)/python -m pytest -q -n auto --dist loadfile; tested=$$?; \
+	echo "$(BIN)/mypy"; wait $$types; typed=$$?; cat "$$said"; rm -f "$$said"; \
+	[ $$tested -eq 0 ] && [ $$typed -eq 0 ]
 
 $(READY_DOCS): $(READY)
 	@PYTHON="$(PYTHON)" tools/setup_venv .venv docs

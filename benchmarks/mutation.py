@@ -419,18 +419,19 @@ def swap(path: str, mutant: Mutant, place: Place) -> None:
 
 
 def equivalents() -> dict[str, str]:
-    """Mutants that change nothing that can be seen, by what they change (without the line), with the reason."""
+    """Mutants that change nothing that can be seen, as :func:`change_of` names them, with the reason."""
     out = {}
     for row in EQUIVALENT.read_text(encoding="utf-8").splitlines() if EQUIVALENT.is_file() else ():
         if row.strip() and not row.startswith("#"):
-            change, _, reason = row.partition(" # ")
+            change, _, reason = row.partition(" ## ")
             out[change.strip()] = reason.strip()
     return out
 
 
 def change_of(mutant: Mutant) -> str:
-    """The name without its line, which moves."""
-    return f"{mutant.path}: {mutant.was} -> {mutant.now}"
+    """The name with the text of its line in place of the number, which moves."""
+    text = (ROOT / mutant.path).read_text(encoding="utf-8").splitlines()[mutant.line - 1].strip()
+    return f"{mutant.path}: {mutant.was} -> {mutant.now} @ {text}"
 
 
 def drawn(path: str, each: int, seed: int) -> list[Mutant]:
@@ -459,7 +460,7 @@ def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, 
             kind = "equivalent"
         counts[kind] += 1
         if kind == "survived":
-            survivors.append(mutant.name)
+            survivors.append(f"{mutant.line}: {change_of(mutant)}")
         row = {"mutant": mutant.name, "outcome": result, "as": kind, "seconds": round(took, 1)}
         if account is not None:
             with account.open("a", encoding="utf-8") as file:

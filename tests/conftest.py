@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import random
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache
@@ -22,13 +23,35 @@ settings.load_profile("fixed" if os.environ.get("CI") else "further")
 os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
 
 
+def pytest_addoption(parser: pytest.Parser) -> None:
+    """``--shuffle SEED``: no test may need another to have run before it."""
+    parser.addoption("--shuffle", type=int, default=None, metavar="SEED", help="files, and tests in them, in any order")
+
+
+@pytest.hookimpl(trylast=True)
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Files in an order drawn with the seed, and in each its tests; the same in every process."""
+    seed = config.getoption("--shuffle")
+    if seed is None:
+        return
+    files: dict[Path, list[pytest.Item]] = {}
+    for item in items:
+        files.setdefault(item.path, []).append(item)
+    draw = random.Random(seed)
+    order = list(files.values())
+    draw.shuffle(order)
+    for tests in order:
+        draw.shuffle(tests)
+    items[:] = [item for tests in order for item in tests]
+
+
 @pytest.fixture(scope="module")
 def blank_pictures() -> Iterator[None]:
     """Every figure is made from its data as ever, and then an empty one of its size is saved: an eighth of the time.
 
     For tests that run a command to its end and look at no picture.
     """
-    from aerpaw_cmp.report import canvas, drawing
+    from aerpaw_cmp.report import canvas
 
     def save_as(fig: Any, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
         return blank(tuple(fig.get_size_inches()), tuple(formats), kind)
@@ -40,7 +63,7 @@ def blank_pictures() -> Iterator[None]:
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canvas, "save_as", save_as)
-        patch.setattr(drawing, "FEWEST", 10_000)  # in this process: a further one costs more than it saves
+        patch.setattr(canvas, "FEWEST_FIGURES", 10_000)  # in this process: a further one costs more than it saves
         yield
 
 

@@ -152,8 +152,8 @@ def _print_campaign_summary(outcome: Any) -> None:
         for p in sorted(m["repeatability"]["pairs"], key=lambda p: -p["n"])[:_SHOWN]
     ]  # fmt: skip
     if rows:
-        more = len(m["repeatability"]["pairs"]) - len(rows)
-        title = "Same places, two flights" + (f"; {more} more in campaign.json" if more else "")
+        more = m["repeatability"]["pairs_total"] - len(rows)
+        title = "Same places, two flights" + (f"; {more} more in {m['repeatability']['table']}" if more else "")
         table(["link", "flights", "pairs", "differ by dB", "residual corr. by place"], rows, title)
     rows = [
         [", ".join(fold["fitted_on"]), r["flight"], f"{r['tower']} {r['channel']}",

@@ -129,24 +129,43 @@ def climb(
 
 def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]], *, replicates: int = REPLICATES) -> list[LadderRow]:
     """The ladder per tower and channel; ``names`` are (tower, channel) of each series."""
+    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name, replicates=replicates)]
+
+
+def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicates: int = REPLICATES) -> list[LadderRow]:
+    """The rows of one series.
+
+    Parameters
+    ----------
+    ladder : Ladder
+    series : int
+        Which of the series of its rungs.
+    name : (tower, channel)
+    replicates : int
+        Of the paired differences.
+
+    Returns
+    -------
+    list of LadderRow
+        One per rung.
+    """
     rows = []
-    for series, (tower, channel) in enumerate(names):
-        for index, rung in enumerate(ladder.rungs):
-            error = ladder.error_db[index][series]
-            found = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
-            rows.append(
-                LadderRow(
-                    model=rung.model,
-                    tower=tower,
-                    channel=channel,
-                    rmse_heldout_db=_rmse(error),
-                    difference_to_best_db=float("nan") if found is None else found.difference_db,
-                    difference_to_best_ci95_db=NO_INTERVAL if found is None else found.difference_ci95_db,
-                    n=int(np.isfinite(error).sum()),
-                    seconds=rung.seconds,
-                    recommended=index == ladder.recommended,
-                )
+    for index, rung in enumerate(ladder.rungs):
+        error = ladder.error_db[index][series]
+        found = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
+        rows.append(
+            LadderRow(
+                model=rung.model,
+                tower=name[0],
+                channel=name[1],
+                rmse_heldout_db=_rmse(error),
+                difference_to_best_db=float("nan") if found is None else found.difference_db,
+                difference_to_best_ci95_db=NO_INTERVAL if found is None else found.difference_ci95_db,
+                n=int(np.isfinite(error).sum()),
+                seconds=rung.seconds,
+                recommended=index == ladder.recommended,
             )
+        )
     return rows
 
 

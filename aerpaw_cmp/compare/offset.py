@@ -378,19 +378,80 @@ def pooled_offsets(
     dict
         Per (flight, tower, channel): the shared offset with the RMSE and the number of pairs of that sequence alone.
     """
-    axes = _GROUP[per]
+    moments = {key: difference_moments(*levels) for key, levels in pairs.items()}
+    return pooled_moments(moments, per, step_db=step_db, span_db=span_db)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Moments:
+    """What an offset needs of a sequence: pairs, mean and variance of simulated minus measured [dB, dB^2]."""
+
+    n: int
+    mean_db: float
+    variance_db2: float
+
+
+def difference_moments(measured_db: ArrayLike, simulated_db: ArrayLike) -> Moments:
+    """The moments of the pairs that count; NaN without one.
+
+    Examples
+    --------
+    >>> difference_moments([-60.0, -70.0, float("nan")], [-57.0, -66.0, -1.0])
+    Moments(n=2, mean_db=3.5, variance_db2=0.25)
+    """
+    difference = _difference(measured_db, simulated_db)
+    if not len(difference):
+        return Moments(n=0, mean_db=float("nan"), variance_db2=float("nan"))
+    mean, variance = _mean_and_variance(difference)
+    return Moments(n=len(difference), mean_db=mean, variance_db2=variance)
+
+
+def pooled_moments(
+    moments: Mapping[tuple[str, str, str], Moments],
+    per: Pooling = "link",
+    *,
+    step_db: float = STEP_DB,
+    span_db: tuple[float, float] = SPAN_DB,
+) -> dict[tuple[str, str, str], OffsetFit]:
+    """:func:`pooled_offsets` of sequences whose levels are no longer at hand.
+
+    Parameters
+    ----------
+    moments : mapping of (flight, tower, channel) to Moments
+    per : {"link", "tower", "channel", "flight", "all"}
+        Which sequences share an offset.
+    step_db, span_db : float, (float, float)
+        Grid of the search [dB].
+
+    Returns
+    -------
+    dict
+        As :func:`pooled_offsets`.
+
+    Notes
+    -----
+    The best shared offset is the mean difference over all pairs, rounded to the grid and kept within it: the mean of
+    the means, weighted by the pairs. RMSE^2(o) = variance + (mean - o)^2 of each sequence.
+    """
+    axes, grid = _GROUP[per], offset_grid(step_db, span_db)
     groups: dict[Hashable, list[tuple[str, str, str]]] = {}
-    for key in pairs:
+    for key in moments:
         groups.setdefault(tuple(key[axis] for axis in axes), []).append(key)
     fits: dict[tuple[str, str, str], OffsetFit] = {}
     for members in groups.values():
-        together = np.concatenate([_difference(*pairs[key]) for key in members])
-        shared = grid_offset(np.zeros(len(together)), together, step_db=step_db, span_db=span_db)
+        known = [moments[key] for key in members if moments[key].n]
+        if not known:
+            fits |= {key: OffsetFit(float("nan"), float("nan"), 0, False) for key in members}
+            continue
+        total = sum(one.n for one in known)
+        mean = known[0].mean_db + sum((one.mean_db - known[0].mean_db) * (one.n / total) for one in known)
+        best = nearest_offset(grid, mean, step_db)
+        offset, at_edge = float(grid[best]), best in (0, len(grid) - 1)
         for key in members:
-            own = _difference(*pairs[key])
-            rmse = float(np.sqrt(np.mean((own - shared.offset_db) ** 2))) if len(own) else float("nan")
-            fits[key] = OffsetFit(shared.offset_db, rmse, len(own), shared.at_edge)
-    return {key: fits[key] for key in pairs}
+            own = moments[key]
+            rmse = float(np.hypot(np.sqrt(own.variance_db2), own.mean_db - offset))
+            fits[key] = OffsetFit(offset, rmse, own.n, at_edge)
+    return {key: fits[key] for key in moments}
 
 
 @dataclass(frozen=True, slots=True)

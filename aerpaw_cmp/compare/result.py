@@ -21,13 +21,18 @@ from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
+APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
+    "estimated and applied", "asked for, not applied", "estimated, not applied", "given in flight.yaml"
+)  # fmt: skip
+"""What was done with a clock: corrected by the estimate, asked to be and not, not asked to be; corrected as stated."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ClockResult:
     """Radio clock of a receiver (a tower) against the telemetry clock, as far as it is a number.
 
     ``radio_minus_telemetry_s`` is positive where the radio's clock shows later times; subtracting it corrects them.
-    ``checks`` is what the verdict rests on, by name.
+    ``applied`` is one of the words above, ``checks`` what the verdict rests on, by name.
     """
 
     receiver: str

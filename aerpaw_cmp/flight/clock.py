@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import AnyArray, BoolArray, FloatArray
+from ..compare.result import APPLIED, ESTIMATED, NOT_APPLIED, ClockResult
 from ..compare.statistics import PairedDifference, paired_difference, plain
 from .lag import (
     DRIFT_FROM_S,
@@ -165,6 +166,20 @@ class ClockEstimate:
         """What is to be subtracted from radio times (n,) [s]."""
         since = (nanoseconds(times) - self.start_ns) * 1e-9
         return np.asarray(self.radio_minus_telemetry_s + self.drift_s_per_s * (since - self.reference_s))
+
+    def result(self, receiver: str, *, apply: bool) -> ClockResult:
+        """The estimate as a number of the flight; only a verdict "ok" is applied, where ``apply`` asks for it."""
+        asked = NOT_APPLIED if apply and self.verdict != "agree" else ESTIMATED
+        return ClockResult(
+            receiver=receiver,
+            radio_minus_telemetry_s=self.radio_minus_telemetry_s,
+            ci95_s=self.ci95_s,
+            drift_s_per_s=self.drift_s_per_s,
+            verdict=self.verdict,
+            reason=f"by the {self.model}" + (f": {self.reason}" if self.reason else ""),
+            applied=APPLIED if apply and self.verdict == "ok" else asked,
+            checks=self.as_dict(),
+        )
 
     def as_dict(self) -> dict[str, Any]:
         """For metrics.json; NaN becomes None."""

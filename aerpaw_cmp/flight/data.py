@@ -23,7 +23,7 @@ from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
-from .track import Track, good_positions
+from .track import Track, TrackPoses, good_positions
 
 Times = NDArray[np.datetime64]
 
@@ -80,6 +80,11 @@ class FlightData:
     warnings: tuple[str, ...]
     nodes: Mapping[str, Track] = field(default_factory=dict)
     """Tracks of the towers that move; ``site`` has them in the middle of their positions."""
+
+    def poses_at(self, time: Times) -> TrackPoses:
+        """Poses of the UAV at instants (n,), for a flight with a track."""
+        assert self.track is not None
+        return self.track.pose_at(time)
 
     def tower_at(self, tower: str, time: Times) -> tuple[FloatArray, BoolArray]:
         """Array centre of a tower at instants (n,), and where it is known (n,); NaN elsewhere.
@@ -227,7 +232,8 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     """Rows with a position of the first stream that has any, with all columns of telemetry."""
     if not path.is_file():
         raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
-    (file,) = ingest([path], options=log.options(timezone), reader=log.reader)
+    options = log.options(timezone)
+    (file,) = ingest([path], options=options, reader=log.reader)
     for stream in file.result.streams:
         if stream.name in log.skip or not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
             continue

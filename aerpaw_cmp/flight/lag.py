@@ -35,6 +35,9 @@ _SCANNED = 6000
 _HELD = 1 << 15
 """Residuals held at once by the search: they stay in a core's cache."""
 
+_HELD_FREE = 1 << 13
+"""The same where free terms stand beside each."""
+
 _INDEPENDENT = 0.7
 """Share of the evidence of several channels that counts: one airframe and one path make their residuals alike."""
 
@@ -149,17 +152,17 @@ class _Prediction:
         return _Prediction(self.first, self.step, columns)
 
     def terms_at(self, t: FloatArray, *, slopes: bool = False) -> FloatArray:
-        """The free terms at t, a constant first (n, 1 + terms), or their slopes [1/s]; NaN as for :meth:`at`."""
+        """Terms at t (..., n), a constant first (..., n, 1 + terms), or their slopes [1/s]; NaN as for :meth:`at`."""
         place = (t - self.first) / self.step
         left = np.floor(place).astype(np.int64)
         inside = (left >= 0) & (left < len(self.terms) - 1)
         left = np.where(inside, left, 0)
-        result = np.empty((len(t), 1 + self.terms.shape[1]))
-        result[:, 0] = 0.0 if slopes else 1.0
+        result = np.empty((*t.shape, 1 + self.terms.shape[1]))
+        result[..., 0] = 0.0 if slopes else 1.0
         if self.terms.shape[1]:
-            weight = (place - left)[:, None]
+            weight = (place - left)[..., None]
             read = self._slopes if slopes else self.terms.__getitem__
-            result[:, 1:] = read(left) * (1.0 - weight) + read(left + 1) * weight
+            result[..., 1:] = read(left) * (1.0 - weight) + read(left + 1) * weight
             result[~inside, 1:] = np.nan
         return result
 
@@ -414,6 +417,29 @@ def _explained(y: FloatArray, terms: FloatArray, phi: float) -> FloatArray:
     return np.asarray(np.einsum("ni,i->n", terms, _on_terms(a, b[None])[0]))
 
 
+_NO_THREADS = 200_000
+"""Multiplications of a matrix product for which BLAS wakes no threads (OpenBLAS: 262 144); see :func:`_on_terms`."""
+
+
+def _without_terms(y: FloatArray, terms: FloatArray, phi: float) -> FloatArray:
+    """Rows y (lags, n) less what their free terms (lags, n, q) explain of them; see :func:`_explained`."""
+    whole = np.isfinite(y).all(axis=1) & np.isfinite(terms).all(axis=(1, 2))
+    result = np.empty_like(y)
+    for row in np.flatnonzero(~whole):
+        result[row] = y[row] - _explained(y[row], terms[row], phi)
+    if whole.any():
+        few, some = y[whole], terms[whole]
+        both = np.concatenate([some, few[..., None]], axis=-1)
+        both = both[:, 1:] - phi * both[:, :-1]
+        if both.shape[1] <= _NO_THREADS // both.shape[2] ** 2:
+            products = both.mT @ both
+        else:
+            products = np.einsum("lni,lnj->lij", both, both)
+        solved = [np.linalg.lstsq(p[:-1, :-1], p[:-1, -1], rcond=1e-12)[0] for p in products]
+        result[whole] = few - np.einsum("lni,li->ln", some, np.stack(solved))
+    return result
+
+
 def _on_terms(terms: FloatArray, rows: FloatArray) -> FloatArray:
     """Least-squares coefficients (k, q) of each row (k, n) on terms (n, q).
 
@@ -453,6 +479,24 @@ def direction_terms(azimuth_deg: ArrayLike, elevation_deg: ArrayLike, relative_d
     return np.column_stack([elevation, elevation**2, *waves, *tilted])
 
 
+def terms_from(place_m: FloatArray, position_m: FloatArray, heading_deg: FloatArray) -> FloatArray:
+    """:func:`direction_terms` (n, 12) of a UAV as seen from a tower.
+
+    Parameters
+    ----------
+    place_m : (1, 3) or (n, 3)
+        Of the tower [m].
+    position_m : (n, 3)
+        Of the UAV: east, north, up [m].
+    heading_deg : (n,)
+        Of its nose, clockwise from north.
+    """
+    line = position_m - place_m
+    azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
+    elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
+    return direction_terms(azimuth, elevation, azimuth + 180.0 - heading_deg)
+
+
 def fit_lag(
     t: FloatArray, m: FloatArray, prediction: _Prediction, lags: FloatArray, limit_s: float, drifting: bool
 ) -> LagFit:
@@ -487,13 +531,16 @@ def fit_lag(
         return y - _explained(y, prediction.terms_at(at), phi) if prediction.terms.shape[1] else y
 
     def costs(tried: FloatArray, rate: float, phi: float) -> FloatArray:
-        if prediction.terms.shape[1]:
-            return np.array([_cost(residual(float(lag), rate, phi), phi, least) for lag in tried])
+        free = prediction.terms.shape[1]
         found = np.empty(len(tried))
         drifted = rate * (ts - middle)
-        for block in range(0, len(tried), rows := max(1, _HELD // len(ts))):
+        for block in range(0, len(tried), rows := max(1, (_HELD_FREE if free else _HELD) // len(ts))):
             part = slice(block, block + rows)
-            found[part] = _costs(ms - prediction.at(ts - tried[part, None] - drifted), phi, least)
+            at = ts - tried[part, None] - drifted
+            y = ms - prediction.at(at)
+            if free:
+                y = _without_terms(y, prediction.terms_at(at), phi)
+            found[part] = _costs(y, phi, least)
         return found
 
     def scan(phi: float, rate: float) -> FloatArray:

@@ -26,6 +26,9 @@ MAXIMUM_GAP_S = 3.0
 COURSE_SPEED_MPS = 1.0
 """Below this ground speed the course says nothing about the heading [m/s]."""
 
+AT_ONCE = 100_000
+"""Instants whose poses are computed at once: bounds memory on flights of more than half an hour."""
+
 COURSE_SPAN_S = 2.0
 """Positions this long before and after give a velocity that is not logged [s]."""
 
@@ -322,6 +325,14 @@ class Track:
         TrackPoses
         """
         instant = nanoseconds(times).ravel()
+        if len(instant) <= AT_ONCE:
+            return self._pose_at(instant)
+        parts = [self._pose_at(part) for part in np.array_split(instant, -(-len(instant) // AT_ONCE))]
+        names = [one.name for one in dataclasses.fields(TrackPoses)]
+        return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
+
+    def _pose_at(self, instant: AnyArray) -> TrackPoses:
+        """Poses at instants (n,) [ns since 1970]."""
         timed = instant != NO_TIME
         t = np.where(timed, instant - self.start_ns, 0) * 1e-9
         code = self._codes(t)

@@ -28,7 +28,7 @@ from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldO
 from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
-from .campaign_tasks import Task, fitted_to, flight_data
+from .campaign_tasks import Task, flight_data
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 from .place import check_place, open_place
 from .workers import Lost, Workers, open_workers
@@ -172,7 +172,7 @@ def run(
     ) as crew:
         with stage("flights"):
             compute(tasks, orders, crew, progress, outcomes)
-        results = [fitted_to(task, outcomes[number]) for number, task in enumerate(tasks)]
+        results = [outcomes[number] for number in range(len(tasks))]
         rank = tuple(row for o in results for row in o.rank)
         flown = tuple(one for o in results for one in o.flown)
         failures += [o.failure for o in results if o.failure is not None]

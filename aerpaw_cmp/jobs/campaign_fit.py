@@ -16,6 +16,7 @@ from ..common.stages import Progress, silent
 from ..common.units import FloatArray
 from ..compare.heldout import fit_held_out, goes_round, rmse
 from ..compare.offset import grid_offset
+from ..compare.result import APPLIED
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
 from ..flight.settings import FlightFile, RssSettings
@@ -337,7 +338,7 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
 
 def _own_lag(clock: Clock | None, point: Point) -> tuple[str, ...]:
     """``lag_s`` where a lag that was estimated on these very samples has been applied."""
-    estimated = clock is not None and clock.found.applied == "estimated and applied" and "rss.lag" not in point
+    estimated = clock is not None and clock.found.applied == APPLIED and "rss.lag" not in point
     return ("lag_s",) if estimated else ()
 
 

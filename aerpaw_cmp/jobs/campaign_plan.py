@@ -5,14 +5,14 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import AerpawCmpError
 from ..common.stages import Progress, duration, silent
-from ..report.campaign_data import Failure
+from ..report.campaign_data import Failure, FlownTrack
 from .campaign_tasks import Done, Order, Outcome, Task, carry_out, fitted_to, outcome_store, task_facts
 from .workers import Lost, Workers
 
@@ -195,6 +195,42 @@ _SEEN_AFTER_S = (0.0, 0.1, 0.5, 2.0, 5.0, 10.0, 20.0)
 """A file that a worker wrote may be seen later here (network file systems remember for a while that it was not)."""
 
 
+class Outcomes:
+    """Outcomes of a campaign's tasks by number, each held without what its setting is not asked for.
+
+    Series of samples stay for the first setting; of the others a row holds numbers, and the flown line of a flight is
+    held once: the memory of 4000 tasks is that of the flights.
+
+    Parameters
+    ----------
+    tasks : sequence of Task
+    """
+
+    def __init__(self, tasks: Sequence[Task]) -> None:
+        self._tasks = tasks
+        self._found: dict[int, Outcome] = {}
+        self._tracks: dict[str, FlownTrack] = {}
+
+    def put(self, number: int, outcome: Outcome) -> None:
+        """Take one more, under the names of this campaign."""
+        task = self._tasks[number]
+        fitted = fitted_to(task, outcome)
+        if fitted.track is not None:
+            known = self._tracks.setdefault(task.flight, fitted.track)
+            same = all(
+                np.array_equal(getattr(known, name), getattr(fitted.track, name), equal_nan=True)
+                for name in ("time_s", "position_m")
+            )
+            fitted = replace(fitted, track=known if same else fitted.track)
+        self._found[number] = fitted
+
+    def __getitem__(self, number: int) -> Outcome:
+        return self._found[number]
+
+    def __len__(self) -> int:
+        return len(self._found)
+
+
 def run_tasks(
     tasks: Sequence[Task], workers: Workers, progress: Progress = silent, keep: str | None = None
 ) -> list[Outcome]:
@@ -217,15 +253,12 @@ def run_tasks(
     """
     found, orders = kept_outcomes(tasks, keep, progress)
     compute(tasks, orders, workers, progress, found)
-    return [fitted_to(task, found[number]) for number, task in enumerate(tasks)]
+    return [found[number] for number in range(len(tasks))]
 
 
-def kept_outcomes(
-    tasks: Sequence[Task], keep: str | None, progress: Progress
-) -> tuple[dict[int, Outcome], dict[int, Order]]:
+def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -> tuple[Outcomes, dict[int, Order]]:
     """Outcomes that are there, and what is to be computed, by number."""
-    found: dict[int, Outcome] = {}
-    orders = {number: Order(task=task) for number, task in enumerate(tasks)}
+    found, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
     if keep is None:
         return found, orders
     store = outcome_store(keep)
@@ -236,7 +269,7 @@ def kept_outcomes(
             orders[number] = Order(task=task, key=key, keep=keep)
             outcome = store.load(key) if key in there else None
             if outcome is not None:
-                found[number] = outcome
+                found.put(number, outcome)
                 del orders[number]
     for text in store.warnings:
         progress(text)
@@ -246,7 +279,7 @@ def kept_outcomes(
 
 
 def compute(
-    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, found: dict[int, Outcome]
+    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, found: Outcomes
 ) -> None:
     """Let the workers do what is to do; each outcome is put into ``found``.
 
@@ -259,8 +292,8 @@ def compute(
     workers : Workers
     progress : Progress
         Tasks done, and the time left.
-    found : dict of int to Outcome
-        Outcomes by the number of the task; gets the new ones.
+    found : Outcomes
+        Gets the new ones.
     """
     if not orders:
         return
@@ -270,7 +303,7 @@ def compute(
     def done(place: int, result: Done | Lost) -> None:
         number = numbers[place]
         outcome = _outcome(orders[number], result)
-        found[number] = outcome
+        found.put(number, outcome)
         watch(outcome, 0 if isinstance(result, Lost) else result.links)
 
     workers.run(carry_out, [orders[number] for number in numbers], done)

@@ -19,7 +19,7 @@ import numpy as np
 from ..common.errors import AerpawCmpError
 from ..common.units import AnyArray, FloatArray
 from ..common.versions import versions
-from ..compare import rank, result, rss, statistics
+from ..compare import offset, rank, result, rss, statistics
 from ..compare.result import FlightResult, RankResult, RssResult
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
@@ -254,7 +254,7 @@ def task_facts(task: Task) -> Facts:
 
 def outcome_store(keep: str) -> OutcomeStore:
     """The outcomes of campaigns in a folder or object store."""
-    return OutcomeStore(open_place(keep), records_of(_this, campaign_data, rank, result, rss, statistics))
+    return OutcomeStore(open_place(keep), records_of(_this, campaign_data, offset, rank, result, rss, statistics))
 
 
 def fitted_to(task: Task, outcome: Outcome) -> Outcome:
@@ -266,8 +266,15 @@ def fitted_to(task: Task, outcome: Outcome) -> Outcome:
             return named
         none = np.zeros(0)
         return dataclasses.replace(
-            named, time_s=none, distance_m=none, position_m=np.zeros((0, 3)), heading_deg=None
-        )  # fmt: skip
+            named,
+            difference=one.moments,
+            time_s=none,
+            measured_db=none,
+            simulated_dbm=none,
+            distance_m=none,
+            position_m=np.zeros((0, 3)),
+            heading_deg=None,
+        )
 
     failure = outcome.failure and dataclasses.replace(outcome.failure, flight=task.flight, setting=task.setting)
     return Outcome(
@@ -327,6 +334,7 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         distance_m=found.geometry["distance_m"],
         heading_deg=found.geometry.get("heading_deg"),
         within=found.further.repeatability,
+        difference=offset.difference_moments(found.measured_db, found.simulated_dbm),
     )
 
 

@@ -7,6 +7,7 @@ A new number of a tower and channel is a field of ``RssFurther`` there and a fun
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -14,12 +15,15 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.forked import in_order
+from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.result import (
+    APPLIED,
     Censored,
     ExpectedOffset,
     Fit,
@@ -40,7 +44,7 @@ from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
-from .replay import FlightReplay, Replayed, direct_foliage_m
+from .replay import FlightReplay, Replayed, direct_foliage_m, processes_for
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -63,11 +67,19 @@ PASSES_WITHIN_M = 3.0
 """Two passes of one place, first and second half of a flight, come this near."""
 
 
+FEWEST_SERIES = 4
+"""Series below which a further process does not pay."""
+
+
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
-    found = tuple(compare_rss_series(data, s, r) for s, r in zip(data.rss, replays.rss, strict=True))
+    calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
+    found = []
+    for one in in_order(calls, processes_for(data), fewest=FEWEST_SERIES):
+        found.append(one)
+        give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
-        rss=found,
+        rss=tuple(found),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
         pairs=tuple(pairs_of(found)),
         serving=serving_of(data.rss, found),
@@ -125,7 +137,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         span_db=settings.span_db,
         replicates=max(settings.bootstrap, 1),
         lag_s=float("nan") if clock is None else clock.found.radio_minus_telemetry_s,
-        fitted_on_scored=("lag_s",) if clock is not None and clock.found.applied == "estimated and applied" else (),
+        fitted_on_scored=("lag_s",) if clock is not None and clock.found.applied == APPLIED else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     position = _positions(replayed)

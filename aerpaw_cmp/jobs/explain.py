@@ -31,7 +31,7 @@ from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
 from ..site.site import Trees
-from .replay import _poses, _track_poses, attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time
+from .replay import attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time, valid_poses
 
 MORE_SAMPLES = 10
 """Times the samples with which Sionna is asked again for paths that it lacks."""
@@ -297,15 +297,15 @@ def _pose(
             time = telemetry_time(time, clock)
             if clock is not None and clock.applied_s[at]:
                 notes.append(f"{clock.applied_s[at]:.3f} s are taken off the radio's clock")
-        track = _track_poses(data.track, time[at : at + 1])
+        track = data.poses_at(time[at : at + 1])
         _known(track.valid, series, at)
-        return series.link.build([series.tower], data.folder), _poses(track, rt.attitude), notes, time[at : at + 1]
+        return series.link.build([series.tower], data.folder), valid_poses(track, rt.attitude), notes, time[at : at + 1]
     link = data.settings.link.rank.build([series.tower], data.folder)
     position, valid = rank_positions(series, data.track)
     _known(valid[at : at + 1], series, at)
     rotation: FloatArray = np.eye(3)[None]
     if data.track is not None:
-        track = _track_poses(data.track, series.time[at : at + 1])
+        track = data.poses_at(series.time[at : at + 1])
         if track.valid[0]:
             rotation = np.asarray(attitude_rotation(track, rt.attitude))
     return link, Poses(position[at : at + 1], np.ascontiguousarray(rotation)), notes, series.time[at : at + 1]

@@ -7,17 +7,20 @@ field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResul
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 
+from ..common.forked import beside, in_order
 from ..common.stages import Stages
-from ..compare.ladder import ladder_rows
+from ..compare.ladder import LadderRow, series_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
 from .audit_flight import audit_replays
-from .compare_flight import compare_flight
+from .compare_flight import FEWEST_SERIES, compare_flight
 from .ladder import FlightLadder, flight_ladder
-from .replay import Clock, FlightReplay, estimate_clocks, replay_rank, replay_rss
+from .replay import Clock, FlightReplay, estimate_clocks, processes_for, replay_rank, replay_rss
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -43,7 +46,11 @@ class FlightRun:
 
 
 def replay_flight(
-    data: FlightData, stages: Stages | None = None, *, clocks: Sequence[Clock | None] | None = None
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    clocks: Sequence[Clock | None] | None = None,
+    meanwhile: Callable[[], object] | None = None,
 ) -> FlightReplay:
     """Clocks and replay alone.
 
@@ -54,10 +61,17 @@ def replay_flight(
         Times "clocks" and "replay".
     clocks : sequence of Clock or None, optional
         One per RSS series, in place of what ``rss.lag`` asks for.
+    meanwhile : callable, optional
+        As for :func:`~aerpaw_cmp.jobs.replay.estimate_clocks`.
+
+    Returns
+    -------
+    FlightReplay
+        Of every RSS and rank series.
     """
     stages = stages or Stages()
     with stages("clocks"):
-        known = estimate_clocks(data, stages.progress) if clocks is None else clocks
+        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
     with stages("replay"):
         return FlightReplay(
             rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
@@ -65,7 +79,12 @@ def replay_flight(
 
 
 def run_flight(
-    data: FlightData, stages: Stages | None = None, *, audit: bool = True, ladder: bool = False
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    audit: bool = True,
+    ladder: bool = False,
+    meanwhile: Callable[[], object] | None = None,
 ) -> FlightRun:
     """Clocks, replay, comparison, audit and ladder.
 
@@ -78,6 +97,8 @@ def run_flight(
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
+    meanwhile : callable, optional
+        What this process may do while others estimate clocks.
 
     Returns
     -------
@@ -85,17 +106,33 @@ def run_flight(
         Replays, numbers of the comparison, and the ladder where it was asked for.
     """
     stages = stages or Stages()
-    replays = replay_flight(data, stages)
-    with stages("compare"):
-        result = compare_flight(data, replays)
-    if audit:
-        with stages("audit"):
-            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
-    climbed = None
-    if ladder:
-        with stages("ladder"):
-            climbed = flight_ladder(data, replays, stages.progress)
-        if climbed is not None:
-            rows = ladder_rows(climbed.ladder, climbed.names, replicates=data.settings.rss.bootstrap)
-            result = dataclasses.replace(result, ladder=tuple(rows))
+    replays = replay_flight(data, stages, meanwhile=meanwhile)
+    with ExitStack() as running:
+        # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
+        climb: Callable[[], FlightLadder | None] | None = None
+        if ladder:
+            climb = partial(flight_ladder, data, replays)
+            climb = running.enter_context(beside(climb)) if processes_for(data) is None else climb
+        with stages("compare"):
+            result = compare_flight(data, replays)
+        if audit:
+            with stages("audit"):
+                result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
+        climbed = None
+        if climb is not None:
+            with stages("ladder"):
+                stages.progress("ladder of models")
+                climbed = climb()
+                if climbed is not None:
+                    rows = _ladder_rows(climbed, data.settings.rss.bootstrap)
+                    result = dataclasses.replace(result, ladder=tuple(rows))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
+
+
+def _ladder_rows(climbed: FlightLadder, replicates: int) -> list[LadderRow]:
+    """The rows of all series in their order, several series at a time where that is safe."""
+    calls = [
+        partial(series_rows, climbed.ladder, index, name, replicates=replicates)
+        for index, name in enumerate(climbed.names)
+    ]
+    return [row for rows in in_order(calls, fewest=FEWEST_SERIES) for row in rows]

@@ -16,7 +16,6 @@ import numpy as np
 import yaml
 
 from ..common.errors import UsageError
-from ..common.stages import Progress, silent
 from ..common.units import FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
@@ -113,11 +112,10 @@ class _Series:
     time_s: FloatArray
 
 
-def flight_ladder(data: FlightData, replays: FlightReplay, progress: Progress = silent) -> FlightLadder | None:
+def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | None:
     """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         return None
-    progress("ladder of models")
     return _Climber(data, [_thin(data, i, r) for i, r in enumerate(replays.rss)]).climb()
 
 

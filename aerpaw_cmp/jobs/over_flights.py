@@ -20,7 +20,7 @@ import numpy as np
 from ..common.errors import InputError
 from ..common.files import seal, unseal
 from ..common.units import FloatArray
-from ..compare.offset import Pooling, pooled_offsets
+from ..compare.offset import Pooling, pooled_moments
 from ..compare.passes import Pass, PassPair, PassTable
 from ..compare.rank import repeat_rank
 from ..flight.settings import Positive, Settings
@@ -47,8 +47,8 @@ def pool_offsets(rows: Sequence[RssRow], per: Pooling) -> tuple[list[RssRow], li
     for setting in dict.fromkeys(row.setting for row in rows):
         members = [row for row in rows if row.setting == setting]
         span = (min(r.span_db[0] for r in members), max(r.span_db[1] for r in members))
-        fits = pooled_offsets(
-            {row.key: (row.measured_db, row.simulated_dbm) for row in members},
+        fits = pooled_moments(
+            {row.key: row.moments for row in members},
             per,
             step_db=min(r.step_db for r in members),
             span_db=span,

@@ -3,22 +3,24 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray
-from ..compare.result import ClockResult
+from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.lag import DIRECTION_TERMS, direction_terms
+from ..flight.lag import DIRECTION_TERMS, terms_from
 from ..flight.settings import RtSettings
-from ..flight.track import Track, TrackPoses
+from ..flight.track import TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
@@ -102,7 +104,7 @@ def replay_rss(
         link = data.rss[members[0]].link.build([tower], data.folder)
         times = [telemetry_time(data.rss[i].time, shifts[i]) for i in members]
         valid, places, tracks = _towers_and_poses(data, tower, times)
-        poses = [_poses(track, rt.attitude) for track in tracks]
+        poses = [valid_poses(track, rt.attitude) for track in tracks]
         joined = poses[0] if len(poses) == 1 else _joined_poses(poses)
         channels = ", ".join(data.rss[i].channel for i in members)
         progress(f"replay RSS {tower} {channels}: {len(joined)} poses")
@@ -131,7 +133,7 @@ def _towers_and_poses(
     valid, places, tracks = [], [], []
     for time in times:
         place, known = data.tower_at(tower, time)
-        track = _track_poses(data.track, time).where(known)
+        track = data.poses_at(time).where(known)
         valid.append(track.valid)
         tracks.append(track.pick(track.valid))
         places.append(place if len(place) == 1 and tower not in data.nodes else place[track.valid])
@@ -149,10 +151,13 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
+def estimate_clocks(
+    data: FlightData, progress: Progress = silent, meanwhile: Callable[[], object] | None = None
+) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
-    Predictions are the image engine's RSS along the track with at most one reflection.
+    Predictions are the image engine's RSS along the track with at most one reflection. ``meanwhile`` is what this
+    process may do while others estimate; it is not called where there is nothing to estimate.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
@@ -160,9 +165,14 @@ def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock
     if isinstance(wanted, float):
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
-    for tower in dict.fromkeys(series.tower for series in data.rss):
-        progress(f"clock {tower}")
-        found[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
+    towers = list(dict.fromkeys(series.tower for series in data.rss))
+    calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
+    with ahead(calls, processes_for(data)) as estimates:
+        if meanwhile is not None:
+            meanwhile()
+        for tower in towers:
+            progress(f"clock {tower}")
+            found[tower] = next(estimates)
     return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -175,9 +185,18 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
         drift_s_per_s=0.0,
         verdict="given",
         reason="",
-        applied="given in flight.yaml",
+        applied=GIVEN,
     )
     return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
+
+
+SHARED_UP_TO = 200_000
+"""RSS samples of a flight up to which its series are shared by several processes."""
+
+
+def processes_for(data: FlightData) -> int | None:
+    """Processes for the series of a flight: as many as are safe; one on a long flight, where each holds much memory."""
+    return None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
 
 
 BLOCK = 100_000
@@ -206,7 +225,7 @@ class _Predictions:
         data = self._data
         place, known = data.tower_at(tower, times)
         track = self.track_at(times).where(known)
-        poses, depth = _poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
+        poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
         if tower in data.nodes:
             found = replay_moving(data.site, link, poses, place[track.valid], max_depth=depth)
         else:
@@ -219,7 +238,7 @@ class _Predictions:
         key = _digest(times)
         if key not in self._tracks:
             kept = list(self._tracks.items())[-_TRACKS_KEPT + 1 :]
-            self._tracks = {**dict(kept), key: _track_poses(self._data.track, times)}
+            self._tracks = {**dict(kept), key: self._data.poses_at(times)}
         return self._tracks[key]
 
     def terms_at(self, tower: str, times: Any) -> FloatArray:
@@ -227,10 +246,8 @@ class _Predictions:
         found, start = np.empty((len(times), DIRECTION_TERMS)), 0
         for part in _in_blocks(times):
             track = self.track_at(part)
-            line = track.position_m - self._data.tower_at(tower, part)[0]
-            azimuth = np.degrees(np.arctan2(line[:, 0], line[:, 1]))
-            elevation = np.degrees(np.arctan2(line[:, 2], np.hypot(line[:, 0], line[:, 1])))
-            some = direction_terms(azimuth, elevation, azimuth + 180.0 - track.heading_deg)
+            place = self._data.tower_at(tower, part)[0]
+            some = terms_from(place, track.position_m, track.heading_deg)
             found[start : start + len(part)] = some
             start += len(part)
         return found
@@ -288,27 +305,14 @@ def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
     if least is None:
         return series.measured_db
     with np.errstate(invalid="ignore"):
-        low = ~(_track_poses(data.track, series.time).position_m[:, 2] >= least)
+        low = ~(data.poses_at(series.time).position_m[:, 2] >= least)
     return np.where(low, np.nan, series.measured_db)
 
 
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
-    """The clock of a receiver as that of one of its series; only a verdict "ok" is applied."""
-    used = apply and fit.verdict == "ok"
-    found = ClockResult(
-        receiver=series.tower,
-        radio_minus_telemetry_s=fit.radio_minus_telemetry_s,
-        ci95_s=fit.ci95_s,
-        drift_s_per_s=fit.drift_s_per_s,
-        verdict=fit.verdict,
-        reason=f"by the {fit.model}" + (f": {fit.reason}" if fit.reason else ""),
-        applied="estimated and applied"
-        if used
-        else "asked for, not applied"
-        if apply and fit.verdict != "agree"
-        else "estimated, not applied",
-        checks=fit.as_dict(),
-    )
+    """The clock of a receiver as that of one of its series."""
+    found = fit.result(series.tower, apply=apply)
+    used = found.applied == APPLIED
     return Clock(found=found, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
 
 
@@ -346,7 +350,7 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         place, known = data.tower_at(series.tower, series.time)
         valid = valid & known
         towers_m = place[valid] if series.tower in data.nodes else None
-        track = None if data.track is None else _track_poses(data.track, series.time).pick(valid)
+        track = None if data.track is None else data.poses_at(series.time).pick(valid)
         rotation = np.tile(np.eye(3), (int(valid.sum()), 1, 1))
         if track is not None:
             rotation[track.valid] = attitude_rotation(track, data.settings.rt.attitude)[track.valid]
@@ -360,16 +364,6 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
     return out
 
 
-def _track_poses(track: Track | None, time: Any) -> TrackPoses:
-    assert track is not None
-    if len(time) <= BLOCK:
-        return track.pose_at(time)
-    parts = [track.pose_at(part) for part in _in_blocks(time)]
-    return TrackPoses(
-        **{one.name: np.concatenate([getattr(p, one.name) for p in parts]) for one in dataclasses.fields(TrackPoses)}
-    )
-
-
 def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
     """Body rotations (n, 3, 3) as a value of ``rt.attitude`` wants them."""
     if mode == "ignored":
@@ -380,7 +374,7 @@ def attitude_rotation(track: TrackPoses, mode: str) -> FloatArray:
     return rotation_from_aircraft(np.zeros_like(heading), np.zeros_like(heading), heading)
 
 
-def _poses(track: TrackPoses, attitude: str) -> Poses:
+def valid_poses(track: TrackPoses, attitude: str) -> Poses:
     """The valid ones; of a track that has no other the very arrays, so that a long flight has one copy of them."""
     some = track.pick(track.valid)
     return Poses(some.position_m, np.ascontiguousarray(attitude_rotation(some, attitude)))

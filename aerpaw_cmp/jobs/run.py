@@ -8,6 +8,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -215,8 +216,8 @@ def run_report(
     from ..flight.data import load_data
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
-    from ..report.exports.write import chosen_formats
-    from ..report.write import FIGURES, STYLES, write_report
+    from ..report.exports.formats import chosen_formats
+    from ..report.write import FIGURES, STYLES, prepare_report, write_report
     from .flight_run import run_flight
     from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
@@ -240,7 +241,7 @@ def run_report(
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
-        found = run_flight(data, stages, ladder=True)
+        found = run_flight(data, stages, ladder=True, meanwhile=partial(prepare_report, figures))
         record = report_record(found, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
@@ -870,7 +871,7 @@ def run_campaign(
 
     from ..flight.settings import load_flight
     from ..report.campaign_html import campaign_metrics, warnings, write_campaign
-    from ..report.exports.write import chosen_formats
+    from ..report.exports.formats import chosen_formats
     from .campaign import load_campaign
     from .campaign import run as run_all
     from .season import find_reports, with_season

@@ -99,9 +99,7 @@ def held_out_rows(rows: Sequence[RssRow]) -> list[RssRow]:
 
 def mean_difference_db(row: RssRow) -> float:
     """Mean of simulated minus measured over the scored samples [dB]; NaN without one."""
-    difference = row.simulated_dbm - row.measured_db
-    good = difference[np.isfinite(difference)]
-    return float(good.mean()) if len(good) else float("nan")
+    return row.moments.mean_db
 
 
 def error_of(row: RssRow) -> float:

@@ -14,7 +14,17 @@ from ..common.units import AnyArray, FloatArray, IntArray, db_from_amplitude
 from ..common.versions import versions
 from ..compare import rss
 from ..compare.rank import RankFit
-from ..compare.result import ClockResult, FlightResult, ModelLevel, PairResult, RankResult, RssResult
+from ..compare.result import (
+    APPLIED,
+    GIVEN,
+    NOT_APPLIED,
+    ClockResult,
+    FlightResult,
+    ModelLevel,
+    PairResult,
+    RankResult,
+    RssResult,
+)
 from ..compare.statistics import PairedDifference
 from ..flight.data import FlightData, RssSeries
 from ..flight.settings import LogSettings
@@ -215,12 +225,12 @@ def clock_warnings(result: FlightResult) -> tuple[str, ...]:
     for receiver, clock in clocks_of(result).items():
         low, high = clock.ci95_s
         shown = f"{clock.radio_minus_telemetry_s:+.2f} s ({low:+.2f} .. {high:+.2f})"
-        if clock.applied == "asked for, not applied":
+        if clock.applied == NOT_APPLIED:
             asked.append(
                 f"{receiver}: rss.lag: apply was asked for, but the radio clock was NOT corrected: the check is "
                 f"{clock.verdict} ({clock.reason})."
             )
-        elif clock.applied == "estimated and applied":
+        elif clock.applied == APPLIED:
             other.append(f"{receiver}: the radio clock shows {shown} more than the telemetry clock; it was corrected.")
         elif clock.verdict == "ok":
             other.append(
@@ -283,7 +293,7 @@ def _clock_entry(clock: ClockResult) -> dict[str, Any]:
         "ci95_s": list(clock.ci95_s),
         "verdict": clock.verdict,
         "reason": clock.reason,
-        "applied": clock.applied in ("estimated and applied", "given in flight.yaml"),
+        "applied": clock.applied in (APPLIED, GIVEN),
     }
 
 

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray, IntArray
+from ..compare.offset import Moments, difference_moments
 from ..compare.passes import cell_means
 from ..compare.result import Repeated
 from ..site.site import Site
@@ -24,7 +25,8 @@ class RssRow:
     flights of the same setting, tower and channel, ``held_out_rmse_db`` is what that leaves here (NaN without another).
     ``baselines`` are RMSE [dB] by name, each with an offset of its own; ``span_db`` and ``step_db`` are those of the
     offset search; ``within`` is the repeatability of the flight's two halves. Arrays (n,) are at the samples, NaN where
-    a side is missing; times, places, distances and headings are kept for the first setting only, and empty elsewhere.
+    a side is missing; they are kept for the first setting only, elsewhere they are empty and ``difference`` stands for
+    them.
     """
 
     flight: str
@@ -57,6 +59,7 @@ class RssRow:
     start_ns: int = 0
     """Instant of ``time_s`` = 0, nanoseconds after 1970-01-01."""
     within: Mapping[str, Repeated] = field(default_factory=dict)
+    difference: Moments | None = None
     pooled_offset_db: float = float("nan")
     pooled_rmse_db: float = float("nan")
     held_out_offset_db: float = float("nan")
@@ -66,6 +69,11 @@ class RssRow:
     def key(self) -> tuple[str, str, str]:
         """Flight, tower, channel."""
         return self.flight, self.tower, self.channel
+
+    @property
+    def moments(self) -> Moments:
+        """Of simulated minus measured over the scored samples."""
+        return self.difference or difference_moments(self.measured_db, self.simulated_dbm)
 
     @property
     def link(self) -> str:

@@ -18,6 +18,8 @@ from ..compare.result import Repeated
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankHeldOutFold, RankRow, RssRow
 from .campaign_explorer import payload
+from .campaign_pairs import TABLE as PAIR_TABLE
+from .campaign_pairs import by_link, pair_frame, telling, telling_ranks
 from .canvas import Picture
 from .explorer import as_json
 from .export import write_file
@@ -87,7 +89,7 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
         "reference": data.reference,
         "failures": _entries(data.failures, ("traceback",)),
         "mean_rmse_db": mean_rmse(data),
-        "rss": _entries(data.rss, ARRAYS),
+        "rss": _entries(data.rss, (*ARRAYS, "difference")),
         "rank": _entries(data.rank),
         "rank_transfers": _entries(data.rank_transfers),
         "calibration": {"per": data.calibration, "groups": _entries(data.pooled)},
@@ -95,8 +97,12 @@ def campaign_metrics(data: CampaignData) -> dict[str, Any]:
             "radius_m": data.radius_m,
             "heading_within_deg": data.heading_within_deg,
             "cell_m": data.cell_m,
-            "pairs": _entries(data.repeats),
-            "rank_pairs": _entries(data.rank_repeats),
+            "pairs_total": len(data.repeats),
+            "links": by_link(data.repeats),
+            "pairs": _entries(telling(data.repeats)),
+            "rank_pairs_total": len(data.rank_repeats),
+            "rank_pairs": _entries(telling_ranks(data.rank_repeats)),
+            "table": f"{PAIR_TABLE}.csv" if data.repeats or data.rank_repeats else None,
         },
         "held_out": {
             "failure": data.held_out_failure or None,
@@ -359,7 +365,7 @@ def write_parquet(table: pd.DataFrame, path: Path, progress: Progress = silent) 
     try:
         import pyarrow  # noqa: F401
     except ImportError:
-        progress("campaign.parquet was not written: it needs pyarrow (pip install 'aerpaw-cmp[geo]')")
+        progress(f"{path.name} was not written: it needs pyarrow (pip install 'aerpaw-cmp[geo]')")
         return []
     # a column of numbers without any text is one of numbers, whatever else its rows are about
     return [write_file(path, table.to_parquet(index=False, engine="pyarrow"))]
@@ -370,8 +376,10 @@ def write_campaign(
 ) -> list[Path]:
     """Write ``campaign.html``, ``campaign.json``, ``campaign.csv`` and ``figures/``; gives the files, page first.
 
+    Pairs of flights at the same places stand in ``pairs.csv``, all of them; campaign.json has the telling ones.
+
     With ``exports`` also the samples of the first setting in those formats
-    (:data:`aerpaw_cmp.report.exports.write.FORMATS`).
+    (:data:`aerpaw_cmp.report.exports.formats.FORMATS`).
 
     Parameters
     ----------
@@ -395,6 +403,10 @@ def write_campaign(
         write_file(folder / "campaign.csv", table.to_csv(index=False, lineterminator="\n")),
         *write_parquet(table, folder / "campaign.parquet", progress),
     ]
+    if data.repeats or data.rank_repeats:
+        pairs = pair_frame(data)
+        written.append(write_file(folder / f"{PAIR_TABLE}.csv", pairs.to_csv(index=False, lineterminator="\n")))
+        written += write_parquet(pairs, folder / f"{PAIR_TABLE}.parquet", progress)
     tables = [path.name for path in written]
     drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")
     written += pictures

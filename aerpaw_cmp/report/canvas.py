@@ -17,13 +17,13 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from ..common.forked import ahead
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site, Trees
 from .data import RankPanel, ReportData, RssPanel
-from .drawing import in_order
 from .export import write_file
 
 if TYPE_CHECKING:
@@ -68,7 +68,7 @@ class FigureSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """A drawn plate: its words, and the picture by format ("png", "svg", "pdf")."""
+    """A drawn plate: its words, the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
 
     name: str
     section: str
@@ -76,6 +76,7 @@ class Picture:
     caption: str
     alt: str
     formats: Mapping[str, bytes]
+    inline: bytes = b""
 
 
 STYLES = ("screen", "paper")
@@ -196,6 +197,7 @@ def render(plate: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str
         caption=plate.caption,
         alt=plate.alt,
         formats=files,
+        inline=smaller(files["png"]) if "png" in files else b"",
     )
 
 
@@ -205,6 +207,8 @@ def write_figures(
     formats: Sequence[str] = ("svg", "png"),
     kind: str = "screen",
     progress: Progress = silent,
+    *,
+    meanwhile: Callable[[], object] | None = None,
 ) -> tuple[list[Picture], list[Path]]:
     """Draw plates and write each in its formats; gives the pictures and the files.
 
@@ -219,6 +223,8 @@ def write_figures(
         Style, as in :func:`render`.
     progress : Progress
         Share of the figures that are drawn.
+    meanwhile : callable, optional
+        What this process may do while others draw.
 
     Returns
     -------
@@ -228,15 +234,27 @@ def write_figures(
     drawn: list[Picture] = []
     written: list[Path] = []
     if plates:
-        import matplotlib.backends.backend_agg
-        import matplotlib.figure  # noqa: F401  once, before further processes are made
-    for picture in in_order([partial(render, plate, formats, kind) for plate in plates]):
-        progress("figures", len(drawn) / len(plates))
-        drawn.append(picture)
-        written += [write_file(folder / f"{picture.name}.{name}", content) for name, content in picture.formats.items()]
+        load_matplotlib()
+    with ahead([partial(render, plate, formats, kind) for plate in plates], fewest=FEWEST_FIGURES) as pictures:
+        if meanwhile is not None:
+            meanwhile()
+        for picture in pictures:
+            progress("figures", len(drawn) / len(plates))
+            drawn.append(picture)
+            written += [write_file(folder / f"{picture.name}.{kind}", one) for kind, one in picture.formats.items()]
     if plates:
         progress("figures", 1.0)
     return drawn, written
+
+
+def load_matplotlib() -> None:
+    """Import what every figure needs: once, before further processes are made."""
+    import matplotlib.backends.backend_agg
+    import matplotlib.figure  # noqa: F401
+
+
+FEWEST_FIGURES = 4
+"""Figures below which a further process does not pay."""
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -20,7 +20,7 @@ from markupsafe import Markup
 from ..compare.ladder import LadderRow
 from ..logs.records import has_wall_clock
 from . import words
-from .canvas import Picture, smaller, start_of
+from .canvas import Picture, start_of
 from .data import RANKS, ReportData
 from .explorer import as_json, payload
 from .first_screen import headlines, verdict
@@ -130,8 +130,8 @@ def policy(script: str = "") -> str:
 
 def picture_uri(picture: Picture) -> str:
     """A picture as an address that holds it: PNG with few colours, else SVG."""
-    if "png" in picture.formats:
-        return "data:image/png;base64," + base64.b64encode(smaller(picture.formats["png"])).decode("ascii")
+    if picture.inline:
+        return "data:image/png;base64," + base64.b64encode(picture.inline).decode("ascii")
     return data_uri(picture.formats["svg"])
 
 

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..common.stages import Stages
-from . import figures, html
+from . import canvas, figures, html
 from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
 from .export import metrics, rank_csv, rss_csv, write_file
-from .exports.samples import of_report
-from .exports.write import FOLDER, write_exports
+from .exports.formats import FOLDER
 
 PAGE = "page"
 FIGURES = ("none", PAGE, "svg", "png", "pdf", "all")
@@ -29,6 +28,13 @@ class WrittenReport:
 
     files: tuple[Path, ...]
     data: ReportData
+
+
+def prepare_report(drawn: str = PAGE) -> None:
+    """Load what :func:`write_report` will need: for a process that has nothing else to do."""
+    html.environment().get_template("report.html.jinja")
+    if drawn != "none":
+        canvas.load_matplotlib()
 
 
 def write_report(
@@ -51,7 +57,7 @@ def write_report(
         One of :data:`FIGURES`.
     style : {"screen", "paper"}
     exports : sequence of str
-        Formats of :data:`aerpaw_cmp.report.exports.write.FORMATS` for the samples, besides the CSVs.
+        Formats of :data:`aerpaw_cmp.report.exports.formats.FORMATS` for the samples, besides the CSVs.
     stages : Stages, optional
         Times the stage "report"; all its seconds are then those of the record.
 
@@ -66,16 +72,22 @@ def write_report(
         If the folder cannot be written.
     """
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
-    written = []
+    written: list[Path] = []
     with stages("report"):
-        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
-            # written even without rows: a reader finds the same files in every report
-            written.append(write_file(folder / name, text))
         plates = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
-        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress)
+
+        def tables() -> None:
+            for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
+                # written even without rows: a reader finds the same files in every report
+                written.append(write_file(folder / name, text))
+
+        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress, meanwhile=tables)
     written += paths
     if exports:
+        from .exports.samples import of_report
+        from .exports.write import write_exports
+
         with stages("exports"):
             written += write_exports(of_report(data), folder, exports, stages.progress)
     data = dataclasses.replace(data, stages_s=dict(stages.seconds))

@@ -196,7 +196,7 @@ lw1,rx,ch0,0,30.0,-10.0,-12.0
 
 def test_reference_powers_give_the_expected_offset(tmp_path):
     path = tmp_path / "refs.csv"
-    path.write_text(REFERENCES)
+    path.write_text(REFERENCES.replace("lw1,rx,ch0,1", "\nlw1,rx,ch0,1"))  # an empty line is passed over
     table = read_reference_powers(path)
     assert len(table) == 3
     level = reference_power_dbm(table, node="LW1", category="rx", channel="ch0", gain_db=30.2, frequency_hz=3.35e9)

@@ -346,3 +346,26 @@ def test_repeat_kappa_of_two_passes():
     assert np.isnan(nowhere.kappa)
     north, south = np.zeros(900), np.full(900, 180.0)
     assert repeat_rank(here, rank, there, rank, heading_deg=north, other_heading_deg=south).n == 0
+
+
+def test_best_k_by_histogram_lies_in_its_interval_and_fits_best():
+    rng = np.random.default_rng(17)
+    profile = np.sort(10 ** rng.uniform(-3.0, 0, (1500, 4)), axis=1)[:, ::-1]
+    profile /= profile[:, :1]
+    h = with_profile(profile)
+    curve = k_curve(channel_rank(h, 30.0).astype(float), singular_values(h), replicates=100)
+    low, high = curve.best_k_total_variation_interval
+    assert low <= curve.best_k_total_variation <= high
+    assert low <= 30.0 * 1.1
+    assert high >= 30.0 / 1.1
+    assert high / low < 2.0, "where the distance is small, not where it is large"
+
+
+def test_a_period_is_taken_when_19_of_20_changes_fall_on_it():
+    rank = np.ones(400)
+    changes = [5 * k for k in range(1, 20)]
+    for odd, verdict in (([97], "held"), ([97, 98], "fresh")):
+        now = rank.copy()
+        for at in sorted(changes + odd):
+            now[at:] = 3.0 - now[at]
+        assert stale_reports(np.arange(400) * 0.1, now).verdict == verdict

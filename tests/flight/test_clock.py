@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight.clock import AGREE_S, ClockChannel, HeldOutBlocks, clock_trap, judge_clock
-from aerpaw_cmp.flight.lag import DRIFT_LIMIT, direction_terms
+from aerpaw_cmp.flight.clock import AGREE_S, ClockChannel, HeldOutBlocks, _near, clock_trap, judge_clock
+from aerpaw_cmp.flight.lag import DRIFT_LIMIT, direction_terms, no_lag
 from tests.flight.test_lag import two_ray_flight
 
 T = np.arange(0, 400, 0.25)
@@ -149,3 +151,54 @@ def test_whole_hours_are_recognised():
     assert clock_trap(tuple(s + np.timedelta64(20, "m") for s in span), span) is None  # no multiple of half hours
     assert clock_trap(tuple(s + np.timedelta64(3, "D") for s in span), span) is None
     assert clock_trap(tuple(s - np.timedelta64(330, "m") for s in span), span).hours == 5.5
+
+
+def test_a_short_log_of_one_side_is_brought_into_a_long_one_of_the_other():
+    """The overlap wanted is half of the shorter log, whichever it is."""
+    hours_4, minutes_10 = (0.0, 4 * 3600.0), (5 * 3600.0, 5 * 3600.0 + 600.0)
+    assert clock_trap(hours_4, minutes_10).hours > 0
+    assert clock_trap(minutes_10, hours_4).hours < 0
+    assert clock_trap((0.0, 3600.0), (1600.0, 6000.0)) is None, "more than half is shared"
+
+
+def test_blocks_kept_out_last_a_minute_and_are_four_to_ten():
+    for seconds, blocks in ((400.0, 6), (150.0, 4), (900.0, 10)):
+        t, level = np.arange(0, seconds, 0.5), two_ray_flight(seconds)
+        found = judge_clock([channel(2.0, level=level, measured=level(t), t=t, noise_db=1.0)])
+        assert found.held_out.blocks == blocks
+        assert 0 <= found.held_out.improved <= blocks
+
+
+def test_the_numbers_of_the_report_are_those_of_the_estimate():
+    found = judge_clock([channel(2.0), channel(2.0, seed=2, name="two")])
+    shown = found.as_dict()
+    assert shown["drift_ms_per_min"] == pytest.approx(found.drift_s_per_s * 1e3 * 60)
+    drifts = replace(found, drift_s_per_s=1e-5, drift_ci95_s_per_s=(-2e-5, 4e-5)).as_dict()
+    assert drifts["drift_ms_per_min"] == pytest.approx(0.6)
+    assert drifts["drift_ci95_ms_per_min"] == pytest.approx([-1.2, 2.4])
+
+
+@pytest.mark.parametrize(
+    ("own_s", "verdict", "evidence_there", "near"),
+    [
+        (2.3, "ok", 50.0, True),  # within half a second
+        (4.0, "ok", 0.0, False),  # a sharp optimum elsewhere
+        (4.0, "ambiguous", 0.0, True),  # it cannot tell the two apart
+        (4.0, "ambiguous", 50.0, False),  # it can
+        (float("nan"), "failed", 0.0, False),
+    ],
+)
+def test_part_of_the_evidence_agrees_where_it_is_near_or_cannot_tell(own_s, verdict, evidence_there, near):
+    lags = np.arange(-6.0, 6.01, 0.25)
+    evidence = np.full(len(lags), 50.0)
+    evidence[np.argmin(np.abs(lags - 2.0))] = evidence_there
+    part = replace(
+        no_lag("made for this test", 100, 6.0, lags),
+        radio_minus_telemetry_s=own_s, verdict=verdict, curve_lag_s=lags, evidence=evidence,
+    )  # fmt: skip
+    assert _near(part, 2.0) == near
+    beside = replace(part, evidence=np.roll(evidence, 1))
+    assert _near(beside, 2.0) == near, "a lag of the curve on either side counts"
+    assert _near(replace(part, evidence=np.roll(evidence, -1)), 2.0) == near
+    two_away = replace(part, evidence=np.roll(evidence, 2))
+    assert _near(two_away, 2.0) == (own_s == 2.3)

@@ -276,3 +276,21 @@ def test_slopes_of_free_terms_are_those_of_their_gradient():
     assert not slopes[:, 0].any()
     assert np.isnan(prediction.terms_at(np.array([2.9, 99.0]))[:, 1:]).all()
     assert direction_terms([1.0], [2.0], [3.0]).shape == (1, lag.DIRECTION_TERMS)
+
+
+def test_free_terms_of_many_lags_at_once_are_those_of_each_alone():
+    """What is left is orthogonal to the whitened terms, with and without gaps, however it is multiplied out."""
+    rng = np.random.default_rng(8)
+    terms = np.concatenate([np.ones((5, 80, 1)), rng.normal(size=(5, 80, 4))], axis=2)
+    y = rng.normal(size=(5, 80)) + terms @ np.array([3.0, 1.0, -2.0, 0.5, 0.0])
+    y[1, 7] = np.nan
+    terms[3, 20:30] = np.nan
+    for phi in (0.0, 0.6):
+        left = lag._without_terms(y, terms, phi)
+        for row in range(5):
+            np.testing.assert_allclose(left[row], y[row] - lag._explained(y[row], terms[row], phi), rtol=0, atol=1e-11)
+        whitened = left[0, 1:] - phi * left[0, :-1]
+        assert np.abs(whitened @ (terms[0, 1:] - phi * terms[0, :-1])).max() < 1e-10
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(lag, "_NO_THREADS", 0)
+        np.testing.assert_allclose(lag._without_terms(y, terms, 0.6), left, rtol=0, atol=1e-11)

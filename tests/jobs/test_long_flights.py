@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.flight import track as track_room
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs import replay as replay_job
@@ -29,6 +30,7 @@ def test_a_clock_predicted_in_blocks_is_that_of_the_whole_flight(
 ) -> None:
     whole = replay_job.estimate_clocks(one_tower)
     monkeypatch.setattr(replay_job, "BLOCK", 1500)
+    monkeypatch.setattr(track_room, "AT_ONCE", 700)
     parts = replay_job.estimate_clocks(one_tower)
     for a, b in zip(whole, parts, strict=True):
         assert a is not None
@@ -57,6 +59,7 @@ def test_a_replay_in_blocks_is_the_replay(one_tower: FlightData, monkeypatch: py
     data = dataclasses.replace(one_tower, settings=off)
     whole = replay_job.replay_rss(data)
     monkeypatch.setattr(replay_job, "BLOCK", 77)
+    monkeypatch.setattr(track_room, "AT_ONCE", 31)
     asked: list[float] = []
     parts = replay_job.replay_rss(data, lambda _text, share=None, /: asked.append(share))
     assert len([s for s in asked if s is not None]) > 5

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import dataclasses
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from aerpaw_cmp.jobs import over_flights
-from aerpaw_cmp.jobs.over_flights import PairsOrder, RepeatSettings, pairs_of, rank_repeats, repeats
-from aerpaw_cmp.report.campaign_data import FlownRank, RssRow
+from aerpaw_cmp.jobs.campaign_plan import Outcomes
+from aerpaw_cmp.jobs.campaign_tasks import Outcome, Task
+from aerpaw_cmp.jobs.over_flights import PairsOrder, RepeatSettings, pairs_of, pool_offsets, rank_repeats, repeats
+from aerpaw_cmp.report.campaign_data import FlownRank, FlownTrack, RssRow
 from tests.jobs.sent_by_pickle import SentByPickle
 
 
@@ -71,3 +74,38 @@ def test_flights_of_ranks_that_lie_apart_are_not_searched(monkeypatch: pytest.Mo
     (pair,) = rank_repeats(flown, 3.0)
     assert (pair.first, pair.second, pair.n, pair.kappa) == ("f0", "f1", 300, 1.0)
     assert len(asked) == 1
+
+
+def test_many_settings_are_held_in_the_memory_of_one() -> None:
+    """Series of samples stay for the first setting; shared offsets of the others come from their moments."""
+    rng, settings = np.random.default_rng(3), [f"s{i}" for i in range(40)]
+    tasks = [Task(Path("f.yaml"), "f", name, {}, None, reference=name == "s0") for name in settings]
+    outcomes, every = Outcomes(tasks), []
+    for number, name in enumerate(settings):
+        row = dataclasses.replace(
+            rows(1, 1, 5000)[0],
+            flight="f",
+            setting=name,
+            measured_db=rng.normal(-60, 3, 5000),
+            simulated_dbm=rng.normal(-58, 3, 5000),
+        )
+        row.simulated_dbm[::7] = np.nan
+        track = FlownTrack(flight="f", time_s=np.arange(5000.0), position_m=np.full((5000, 3), np.nan))
+        outcomes.put(number, Outcome(rss=(row,), track=track))
+        every.append(row)
+    held = [outcomes[number] for number in range(40)]
+    arrays = {
+        id(value): value.nbytes
+        for one in held
+        for record in (*one.rss, one.track)
+        for value in (getattr(record, field.name) for field in dataclasses.fields(record))  # type: ignore[arg-type]
+        if isinstance(value, np.ndarray)
+    }
+    assert sum(arrays.values()) < 16 * 8 * 5000  # of one setting: at most sixteen numbers a sample
+    done, groups = pool_offsets([one.rss[0] for one in held], "tower")
+    whole, same = pool_offsets(every, "tower")
+    for a, b in zip(done, whole, strict=True):
+        assert (a.pooled_offset_db, a.pooled_rmse_db) == (b.pooled_offset_db, b.pooled_rmse_db)
+        difference = b.simulated_dbm - b.measured_db
+        assert a.pooled_rmse_db == pytest.approx(np.sqrt(np.nanmean((difference - a.pooled_offset_db) ** 2)), rel=1e-12)
+    assert repr(groups) == repr(same)

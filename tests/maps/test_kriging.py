@@ -460,3 +460,22 @@ def test_wrong_shapes_are_named():
         OrdinaryKriging(PAPER).fit(scattered(4, 1, 9.0, 3), np.zeros(4)).predict([[0.0, 0.0]])
     with pytest.raises(UsageError, match="not finite"):
         OrdinaryKriging(lambda d: d * np.nan).fit(scattered(4, 1, 50.0), np.zeros(4)).predict([[0.0, 0.0]])
+
+
+def test_neighbours_are_within_150_m_unless_said_otherwise():
+    """arXiv 2502.10324: a place further away takes no part."""
+    for distance, reached in ((149.5, True), (150.5, False)):
+        estimate, _ = OrdinaryKriging(exponential).fit([[0.0, 0.0]], [3.0]).predict([[distance, 0.0]])
+        assert np.isfinite(estimate[0]) == reached
+
+
+def test_targets_of_one_geometry_share_one_system():
+    from aerpaw_cmp.maps.kriging import _same_geometry
+
+    square = np.array([[0.0, 10.0], [10.0, 0.0], [-10.0, 0.0]])
+    offsets = np.stack([square, 2 * square, square, square[::-1], square + 1e-12])
+    example, group = _same_geometry(offsets)
+    assert len(example) == 3
+    assert group[0] == group[2] == group[4]
+    assert len({int(group[k]) for k in (0, 1, 3)}) == 3
+    np.testing.assert_allclose(offsets[example][group], offsets, atol=1e-9)

@@ -134,12 +134,13 @@ def test_matches_50_digits_with_two_reflections_up_to_3_km(scenes):
     assert checked_depths == {0, 1, 2}
 
 
-def test_line_of_sight_is_friis_with_the_right_phase(scenes):
+@pytest.mark.parametrize(("place", "length"), [((120.0, -50.0, 10.0), 130.0), ((0.48, -0.2, 10.0), 0.52)])
+def test_line_of_sight_is_friis_with_the_right_phase(scenes, place, length):
     site = scenes.site()
-    poses = scenes.poses([[120.0, -50.0, 10.0]])
+    poses = scenes.poses([place])
     result = replay(site, scenes.link(site), poses, max_depth=0)
     lam = wavelength_m(scenes.carrier_hz)
-    expected = lam / (4 * np.pi * 130.0) * np.exp(-2j * np.pi * 130.0 / lam)
+    expected = lam / (4 * np.pi * length) * np.exp(-2j * np.pi * length / lam)
     assert result.h[0, 0, 0, 0] == pytest.approx(expected, rel=1e-10)
     assert result.rss_dbm == pytest.approx(
         free_space_dbm(site.towers["LW1"].position_m[None], poses.position_m, 3.4e9, 40.0)

@@ -190,3 +190,32 @@ def test_only_rank(small_report, tmp_path, driver):
         assert [e for e in driver.get_log("browser") if e["level"] == "SEVERE"] == []
     finally:
         driver.get(here)
+
+
+@pytest.mark.parametrize("width", [1440, 390])
+def test_names_of_towers_stay_clear_of_the_key_of_the_edges_and_of_each_other(driver, width):
+    """Towers put all over the map, some of them side by side: below the lowest of them begins the key."""
+    size = {"width": width, "height": 1200, "deviceScaleFactor": 1, "mobile": False}
+    driver.execute_cdp_cmd("Emulation.setDeviceMetricsOverride", size)
+    try:
+        frame(driver)
+        kept = driver.execute_script(
+            "const site = explorer.data.site, kept = site.towers, at = kept[0].at;"
+            "site.towers = [kept[0], { ...kept[0], name: 'beside', at: [at[0] + 4, at[1], at[2]] }, ...kept.slice(1)];"
+            "for (let k = 0; k < 40; k++) site.towers.push({ name: 'Tower ' + k, top: at[2] + 10,"
+            "  at: [at[0] + 150 * (k % 7 - 3), at[1] + 150 * (Math.floor(k / 7) - 3), at[2]] });"
+            "explorer.span(null); return kept;"
+        )
+        frame(driver)
+        labels, key, wide = driver.execute_script(
+            "return [explorer.labels(), explorer.keyTop(), document.getElementById('map').clientWidth]"
+        )
+        assert len(labels) > 8
+        assert all(left >= 0 and right <= wide and top >= 0 and bottom <= key for left, top, right, bottom, _ in labels)
+        near = [one for one in labels if one[4] in ("beside", kept[0]["name"])]
+        assert len(near) == 2
+        (a, b, c, d, _), (e, f, g, h, _) = near
+        assert min(c, g) <= max(a, e) or min(d, h) <= max(b, f)
+        driver.execute_script("explorer.data.site.towers = arguments[0]; explorer.span(null)", kept)
+    finally:
+        driver.execute_cdp_cmd("Emulation.clearDeviceMetricsOverride", {})

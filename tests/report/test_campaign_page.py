@@ -13,7 +13,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.report import campaign_explorer, campaign_figures, campaign_html, canvas
+from aerpaw_cmp.report import campaign_explorer, campaign_figures, campaign_html, campaign_pairs, canvas
+from aerpaw_cmp.report.campaign_data import RankPairing, Repeat
 from aerpaw_cmp.report.explorer import as_json
 from aerpaw_cmp.report.packed import NONE
 from benchmarks import fabricated
@@ -120,3 +121,46 @@ def test_figures_of_a_season_are_few_and_can_be_drawn(data):
     for plate in plates:
         if plate.section == "season":
             assert canvas.render(plate, ("png",)).formats["png"][:4] == b"\x89PNG"
+
+
+def many_pairs(count):
+    """Pairs of flights of which number i meets at i places (every third nowhere) and differs by (i * 7919) % 101 dB."""
+    nothing = {"share": 0.5, "offset_db": 0.0, "single_db": 1.0, "residual_rmse_db": 1.0, "place_rmse_db": 1.0,
+               "place_correlation": 0.5, "cells": 3, "height_difference_m": 0.0}  # fmt: skip
+    for i in range(count):
+        meets = i % 3 > 0
+        yield Repeat(
+            tower=f"LW{i % 2 + 1}", channel="USRP1", first=f"flight {i}", second="other", n=i if meets else 0,
+            rmse_db=float(i * 7919 % 101) if meets else float("nan"), rmse_ci95_db=(1.0, 2.0) if meets else None, **nothing,
+        )  # fmt: skip
+
+
+def test_campaign_json_has_the_telling_pairs_and_a_file_has_all(data, tmp_path):
+    season = dataclasses.replace(data, repeats=tuple(many_pairs(30_000)))
+    found = campaign_html.campaign_metrics(season)["repeatability"]
+    assert found["pairs_total"] == 30_000
+    assert len(found["pairs"]) == campaign_pairs.KEPT
+    assert len(json.dumps(found)) < 600_000
+    listed = {pair["first"] for pair in found["pairs"]}
+    most = sorted(season.repeats, key=lambda pair: -pair.n)[: campaign_pairs.KEPT // 2]
+    assert listed >= {pair.first for pair in most}
+    assert (
+        sum(pair["rmse_db"] == 100.0 for pair in found["pairs"]) >= 190
+    )  # all of the worst: a 101st of those that meet
+    one = found["links"][0]
+    met = [pair for pair in season.repeats if pair.tower == one["tower"] and pair.n]
+    assert (one["pairs"], one["meeting"], one["n"]) == (15_000, len(met), sum(pair.n for pair in met))
+    assert one["rmse_quantiles_db"]["50"] == pytest.approx(np.median([pair.rmse_db for pair in met]))
+
+    few = dataclasses.replace(data, repeats=season.repeats[:40])
+    assert [p["first"] for p in campaign_html.campaign_metrics(few)["repeatability"]["pairs"]] == [
+        pair.first for pair in few.repeats
+    ]
+    table = campaign_pairs.pair_frame(dataclasses.replace(season, rank_repeats=(RANKS_AGAIN,)))
+    assert len(table) == 30_001
+    assert table["n"].iloc[:30_000].tolist() == [pair.n for pair in season.repeats]
+    assert table["rmse_low_db"].notna().sum() == 20_000
+    assert (table["kind"].iloc[-1], table["kappa_low"].iloc[-1]) == ("rank", 0.25)
+
+
+RANKS_AGAIN = RankPairing(tower="LW1", first="a", second="b", n=9, agreement=0.5, kappa=0.5, kappa_ci95=(0.25, 0.75))

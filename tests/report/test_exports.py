@@ -18,7 +18,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.settings import ReportSettings
 from aerpaw_cmp.report.export import rank_frame, rss_frame
-from aerpaw_cmp.report.exports import geojson, geopackage, gpx, kmz, matlab, netcdf, parquet, samples, write
+from aerpaw_cmp.report.exports import formats, geojson, geopackage, gpx, kmz, matlab, netcdf, parquet, samples, write
 
 ODD = 'LW<4> & "ö"'
 DBM = "0.1 lg(re 1 mW)"
@@ -296,7 +296,7 @@ CHECKS = {
 
 def checked(name, folder, frames, data):
     more = (data,) if name in ("gpx", "kmz") else ()
-    CHECKS[name](folder / write.FOLDER, frames, *more)
+    CHECKS[name](folder / formats.FOLDER, frames, *more)
 
 
 @pytest.mark.parametrize("name", write.FORMATS)
@@ -460,23 +460,23 @@ def test_a_long_flight_is_thinned_with_its_extremes(data, tmp_path, monkeypatch)
 
 
 def test_formats_are_chosen_by_name():
-    assert write.chosen_formats(["KMZ, gpx", "gpx"]) == ("kmz", "gpx")
-    assert write.chosen_formats(["all"]) == write.FORMATS
-    assert write.chosen_formats([]) == ()
+    assert formats.chosen_formats(["KMZ, gpx", "gpx"]) == ("kmz", "gpx")
+    assert formats.chosen_formats(["all"]) == write.FORMATS
+    assert formats.chosen_formats([]) == ()
     with pytest.raises(UsageError, match=r"'shapefile'.*geopackage"):
-        write.chosen_formats(["shapefile"])
+        formats.chosen_formats(["shapefile"])
     asked = typing.get_args(typing.get_args(ReportSettings.model_fields["export"].annotation)[0])
-    assert set(asked) == {*write.FORMATS, write.ALL}
+    assert set(asked) == {*write.FORMATS, formats.ALL}
 
 
 @pytest.mark.parametrize(("name", "module"), [("netcdf", "netCDF4"), ("parquet", "pyarrow")])
 def test_a_missing_library_is_named_with_its_extra(name, module, data, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, module, None)
     with pytest.raises(UsageError, match=rf"{module}.*aerpaw-cmp\[geo\]"):
-        write.chosen_formats([name])
+        formats.chosen_formats([name])
     told = []
     write.write_exports(
-        samples.of_report(data), tmp_path, write.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
+        samples.of_report(data), tmp_path, formats.chosen_formats(["gpx", "all"]), lambda text, *_: told.append(text)
     )
     assert any(module in text and "aerpaw-cmp[geo]" in text for text in told)
     assert not list((tmp_path / "exports").glob("*.nc" if name == "netcdf" else "*.parquet"))

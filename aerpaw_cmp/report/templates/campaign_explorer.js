@@ -204,7 +204,7 @@
 
   // --- residuals by place -----------------------------------------------------------------------------------------------
 
-  let project = null, place = null;
+  let project = null, place = null, labels = [];
   const places = () => {
     const chosen = chosenLinks(), one = data.places.find(p => p.link === (chosen.length === 1 ? chosen[0] : -1)) || (data.places.length === 1 ? data.places[0] : null);
     return one;
@@ -242,8 +242,8 @@
     for (const t of data.site ? data.site.towers : []) {
       const x = project.x(t.at[0]), y = project.y(t.at[1]);
       pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath(); pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke();
-      pen.font = "bold 12px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = css("--paper"); pen.strokeText(t.name, x + 9, y + 4); pen.fillStyle = css("--accent"); pen.fillText(t.name, x + 9, y + 4);
     }
+    labels = common.names(pen, [46, 6, w - 6, h - 30], (data.site ? data.site.towers : []).map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: css("--accent"), halo: css("--paper") })));
     if (place !== null && c.e[place] !== undefined) { pen.strokeStyle = "#000"; pen.lineWidth = 2; pen.strokeRect(project.x(c.e[place] * m), project.y((c.n[place] + 1) * m), m * scale, m * scale); }
     pen.restore();
     pen.fillStyle = css("--ink"); pen.font = "12px system-ui, sans-serif"; pen.textAlign = "center";
@@ -342,7 +342,7 @@
 
   document.documentElement.classList.add("live");
   controls(); everything();
-  window.campaignExplorer = { state, data, perFlight, ranking: () => ranked, mark, keep, spots, everything, controls, places: () => { const p = places(); return p && { link: p.link, ...cellsOf(p) }; }, project: () => project, trackOf, ready: true };
+  window.campaignExplorer = { state, data, perFlight, ranking: () => ranked, mark, keep, spots, everything, controls, places: () => { const p = places(); return p && { link: p.link, ...cellsOf(p) }; }, labels: () => labels, project: () => project, trackOf, ready: true };
 })().catch(error => { // an old browser without the means: the static tables and figures stay
   document.documentElement.classList.remove("live");
   console.error(error);

@@ -45,6 +45,24 @@ const common = (() => {
     return [pen, w, h];
   }
 
+  // names of points inside an area [left, top, right, bottom]: beside their points, clear of its edges and of each other
+  function names(pen, area, points, font = "bold 12px system-ui, sans-serif") {
+    const [left, top, right, bottom] = area, placed = [], high = 13;
+    pen.save(); pen.font = font; pen.lineWidth = 3; pen.textAlign = "left"; pen.lineJoin = "round";
+    for (const { text, at, colour, halo, alpha } of points) {
+      if (!(at[0] >= left && at[0] <= right && at[1] >= top && at[1] <= bottom)) continue;
+      const wide = pen.measureText(text).width;
+      const held = ([x, y]) => [Math.max(left + 2, Math.min(right - wide - 2, x)), Math.max(top + high, Math.min(bottom - 4, y))];
+      const over = ([x, y]) => placed.reduce((sum, [a, b, c, d]) => sum + Math.max(0, Math.min(x + wide, c) - Math.max(x, a)) * Math.max(0, Math.min(y + 3, d) - Math.max(y - high + 3, b)), 0);
+      const tried = [[8, -5], [8, 14], [-wide - 8, -5], [-wide - 8, 14], [-wide / 2, -12], [-wide / 2, 22]].map(d => held([at[0] + d[0], at[1] + d[1]]));
+      const [x, y] = tried.reduce((best, one) => over(one) < over(best) - 0.5 ? one : best);
+      placed.push([x, y - high + 3, x + wide, y + 3, text]);
+      pen.globalAlpha = alpha ?? 1; pen.strokeStyle = halo; pen.strokeText(text, x, y); pen.fillStyle = colour; pen.fillText(text, x, y);
+    }
+    pen.restore();
+    return placed;
+  }
+
   function ticks(low, high, most = 5) {
     if (!(high > low)) return [low];
     const raw = (high - low) / most, mag = 10 ** Math.floor(Math.log10(raw)), step = [1, 2, 5, 10].map(k => k * mag).find(k => k >= raw * (1 - 1e-9)), out = [];
@@ -95,5 +113,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, ticks, axes, ramp, quantile, later, whenResized, digits };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, later, whenResized, digits };
 })();

@@ -224,7 +224,8 @@
   // --- the map, plan or in three dimensions ---------------------------------------------------------------------------
 
   const canvas = at("map"), pen = canvas.getContext("2d");
-  let project = null, drawn = [];
+  const KEY = 46; // strip below the map that holds its scale and its colours: nothing of the map lies under them
+  let project = null, drawn = [], labels = [];
 
   function flown() {
     const s = rss() || rank() || data.track;
@@ -240,7 +241,7 @@
   }
 
   function prepare() {
-    const w = canvas.clientWidth, h = canvas.clientHeight, b = box(), c = b.map(([x, y]) => (x + y) / 2);
+    const w = canvas.clientWidth, h = canvas.clientHeight - KEY, b = box(), c = b.map(([x, y]) => (x + y) / 2);
     const ct = Math.cos(state.turn), st = Math.sin(state.turn), ce = Math.cos(state.tilt), se = Math.sin(state.tilt), stretch = state.tilt > 1.5 ? 1 : 2;
     const raw = p => {
       const e = p[0] - c[0] - state.east, n = p[1] - c[1] - state.north, u = (p[2] || 0) * stretch;
@@ -251,7 +252,7 @@
     for (const e of b[0]) for (const n of b[1]) for (const u of [0, b[2][1]]) corners.push(raw([e + state.east, n + state.north, u]));
     const xs = corners.map(p => p[0]), ys = corners.map(p => p[1]);
     const wide = Math.max(Math.max(...xs) - Math.min(...xs), 10), high = Math.max(Math.max(...ys) - Math.min(...ys), 10);
-    const scale = state.zoom * Math.min((w - 60) / wide, (h - 60) / high), mx = (Math.max(...xs) + Math.min(...xs)) / 2, my = (Math.max(...ys) + Math.min(...ys)) / 2;
+    const scale = state.zoom * Math.min((w - 60) / wide, (h - 44) / high), mx = (Math.max(...xs) + Math.min(...xs)) / 2, my = (Math.max(...ys) + Math.min(...ys)) / 2;
     project = p => { const q = raw(p); return [w / 2 + (q[0] - mx) * scale, h / 2 - (q[1] - my) * scale, q[2]]; };
     project.scale = scale;
   }
@@ -292,17 +293,13 @@
     pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
     pen.strokeStyle = colour; pen.lineWidth = width; pen.setLineDash(dash || []); pen.stroke(); pen.setLineDash([]);
   }
-  function label(text, p, colour) {
-    pen.font = "bold 12px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = css("--paper");
-    pen.strokeText(text, p[0] + 6, p[1] - 5); pen.fillStyle = colour; pen.fillText(text, p[0] + 6, p[1] - 5);
-  }
-
   function drawMap() {
     const ratio = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
     canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);
     pen.setTransform(ratio, 0, 0, ratio, 0, 0); pen.lineJoin = "round";
     pen.fillStyle = css("--paper"); pen.fillRect(0, 0, w, h);
     prepare();
+    pen.save(); pen.beginPath(); pen.rect(0, 0, w, h - KEY); pen.clip();
     for (const f of data.site.forests) polygon(f.map(p => project([p[0], p[1], 0])), css("--forest"), null);
     const parts = [];
     for (const faces of data.site.buildings) for (const face of faces) {
@@ -336,9 +333,11 @@
       const foot = project(t.at), top = project([t.at[0], t.at[1], t.top]);
       polyline([foot, top], css("--accent"), 3);
       polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
-      label(t.name, top, t.name === tower ? css("--accent") : css("--soft"));
     }
     drawPaths(tower);
+    const own = data.site.towers.filter(t => t.name === tower), others = data.site.towers.filter(t => t.name !== tower);
+    labels = common.names(pen, [0, 0, w, h - KEY], [...own, ...others].map(t => ({ text: t.name, at: project([t.at[0], t.at[1], t.top]), colour: css(t.name === tower ? "--accent" : "--soft"), halo: css("--paper") })));
+    pen.restore();
     drawKey(c, w, h);
   }
 
@@ -512,5 +511,5 @@
   document.documentElement.classList.add("live");
   controls();
   everything();
-  window.explorer = { state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), data };
+  window.explorer = { state, statistics, rankStatistics, choose, span, series: i => Array.from(get(i)), labels: () => labels, keyTop: () => canvas.clientHeight - KEY, data };
 })();

@@ -85,7 +85,7 @@
 
   // --- the map ----------------------------------------------------------------------------------------------------------
 
-  let image = null, project = null;
+  let image = null, project = null, labels = [];
   function draw() { // the cells once per layer, scaled by the browser
     image = document.createElement("canvas"); image.width = columns; image.height = rows;
     const pen = image.getContext("2d"), pixels = pen.createImageData(columns, rows), ends = limits();
@@ -128,8 +128,9 @@
       const x = project.x(t.at[0]), y = project.y(t.at[1]), own = !tower || tower === data.joint || tower === t.name;
       pen.beginPath(); pen.moveTo(x, y - 8); pen.lineTo(x - 7, y + 5); pen.lineTo(x + 7, y + 5); pen.closePath();
       pen.globalAlpha = own ? 1 : 0.35; pen.fillStyle = "#C1121F"; pen.strokeStyle = "#fff"; pen.lineWidth = 1.2; pen.fill(); pen.stroke();
-      pen.font = "bold 12px system-ui, sans-serif"; pen.lineWidth = 3; pen.strokeStyle = "#fff"; pen.strokeText(t.name, x + 9, y + 4); pen.fillStyle = "#8f0f18"; pen.fillText(t.name, x + 9, y + 4); pen.globalAlpha = 1;
+      pen.globalAlpha = 1;
     }
+    labels = common.names(pen, [46, 8, w - 16, h - 32], data.site.towers.map(t => ({ text: t.name, at: [project.x(t.at[0]), project.y(t.at[1])], colour: "#8f0f18", halo: "#fff", alpha: !tower || tower === data.joint || tower === t.name ? 1 : 0.35 })));
     if (state.cell) {
       const [r, c] = state.cell, x = project.x(east[c] - data.half[0]), y = project.y(north[r] + data.half[1]), wide = 2 * data.half[0] * project.scale, high = 2 * data.half[1] * project.scale;
       pen.strokeStyle = "#000"; pen.lineWidth = 3; pen.strokeRect(x, y, wide, high); pen.strokeStyle = "#F0C000"; pen.lineWidth = 1.6; pen.strokeRect(x, y, wide, high);
@@ -382,7 +383,7 @@
   setQuantity(0);
   state.b = [...state.a];
   everything();
-  window.mapExplorer = { state, data, statistics, layer, degrees, profile, column, cellAt, limits, point, line, setQuantity, setDifference, everything, shown: () => shown, project: () => project, ready: true };
+  window.mapExplorer = { state, data, statistics, layer, degrees, profile, column, cellAt, limits, point, line, setQuantity, setDifference, everything, shown: () => shown, labels: () => labels, project: () => project, ready: true };
 })().catch(error => { // an old browser without the means: the static figures stay
   document.documentElement.classList.remove("live");
   console.error(error);

@@ -1,0 +1,87 @@
+"""Pairs of flights at the same places: all of them as a table, the telling ones and a summary for campaign.json."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from .campaign_data import CampaignData, RankPairing, Repeat
+
+KEPT = 1000
+"""Pairs of each kind that campaign.json lists; of more, those with the most places and those that differ most."""
+
+TABLE = "pairs"
+"""The file with all of them, less its ending."""
+
+
+def telling(pairs: Sequence[Repeat], most: int = KEPT) -> list[Repeat]:
+    """All pairs, or half of ``most`` by their number of places and half by their difference, in their order."""
+    by_places = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))
+    by_difference = sorted(range(len(pairs)), key=lambda i: (-np.nan_to_num(pairs[i].rmse_db, nan=-1.0), i))
+    return [pairs[i] for i in _chosen(by_places, by_difference, most)]
+
+
+def telling_ranks(pairs: Sequence[RankPairing], most: int = KEPT) -> list[RankPairing]:
+    """The same of reported ranks: by their number of places, and by how little they agree."""
+    by_places = sorted(range(len(pairs)), key=lambda i: (-pairs[i].n, i))
+    by_kappa = sorted(range(len(pairs)), key=lambda i: (np.nan_to_num(pairs[i].kappa, nan=2.0), i))
+    return [pairs[i] for i in _chosen(by_places, by_kappa, most)]
+
+
+def _chosen(one: Sequence[int], other: Sequence[int], most: int) -> list[int]:
+    if len(one) <= most:
+        return sorted(one)
+    first = one[: most // 2]
+    known = set(first)
+    return sorted([*first, *[i for i in other if i not in known][: most - len(first)]])
+
+
+def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
+    """Per tower and channel: pairs of flights, those that meet, their places, and how much they differ [dB]."""
+    groups: dict[tuple[str, str], list[Repeat]] = {}
+    for pair in pairs:
+        groups.setdefault((pair.tower, pair.channel), []).append(pair)
+    found = []
+    for (tower, channel), members in groups.items():
+        meeting = [pair for pair in members if pair.n]
+        rmse = np.array([pair.rmse_db for pair in meeting if np.isfinite(pair.rmse_db)])
+        low, median, high = np.quantile(rmse, (0.1, 0.5, 0.9)).tolist() if len(rmse) else (float("nan"),) * 3
+        found.append(
+            {
+                "tower": tower,
+                "channel": channel,
+                "pairs": len(members),
+                "meeting": len(meeting),
+                "n": sum(pair.n for pair in meeting),
+                "rmse_mean_db": float(rmse.mean()) if len(rmse) else float("nan"),
+                "rmse_quantiles_db": {"10": low, "50": median, "90": high},
+            }
+        )
+    return found
+
+
+def pair_frame(data: CampaignData) -> pd.DataFrame:
+    """One row per pair of flights, tower and channel (``kind`` rss), or tower (``kind`` rank)."""
+    rss = _columns(data.repeats, Repeat, {"rmse_ci95_db": ("rmse_low_db", "rmse_high_db")})
+    rank = _columns(data.rank_repeats, RankPairing, {"kappa_ci95": ("kappa_low", "kappa_high")})
+    frames = [pd.DataFrame({"kind": kind, **columns}) for kind, columns in (("rss", rss), ("rank", rank)) if columns]
+    found = [frame for frame in frames if len(frame)]
+    table: pd.DataFrame = pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+    return table
+
+
+def _columns(items: Sequence[Any], kind: type, bounds: dict[str, tuple[str, str]]) -> dict[str, Any]:
+    """Fields of records as columns; an interval becomes two."""
+    columns: dict[str, Any] = {}
+    for name in (field.name for field in dataclasses.fields(kind)):
+        values = [getattr(item, name) for item in items]
+        if name in bounds:
+            for end, column in enumerate(bounds[name]):
+                columns[column] = [float("nan") if value is None else value[end] for value in values]
+        else:
+            columns[name] = values
+    return columns

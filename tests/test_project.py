@@ -205,3 +205,20 @@ def f(a, b, *, c, d) -> int:
     (function,) = ast.parse(source).body
     assert isinstance(function, ast.FunctionDef)
     assert lacking(function) == ["c", "Returns"]
+
+
+def built_by_position(tree: ast.AST, classes: set[str], most: int) -> list[tuple[int, str]]:
+    """Lines that build one of ``classes`` of more than ``most`` positional values."""
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > most]
+    names = [(call.lineno, ast.unparse(call.func).split(".")[-1]) for call in calls]
+    return [(line, name) for line, name in names if name in classes]
+
+
+def test_records_of_many_fields_are_built_by_keyword() -> None:
+    """Six values of like types, one of them in the wrong place, make a record that nothing refuses."""
+    trees = {p: ast.parse(p.read_text()) for p in [*ROOT.glob("aerpaw_cmp/**/*.py"), *ROOT.glob("parsers/**/*.py")]}
+    classes = {node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    assert len(classes) > 300
+    found = {p.name: lines for p, tree in trees.items() if (lines := built_by_position(tree, {*classes, "cls"}, 5))}
+    assert found == {}
+    assert built_by_position(ast.parse("x = m.Link(1, 2, 3)\ny = Link(1, 2, c=3)"), {"Link"}, 2) == [(1, "Link")]

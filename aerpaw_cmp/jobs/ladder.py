@@ -41,7 +41,7 @@ AS_SET = "as set in flight.yaml"
 FREE_SPACE = "free space"
 
 Antennas = Literal["isotropic", "measured", "installed"]
-Ground = Literal["none", "coherent", "weakened", "power sum"]
+Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
 
@@ -54,6 +54,8 @@ class Model:
     ground: Ground = "none"
     buildings: bool = False
     trees: Trees = "none"
+    roughness_m: float = 0.0
+    """Of ``ground: rough``: that of the flight file, where it has one."""
 
     @property
     def name(self) -> str:
@@ -74,6 +76,7 @@ class Model:
             "max_depth": depth,
             "attitude": self.attitude,
             "reflection_loss_db": WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
         if self.trees in ("p833", "weissberger"):
@@ -180,7 +183,9 @@ class _Climber:
 
     def _ground(self, best: Model) -> list[Model]:
         kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
-        return [dataclasses.replace(best, ground=kind) for kind in kinds]
+        found = [dataclasses.replace(best, ground=kind) for kind in kinds]
+        rough = self._data.settings.rt.ground_roughness_m
+        return [*found, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
 
     def _buildings(self, best: Model) -> list[Model]:
         if not self._data.site.buildings:
@@ -210,8 +215,8 @@ class _Climber:
         begin = time.perf_counter()
         poses, link = self._poses(series, model.attitude), _link(series.replayed.link, model.antennas)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
-        wanted = rt.model_copy(update=model.settings(rt.max_depth)["rt"])
-        loss = path_loss(self._data.site.trees, wanted, link.carrier_hz)
+        wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+        loss = path_loss(self._data.site, wanted, link.carrier_hz)
         fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
@@ -276,6 +281,8 @@ def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> di
     changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
     for section, change in changes.items():
         result[section] = {**result.get(section, {}), **change}
+    if model.ground != "rough":
+        result["rt"].pop("ground_roughness_m", None)
     if model.trees not in ("p833", "weissberger"):
         result["rt"].pop("foliage_model", None)
     if model.antennas != "installed":

@@ -594,7 +594,7 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
-    loss = path_loss(site.trees, settings.rt, link.carrier_hz)
+    loss = path_loss(site, settings.rt, link.carrier_hz)
     if settings.rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
         found = found.select(np.isfinite(loss(found, sources, point)))

@@ -25,10 +25,20 @@ class SpherePattern(MeasuredPattern):
     name : str
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    learned_from : tuple of str
+        Flights that the gain was learned from, where the file says so: on those it must not be scored.
     """
 
-    def __init__(self, name: str, gain_dbi: FloatArray, sd_db: FloatArray, frequency_hz: float | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        gain_dbi: FloatArray,
+        sd_db: FloatArray,
+        frequency_hz: float | None = None,
+        learned_from: tuple[str, ...] = (),
+    ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
+        self.learned_from = learned_from
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
@@ -154,7 +164,16 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     gain[row, column] = values[:, 2]
     if len(header) > 3:
         sd[row, column] = values[:, 3]
-    return SpherePattern(name or path.stem, gain, sd)
+    return SpherePattern(name or path.stem, gain, sd, learned_from=_flights_in(text))
+
+
+LEARNED = "# aerpaw-cmp calibrate: "
+"""Begins the comment that names a calibration and, after ``, from``, its flights."""
+
+
+def _flights_in(text: str) -> tuple[str, ...]:
+    first = next((line for line in text.splitlines() if line.startswith(LEARNED)), "")
+    return tuple(name.strip() for name in first.partition(", from ")[2].split(",") if name.strip())
 
 
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:

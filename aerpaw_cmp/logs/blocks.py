@@ -308,13 +308,13 @@ class Gathered:
             streams.append(Stream(key[0], key[1], frame, self.attributes[key]))  # type: ignore[arg-type]
         back = steps_back(streams[0].frame["time"].to_numpy()) if streams else 0
         return ReadResult(
-            self.reader,
-            tuple(streams),
-            self.lines,
-            self.accepted,
-            self.blank,
-            tuple(self.rejected),
-            self.warnings.result(back),
+            reader=self.reader,
+            streams=tuple(streams),
+            lines=self.lines,
+            accepted=self.accepted,
+            blank=self.blank,
+            rejected=tuple(self.rejected),
+            warnings=self.warnings.result(back),
         )
 
 

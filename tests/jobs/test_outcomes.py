@@ -220,7 +220,7 @@ KILLED = """
 import os, signal, sys
 from pathlib import Path
 from aerpaw_cmp.jobs import campaign_tasks
-from aerpaw_cmp.jobs.campaign_plan import batched, run_tasks
+from aerpaw_cmp.jobs.campaign_plan import run_tasks
 from aerpaw_cmp.jobs.workers import Here
 from aerpaw_cmp.report.campaign_data import FlownTrack
 import numpy as np

@@ -1,18 +1,17 @@
 """Every file that a report was made from, besides the logs: settings, site, antennas, elevation, reference powers.
 
-No list of keys: whatever text of the flight file or of the site file names a file is one, so that a new key cannot be
-forgotten.
+Whatever text of the flight file or of the site file names a file is one (:mod:`aerpaw_cmp.common.inputs`).
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ..common.inputs import named_files
 from ..common.outputs import file_digest
 from ..flight.settings import FlightFile
 from ..report.data import InputFile
@@ -73,30 +72,6 @@ def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
     return site_model(site)
 
 
-def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
-    """Dotted key, text and place of every value that names a file."""
-    for key, text in _texts(content, ""):
-        if not text or "\0" in text:
-            continue
-        for root in roots:
-            # most texts name nothing: a Path is made of those that do
-            if os.path.isfile(os.path.join(root, text)):  # noqa: PTH113, PTH118  never raises
-                yield key, text, root / text
-                break
-
-
-def _texts(value: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Every text in nested settings with its dotted key."""
-    if isinstance(value, (str, Path)):
-        yield key, str(value)
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _texts(item, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, (list, tuple)):
-        for index, item in enumerate(value):
-            yield from _texts(item, f"{key}.{index}" if key else str(index))
-
-
 @lru_cache(maxsize=1024)
 def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
     """SHA-256 of a file as it was when its size and time were those: a campaign asks with every task."""
@@ -104,7 +79,7 @@ def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:
-    found = os.stat(place)  # noqa: PTH116
+    found = os.stat(place)
     return InputFile(
         path=name,
         sha256=digest_of(place, found.st_size, found.st_mtime_ns),

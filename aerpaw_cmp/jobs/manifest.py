@@ -5,6 +5,7 @@ Whatever text of the flight file or of the site file names a file is one (:mod:`
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
@@ -79,7 +80,7 @@ def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:
-    found = os.stat(place)
+    found = os.stat(place)  # noqa: PTH116
     return InputFile(
         path=name,
         sha256=digest_of(place, found.st_size, found.st_mtime_ns),

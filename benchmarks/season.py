@@ -87,7 +87,7 @@ class Cluster:
     def _worker(self) -> subprocess.Popen[bytes]:
         return subprocess.Popen(
             [sys.executable, "-m", "distributed.cli.dask_worker", self.address, "--nthreads", "1", "--no-dashboard",
-             "--death-timeout", "20", "--local-directory", tempfile.gettempdir()],
+             "--death-timeout", "300", "--local-directory", tempfile.gettempdir()],
             stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL,
         )  # fmt: skip
 

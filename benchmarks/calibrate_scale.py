@@ -83,14 +83,17 @@ def main() -> None:
     parser.add_argument("--samples", type=int, default=3500, help="per channel")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
-    rows = [measured(count, arguments.samples) for count in sorted(arguments.flights)]
+    counts = sorted(arguments.flights)
     if arguments.json:
+        rows = [measured(count, arguments.samples) for count in counts]
         print(json.dumps({"machine": platform.processor() or platform.machine(), "rows": rows}))
         return
+    print(f"{platform.processor() or platform.machine()}, NumPy {np.__version__}, one process, CPU seconds")
     print(f"{'flights':>8} {'samples':>8} {'fit CPU s':>10} {'scores CPU s':>13} {'left out dB':>12} {'peak MiB':>9}")
-    for row in rows:
+    for count in counts:  # each as it is done: the last takes minutes
+        row = measured(count, arguments.samples)
         print(f"{row['flights']:8d} {row['samples']:8d} {row['fit_cpu_s']:10.1f} {row['scores_cpu_s']:13.1f} "
-              f"{row['left_out_rmse_db']:12.2f} {row['peak_mib']:9.0f}")  # fmt: skip
+              f"{row['left_out_rmse_db']:12.2f} {row['peak_mib']:9.0f}", flush=True)  # fmt: skip
 
 
 if __name__ == "__main__":

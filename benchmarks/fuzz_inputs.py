@@ -53,7 +53,9 @@ from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 LIMIT_S = 2.0
 LIMIT_MIB = 300
 WATCHDOG_S = 20.0
-"""A worker that finishes no input for so long hangs in native code, where no alarm reaches it."""
+"""A worker that spends so much of the processor on one input hangs in native code, where no alarm reaches it."""
+WATCHDOG_WALL_S = 600.0
+"""One that finishes no input for so long sleeps for ever; long, so that a run may have the lowest priority."""
 
 BLOCK = 1000
 SEED_BYTES = 1500
@@ -659,6 +661,15 @@ def _block(target: Target, seed: int, start: int, stop: int, place: mmap.mmap, s
     send.close()
 
 
+def _processor_s(pid: int | None) -> float:
+    """What a process has had of the processor [s]; 0 when it is gone."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text(encoding="ascii", errors="replace").rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any]:
     """Inputs ``start`` to ``stop`` in a process of their own; if it ends or hangs, the input is at fault."""
     parts: list[dict[str, Any]] = []
@@ -670,12 +681,12 @@ def run_block(target: Target, seed: int, start: int, stop: int) -> dict[str, Any
         worker = context.Process(target=_block, args=(target, seed, start, stop, place, send))
         worker.start()
         send.close()
-        at, since = start, time.monotonic()
+        at, since, spent = start, time.monotonic(), _processor_s(worker.pid)
         while not receive.poll(0.2) and worker.is_alive():
             (now,) = struct.unpack("q", place[:8])
             if now != at:
-                at, since = now, time.monotonic()
-            elif time.monotonic() - since > WATCHDOG_S:
+                at, since, spent = now, time.monotonic(), _processor_s(worker.pid)
+            elif _processor_s(worker.pid) - spent > WATCHDOG_S or time.monotonic() - since > WATCHDOG_WALL_S:
                 worker.kill()
         try:
             parts.append(receive.recv())

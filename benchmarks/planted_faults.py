@@ -87,15 +87,15 @@ FAULTS = (
     Fault("crowns from the ground", f"{P}.foliage", "CrownIndex.__init__", "base = trees.ground_m + trees.crown_base_m", "base = trees.ground_m + 0.0 * trees.crown_base_m"),
     Fault("crowns as cylinders", f"{P}.foliage", "CrownIndex.__init__", "self.shape: Shape = shape", "self.shape: Shape = 'cylinder'"),
     Fault("one segment of a path without foliage", f"{P}.foliage", "foliage_depth_m", "for k in range(last, -2, -1):", "for k in range(last, -1, -1):"),
-    Fault("paths of two reflections dropped", f"{P}.image", "find_paths", "for level in select(tower, tree) if select else tree:", "for level in tree[:2]:"),
-    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(found, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(found, max_depth, faces))"),
-    Fault("direct paths dropped", f"{P}.image", "find_paths", "for level in select(tower, tree) if select else tree:", "for level in tree[1:]:"),
+    Fault("paths of two reflections dropped", f"{P}.image", "find_paths", "for level in tree:", "for level in tree[:2]:"),
+    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(found, max_depth, faces, in_order=in_order, threads=threads)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(found, max_depth, faces))"),
+    Fault("direct paths dropped", f"{P}.image", "find_paths", "for level in tree:", "for level in tree[1:]:"),
     Fault("nothing hides", f"{P}.solids", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
     Fault("walls 5 m longer than they are", f"{P}.faces", "inside", "faces.upper[index] + tolerance_m", "faces.upper[index] + 5.0"),
     Fault("reflection points off by 1 % of the way", f"{P}.image", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
     Fault("walls moved by 5 cm", f"{P}.faces", "_walls", "offset = float(normal[:2] @ start)", "offset = float(normal[:2] @ start) + 0.05"),
     Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),
-    Fault("power summed over the receiving ports", f"{P}.channel", "mean_pair_power", ".mean(axis=(-2, -1))", ".mean(axis=-1).sum(axis=-1)"),
+    Fault("power summed over the receiving ports", f"{P}.channel", "mean_pair_power", "parts, parts) / pairs)", "parts, parts) / pairs * h.shape[-2])"),
     Fault("transmit power 1 dB more", f"{P}.channel", "rss_dbm", "transmit_power_dbm + db", "transmit_power_dbm + 1.0 + db"),
     Fault("K compared with powers", "aerpaw_cmp.compare.rank", "rank_from_singular_values", "(1.0 / k + margin)", "(1.0 / k**2 + margin)"),
 )  # fmt: skip
@@ -110,29 +110,65 @@ def planted(fault: Fault) -> Iterator[None]:
     undo: list[Callable[[], None]] = []
     try:
         _plant(fault, undo)
+        _forget()
         yield
     finally:
         for step in reversed(undo):
             step()
+        _forget()
 
 
-def _plant(fault: Fault, undo: list[Callable[[], None]]) -> None:
+def _forget() -> None:
+    """What the package keeps of the functions as they were."""
+    from aerpaw_cmp.propagation import faces, foliage
+
+    faces._building_faces.cache_clear()
+    foliage._last_index.clear()
+
+
+def _found(fault: Fault) -> tuple[Any, Any, str, Any, str]:
+    """Module and owner of a fault's function, its name, the function and its source.
+
+    Raises
+    ------
+    LookupError
+        The code has changed.
+    """
     module = importlib.import_module(fault.module)
     owner: Any = module
     *outer, name = fault.where.split(".")
-    for part in outer:
-        owner = getattr(owner, part)
-    raw = owner.__dict__[name] if outer else getattr(module, name)
+    try:
+        for part in outer:
+            owner = getattr(owner, part)
+        raw = owner.__dict__[name] if outer else getattr(module, name)
+    except (AttributeError, KeyError):
+        raise LookupError(f"{fault.name}: there is no {fault.module}.{fault.where}") from None
     source = textwrap.dedent(inspect.getsource(_function(raw)))
-    if source.count(fault.old) < 1:
-        raise SystemExit(f"{fault.name}: '{fault.old}' is not in {fault.module}.{fault.where}; the code has changed")
+    if fault.old not in source:
+        raise LookupError(f"{fault.name}: '{fault.old}' is not in {fault.module}.{fault.where}")
+    return module, owner, name, raw, source
+
+
+def stale() -> list[str]:
+    """Faults whose line is not in the code any more."""
+    lines = []
+    for fault in FAULTS:
+        try:
+            _found(fault)
+        except LookupError as error:
+            lines.append(str(error))
+    return lines
+
+
+def _plant(fault: Fault, undo: list[Callable[[], None]]) -> None:
+    module, owner, name, raw, source = _found(fault)
     scope: dict[str, Any] = {}
     code = compile("from __future__ import annotations\n" + source.replace(fault.old, fault.new), fault.where, "exec")
     exec(code, module.__dict__ | {"__name__": module.__name__}, scope)
     new = scope[name]
     setattr(owner, name, new)
     undo.append(lambda: setattr(owner, name, raw))
-    if outer:
+    if owner is not module:
         return
     # who imported the function by name has it too
     for other in list(sys.modules.values()):
@@ -289,7 +325,12 @@ def main() -> int:
     parser.add_argument("--no-sionna", action="store_true", help="the second implementation alone")
     parser.add_argument("--markdown", action="store_true", help="the table for docs/numerics.md")
     parser.add_argument("--json", action="store_true")
+    parser.add_argument("--stale", action="store_true", help="only say which faults are not in the code any more")
     options = parser.parse_args()
+    if lines := stale():
+        raise SystemExit("\n".join(lines))
+    if options.stale:
+        return 0
     data = sample_flight(options.every)
     clean = replays_of(data)
     clean_ranks = ranks_of(clean)

@@ -291,7 +291,9 @@ def draw(found: dict[str, list[tuple[float, float]]], scene: str, path: Path) ->
     figure, axes = plt.subplots(1, len(found), figsize=(11, 2.8), constrained_layout=True)
     for ax, (what, pairs) in zip(axes, found.items(), strict=True):
         x, y = np.array(pairs).T
-        ax.loglog(x, y, "o-", color="#1f5fa8")
+        ax.plot(x, y, "o-", color="#1f5fa8")
+        ax.set_yscale("log")
+        ax.set_xscale("linear" if what == "depth" else "log")
         label = (
             f"power {fitted(pairs):.2f}"
             if what != "depth"
@@ -299,8 +301,12 @@ def draw(found: dict[str, list[tuple[float, float]]], scene: str, path: Path) ->
         )
         ax.set_title(label, fontsize=10)
         ax.set_xlabel(what)
-        ax.set_xticks(x, [f"{v:g}" for v in x])
+        ax.set_xticks(x, [f"{v / 1000:.3g}k" if v >= 1000 else f"{v:g}" for v in x])
+        ticks = [m * 10.0**e for e in range(-4, 4) for m in (1, 2, 5)]
+        shown = [t for t in ticks if 0.7 * y.min() <= t <= 1.4 * y.max()]
+        ax.set_yticks(shown, [f"{t:g}" for t in shown])
         ax.minorticks_off()
+        ax.set_ylim(0.7 * y.min(), 1.4 * y.max())
         ax.grid(alpha=0.3)
     axes[0].set_ylabel("CPU seconds of the search")
     figure.suptitle(f"{scene}: growth of the exact search", fontsize=11)

@@ -127,9 +127,10 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
 class Score:
     """Error of one flight and channel that had no part in the fit, after one offset [dB].
 
-    ``rmse_4s_db``: both sides averaged in power over 4 s. ``within_2sd``: share of samples whose error is within two
-    standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured minus predicted, mean.
-    ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in place of the flight's own.
+    ``rmse_4s_db``: both sides averaged in power over 4 s. ``within_2sd``: share of samples (some hundred of them)
+    whose error is within two standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured
+    minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
+    place of the flight's own.
     """
 
     flight: str
@@ -154,7 +155,10 @@ def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = No
     time, free, left = s.time_s[good], observed.free_space_db[good], error[good]
     measured, level = s.residual_db[good] + free, gain_db[good] + free
     means = local_mean_db(time, measured, 4.0) - local_mean_db(time, level, 4.0)
-    inside = math.nan if sd_db is None else float(np.mean(np.abs(left - left.mean()) < 2.0 * sd_db[good]))
+    known = np.zeros(len(left), np.bool_) if sd_db is None else np.isfinite(sd_db[good])
+    inside = math.nan
+    if sd_db is not None and known.any():
+        inside = float(np.mean(np.abs(left - left.mean())[known] < 2.0 * sd_db[good][known]))
     return Score(
         flight=s.flight,
         tower=s.tower,
@@ -201,7 +205,7 @@ def flight_left_out(
         offsets = _offsets(train, learned)
         for o in observed:
             if o.samples.flight in group and o.samples.antenna in offsets:
-                out.append(_scored_with(o, learned, offsets[o.samples.antenna]))
+                out.append(_scored_with(o, learned, offsets[o.samples.antenna], spread=kept is not None))
     return tuple(s for s in out if s is not None)
 
 
@@ -214,12 +218,19 @@ def _offsets(train: Sequence[LinkSamples], learned: Learned) -> dict[str, float]
     return {antenna: float(np.nanmean(values)) for antenna, values in each.items() if np.isfinite(values).any()}
 
 
-def _scored_with(o: Observed, learned: Learned, offset_db: float) -> Score | None:
+SPREAD_SAMPLES = 400
+"""Samples of a series at which standard deviations are checked: each costs a thousand times what its mean does."""
+
+
+def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: bool) -> Score | None:
     """Score of a prediction, its own offset and that of the other flights side by side."""
-    gain, sd = learned.predict(o.samples)
-    model = learned.choice.model
-    whole = np.sqrt(sd**2 + model.own_sd_db**2 + model.noise_sd_db**2)
-    found = score(o, gain, whole if learned.fit else None)
+    gain, model = learned.mean(o.samples), learned.choice.model
+    whole = np.full(len(gain), np.nan)
+    if spread and learned.fit is not None:
+        some = np.unique(np.linspace(0, len(gain) - 1, min(len(gain), SPREAD_SAMPLES)).round().astype(np.int64))
+        sd = learned.predict(o.samples.part(some))[1]
+        whole[some] = np.sqrt(sd**2 + model.own_sd_db**2 + model.noise_sd_db**2)
+    found = score(o, gain, whole)
     if found is None:
         return None
     return dataclasses.replace(found, rmse_shared_offset_db=math.hypot(found.rmse_db, found.offset_db - offset_db))
@@ -266,12 +277,13 @@ def parts_left_out(
     tuple of Score
         One per series, over all its parts; series of which no part could be predicted are left out.
     """
-    out: list[Score | None] = []
-    for flight in spread_flights(flights_of(observed)):
-        mine = [o for o in observed if o.samples.flight == flight]
-        others = list(observed) if own else [o for o in observed if o.samples.flight != flight]
-        stitched = [np.full(len(o.samples), np.nan) for o in mine]
-        for k in range(len(parts(mine[0], mine[0]))):
+    flights = spread_flights(flights_of(observed))
+    of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
+    stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
+    # one part after the other: what the flights learn from is much the same, and kept
+    for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
+        for flight, mine in of.items():
+            others = list(observed) if own else [o for o in observed if o.samples.flight != flight]
             train = [o.part(parts(mine[0], o)[k][1]).samples for o in others]
             train = [s for s in train if np.isfinite(s.residual_db).sum() >= LEAST_SAMPLES]
             if not train or not any(parts(o, o)[k][0].any() for o in mine):
@@ -281,7 +293,7 @@ def parts_left_out(
             except InputError:
                 continue
             known = {s.antenna for s in train}
-            for o, whole in zip(mine, stitched, strict=True):
+            for o, whole in zip(mine, stitched[flight], strict=True):
                 inside, outside = parts(o, o)[k]
                 if o.samples.antenna not in known or not inside.any():
                     continue
@@ -289,7 +301,7 @@ def parts_left_out(
                 rest = (o.samples.residual_db - gain)[outside]
                 if np.isfinite(rest).sum() >= LEAST_SAMPLES:
                     whole[inside] = gain[inside] + np.nanmean(rest)
-        out += [score(o, whole) for o, whole in zip(mine, stitched, strict=True)]
+    out = [score(o, whole) for flight in flights for o, whole in zip(of[flight], stitched[flight], strict=True)]
     return tuple(s for s in out if s is not None)
 
 

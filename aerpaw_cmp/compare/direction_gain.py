@@ -10,7 +10,9 @@ place, so that the shadowing of one flight is not learned as antenna. The gains 
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
+from collections import OrderedDict
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
@@ -24,8 +26,8 @@ from .sphere import gaussian_features
 Frame = Literal["body", "mast", "world", "place"]
 Sharing = Literal["all", "antenna"]
 
-OFFSET_SD_DB = 100.0
-"""Prior of each offset: free in effect, and still a proper covariance."""
+OFFSET_SD = 100.0
+"""Prior of each offset in standard deviations of the noise: free in effect, and still a proper covariance."""
 
 MOST_COLUMNS = 6000
 """Square matrices of this order are held (290 MB)."""
@@ -244,28 +246,101 @@ def _whitener(model: GainModel, samples: LinkSamples) -> FloatArray:
     from scipy.spatial.distance import cdist
 
     distance = cdist(samples.position_m, samples.position_m)
-    own = model.own_sd_db**2 * np.exp(-distance / model.own_length_m) + OFFSET_SD_DB**2
+    own = model.own_sd_db**2 * np.exp(-distance / model.own_length_m) + (OFFSET_SD * model.noise_sd_db) ** 2
     own[np.diag_indices(len(own))] += model.noise_sd_db**2
     return np.asarray(cholesky(own, lower=True))
 
 
-def _assemble(model: GainModel, series: Sequence[LinkSamples], designs: Sequence[FloatArray]) -> _System:
-    """Sum of the normal equations of all series."""
-    from scipy.linalg import solve_triangular
+@dataclass(frozen=True, slots=True)
+class _SeriesEquations:
+    """Normal equations of one series in its own columns, whitened with the noise as the unit.
 
-    width = designs[0].shape[1]
+    ``gram`` (q, q), ``right`` (q,), ``square`` and ``log_det`` as in :class:`_System`; ``mean`` (q,) of the features
+    over the ``rows``.
+    """
+
+    gram: FloatArray
+    right: FloatArray
+    square: float
+    log_det: float
+    mean: FloatArray
+    rows: int
+
+
+KEPT_MIB = 512
+"""Equations that are kept at most; those that were used longest ago go first."""
+
+_kept: OrderedDict[bytes, _SeriesEquations] = OrderedDict()
+"""Of series by their content. A flight left out, a factor of the spread, a common scale: each is another sum of the
+same equations, since nuisance and noise keep their ratio and whitening is linear in their scale."""
+
+
+def _columns(blocks: Sequence[_Block], antenna: str) -> tuple[list[_Block], IntArray]:
+    """Blocks that act on an antenna, and their columns (q,)."""
+    own = [b for b in blocks if b.antenna in (None, antenna)]
+    columns = [np.arange(b.start, b.stop) for b in own]
+    return own, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+
+
+def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
+    """Equations of one series, kept or made."""
+    ratio = float(f"{model.own_sd_db / model.noise_sd_db:.12g}")
+    digest = hashlib.blake2b(repr((ratio, model.own_length_m, len(samples))).encode())
+    for name in _ARRAYS:
+        digest.update(np.ascontiguousarray(getattr(samples, name)).tobytes())
+    for block in own:
+        digest.update(repr((block.term.frame, block.term.length)).encode())
+        digest.update(b"" if block.knots_m is None else np.ascontiguousarray(block.knots_m).tobytes())
+    key = digest.digest()
+    if key in _kept:
+        _kept.move_to_end(key)
+        return _kept[key]
+    found = _made_equations(dataclasses.replace(model, own_sd_db=ratio, noise_sd_db=1.0), own, samples)
+    _kept[key] = found
+    while len(_kept) > 1 and sum(one.gram.nbytes for one in _kept.values()) > KEPT_MIB << 20:
+        _kept.popitem(last=False)
+    return found
+
+
+def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
+    from scipy.linalg import solve_triangular
+    from scipy.linalg.blas import dsyrk
+
+    parts = [_features(b, _argument(samples, b.term.frame)) for b in own]
+    design = np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
+    lower = _whitener(model, samples)
+    rows = np.asfortranarray(solve_triangular(lower, design, lower=True))
+    target = solve_triangular(lower, samples.residual_db - samples.residual_db.mean(), lower=True)
+    gram = dsyrk(1.0, rows, trans=1, lower=1) if rows.shape[1] else np.zeros((0, 0))
+    return _SeriesEquations(
+        gram=np.asarray(gram + np.tril(gram, -1).T),
+        right=np.asarray(rows.T @ target),
+        square=float(target @ target),
+        log_det=float(np.log(np.diag(lower)).sum()),
+        mean=design.mean(axis=0),
+        rows=len(samples),
+    )
+
+
+def _assemble(
+    model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
+) -> tuple[_System, dict[str, FloatArray]]:
+    """Sum of the normal equations of all series, and the mean of the features (p,) per antenna."""
+    width, noise = blocks[-1].stop if blocks else 0, model.noise_sd_db
     gram, right, square, log_det = np.zeros((width, width)), np.zeros(width), 0.0, 0.0
-    for samples, design in zip(series, designs, strict=True):
-        lower = _whitener(model, samples)
-        rows = solve_triangular(lower, design, lower=True)
-        target = solve_triangular(lower, samples.residual_db - samples.residual_db.mean(), lower=True)
-        used = np.flatnonzero(design.any(axis=0))
-        rows = rows[:, used]
-        gram[np.ix_(used, used)] += rows.T @ rows
-        right[used] += rows.T @ target
-        square += float(target @ target)
-        log_det += float(np.log(np.diag(lower)).sum())
-    return _System(gram, right, square, log_det)
+    total = {s.antenna: np.zeros(width) for s in series}
+    count = dict.fromkeys(total, 0)
+    for samples in series:
+        own, columns = _columns(blocks, samples.antenna)
+        one = _series_equations(model, own, samples)
+        gram[np.ix_(columns, columns)] += one.gram
+        right[columns] += one.right
+        square += one.square
+        log_det += one.log_det + one.rows * math.log(noise)
+        total[samples.antenna][columns] += one.rows * one.mean
+        count[samples.antenna] += one.rows
+    centre = {antenna: total[antenna] / count[antenna] for antenna in total}
+    return _System(gram / noise**2, right / noise**2, square / noise**2, log_det), centre
 
 
 def _scale(blocks: Sequence[_Block], model: GainModel) -> FloatArray:
@@ -430,8 +505,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     model = model or GainModel()
     binned = _binned(series, model.bin_s)
     blocks = _layout(model, binned)
-    designs = [_design(blocks, s) for s in binned]
-    system = _assemble(model, binned, designs)
+    system, centre = _assemble(model, binned, blocks)
     scale = _scale(blocks, model)
     weights, lower, evidence = _posterior(system, scale)
     return GainFit(
@@ -443,7 +517,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
         _weights=weights,
         _lower=lower,
         _scale=scale,
-        _centre=_centres(binned, designs),
+        _centre=centre,
         _seen=_seen(binned),
     )
 
@@ -454,14 +528,6 @@ def _binned(series: Sequence[LinkSamples], bin_s: float) -> list[LinkSamples]:
     if not binned:
         raise InputError("no sample has a level and a direction", expected="RSS with positions and attitude")
     return binned
-
-
-def _centres(binned: Sequence[LinkSamples], designs: Sequence[FloatArray]) -> dict[str, FloatArray]:
-    found = {}
-    for antenna in dict.fromkeys(s.antenna for s in binned):
-        own = [d for s, d in zip(binned, designs, strict=True) if s.antenna == antenna]
-        found[antenna] = np.concatenate(own).mean(axis=0)
-    return found
 
 
 def _seen(binned: Sequence[LinkSamples]) -> dict[str, FloatArray]:
@@ -514,7 +580,7 @@ def choose_model(
     """
     model = model or GainModel()
     total = sum(map(len, _binned(series, model.bin_s)))
-    coarse = dataclasses.replace(model, bin_s=model.bin_s * max(1.0, total / MOST_ROWS))
+    coarse = dataclasses.replace(model, bin_s=model.bin_s * max(1, math.ceil(total / MOST_ROWS)))
     folds = _folds(series)
     errors: dict[float, float] = {}
     for factor in spreads if folds else ():
@@ -559,7 +625,7 @@ def _left_out_squares(train: Sequence[LinkSamples], test: Sequence[LinkSamples],
 def _common_scale(series: Sequence[LinkSamples], model: GainModel) -> float:
     binned = _binned(series, model.bin_s)
     blocks = _layout(model, binned)
-    system = _assemble(model, binned, [_design(blocks, s) for s in binned])
+    system, _ = _assemble(model, binned, blocks)
     scale = _scale(blocks, model)
     weights, _, _ = _posterior(system, scale)
     rows = sum(map(len, binned)) - len(binned)

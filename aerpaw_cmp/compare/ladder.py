@@ -1,9 +1,10 @@
 """What a scene needs: a ladder of models, scored on stretches of the flight that had no part in their offset.
 
 Each rung is a prediction of the same samples by a model with one thing more than another. A flight is cut into
-stretches; the offset of a model is fitted without a stretch and scored on it, in turn. Models are compared on the same
-samples by paired differences, and the simplest one within one standard error of the best is recommended: what a flight
-cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section 3.4.3: the 1 SE rule).
+places, or into stretches of time; the offset of a model is fitted without one and scored on it, in turn. Models are
+compared on the same samples by paired differences, and the simplest one within one standard error of the best is
+recommended: what a flight cannot show to help is not worth having (Breiman, Friedman, Olshen, Stone 1984, section
+3.4.3: the 1 SE rule).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ from ..common.units import BoolArray, FloatArray, IntArray
 from .statistics import NO_INTERVAL, REPLICATES, Interval, PairedDifference, paired_difference
 
 BLOCKS = 8
-"""Stretches that a flight is cut into."""
+"""Places or stretches that a flight is cut into."""
 
 LEAST_COVERED = 0.8
 """A model that has no level at more than a fifth of the samples cannot be compared with the others."""
@@ -81,9 +82,49 @@ def stretches_of(samples: int, blocks: int = BLOCKS) -> IntArray:
     return np.asarray(np.arange(samples) * blocks // max(samples, 1), dtype=np.int64)
 
 
+def places_of(position_m: FloatArray, blocks: int = BLOCKS) -> IntArray:
+    """Place of each sample (n,): cells of equally many samples, made by halving along the longer side of the plan.
+
+    A place that a flight comes back to is one place, and is left out as a whole; stretches of time would leave its
+    other visits in.
+
+    Parameters
+    ----------
+    position_m : (n, 2) or (n, 3)
+        East, north [m]; of equal ones the earlier come first.
+    blocks : int
+        A power of two.
+
+    Returns
+    -------
+    (n,) int
+        0 to ``blocks - 1``.
+
+    Examples
+    --------
+    >>> places_of(np.array([[0.0, 0.0], [9.0, 1.0], [1.0, 0.0], [8.0, 1.0]]), blocks=2).tolist()
+    [0, 1, 0, 1]
+    """
+    place = np.zeros(len(position_m), dtype=np.int64)
+    cells = [np.arange(len(position_m))]
+    while len(cells) < blocks:
+        cells = [part for cell in cells for part in _halves(cell, position_m)]
+    for number, cell in enumerate(cells):
+        place[cell] = number
+    return place
+
+
+def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]:
+    if not len(cell):
+        return cell, cell
+    side = int(np.ptp(position_m[cell, :2], axis=0).argmax())
+    order = cell[np.argsort(position_m[cell, side], kind="stable")]
+    return order[: len(order) // 2], order[len(order) // 2 :]
+
+
 def climb(
     measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = BLOCKS,
-    replicates: int = REPLICATES,
+    position_m: Sequence[FloatArray] | None = None, replicates: int = REPLICATES,
 ) -> Ladder:  # fmt: skip
     """Score the rungs of a ladder, given from the simplest to the most complex model.
 
@@ -96,7 +137,9 @@ def climb(
     rungs : sequence of Rung
         Simplest first: ties go to the earlier one.
     blocks : int
-        Stretches, of equally many samples.
+        Places or stretches, of equally many samples.
+    position_m : sequence of (n, 3), optional
+        Where each sample was taken: places are left out (:func:`places_of`). Without, stretches of time.
     replicates : int
         Of the paired differences.
 
@@ -107,10 +150,13 @@ def climb(
     enough = [_covers(measured_db, rung) for rung in rungs]
     shared = [_shared(m, [r.level_db[i] for r, ok in zip(rungs, enough, strict=True) if ok])
               for i, m in enumerate(measured_db)]  # fmt: skip
+    places = [None] * len(shared) if position_m is None else [
+        places_of(p[keep], blocks) for p, keep in zip(position_m, shared, strict=True)
+    ]  # fmt: skip
     errors = tuple(
         tuple(
-            held_out_error_db(m, level, keep, blocks) if ok else np.full(len(m), np.nan)
-            for m, level, keep in zip(measured_db, rung.level_db, shared, strict=True)
+            held_out_error_db(m, level, keep, blocks, block) if ok else np.full(len(m), np.nan)
+            for m, level, keep, block in zip(measured_db, rung.level_db, shared, places, strict=True)
         )
         for rung, ok in zip(rungs, enough, strict=True)
     )
@@ -170,8 +216,9 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicate
 
 
 def held_out_error_db(
-    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = BLOCKS
-) -> FloatArray:
+    measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = BLOCKS,
+    place: IntArray | None = None,
+) -> FloatArray:  # fmt: skip
     """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
 
     Parameters
@@ -182,6 +229,8 @@ def held_out_error_db(
         Samples that count.
     blocks : int
         Stretches of equal length.
+    place : (kept samples,) int, optional
+        The block of each sample that counts, in place of stretches of time.
 
     Returns
     -------
@@ -195,7 +244,7 @@ def held_out_error_db(
     """
     rows = np.flatnonzero(keep)
     difference = measured_db[rows] - level_db[rows]
-    stretch = stretches_of(len(rows), blocks)
+    stretch = stretches_of(len(rows), blocks) if place is None else place
     count = np.bincount(stretch, minlength=blocks)
     total = np.bincount(stretch, weights=difference, minlength=blocks)
     with np.errstate(invalid="ignore", divide="ignore"):

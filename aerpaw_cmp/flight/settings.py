@@ -367,6 +367,8 @@ class RtSettings(Settings):
     leaves: Literal["in", "out"] = "in"
     reflection_loss_db: Annotated[float, Field(ge=0)] = 0.0
     """Taken from every reflection besides its Fresnel coefficient (rough surfaces); to be fitted on other flights."""
+    ground_roughness_m: Annotated[float, Field(ge=0, le=10)] = 0.0
+    """Standard deviation of the ground's height: its specular reflection falls by Rayleigh's (Ament's) factor."""
     paired_foliage: bool = False
     """Also replay without trees and out of leaf, and report the differences."""
     relevance_db: Positive | None = None

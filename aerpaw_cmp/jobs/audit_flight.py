@@ -115,7 +115,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
                 max_depth=rt.max_depth,
                 samples=rt.samples,
                 batch=rt.batch,
-                loss=path_loss(site.trees, rt, replayed.link.carrier_hz),
+                loss=path_loss(site, rt, replayed.link.carrier_hz),
                 crowns=reflecting_crowns(site.trees, rt),
                 cache_dir=None if rt.cache else "",
                 ks=ks,
@@ -197,6 +197,7 @@ def expected_loss(rt: RtSettings) -> ExpectedLoss:
         maximum_db=rt.maximum_loss_db,
         in_leaf=rt.leaves == "in",
         reflection_db=rt.reflection_loss_db,
+        ground_roughness_m=rt.ground_roughness_m,
     )
 
 

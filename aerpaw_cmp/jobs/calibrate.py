@@ -93,6 +93,11 @@ class GroundFit:
         near = [r for r, v in zip(self.roughness_m, self.log_likelihood, strict=True) if v > least]
         return min(near), max(near)
 
+    @property
+    def used_m(self) -> float | None:
+        """What a replay is to take: the most probable height, or None where no ground ray is as likely."""
+        return None if math.isinf(self.likely_m[1]) else self.best_m
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Calibration:

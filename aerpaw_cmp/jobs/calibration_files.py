@@ -19,7 +19,7 @@ from ..report.calibration_data import AntennaMap, CalibrationData
 from ..report.calibration_html import write_calibration
 from ..report.export import write_file
 from ..report.names import safe_name
-from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, unit_mean_gain
+from ..site.sphere_pattern import SpherePattern, planning_cuts, sphere_csv, sphere_grid, sphere_netcdf, unit_mean_gain
 from .calibrate import Calibration
 
 MARK = "# aerpaw-cmp calibrate"
@@ -52,20 +52,47 @@ def antenna_maps(found: Calibration) -> dict[tuple[str, str], AntennaMap]:
     return out
 
 
-def antenna_files(found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float) -> dict[str, str]:
-    """Text of each file by its name: the full sphere with standard deviation, and cuts for planning tools."""
+def antenna_files(
+    found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
+) -> dict[str, str | bytes]:
+    """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
+
+    The sphere is CSV and, where netCDF4 is installed, NetCDF too.
+
+    Parameters
+    ----------
+    found : Calibration
+    maps : mapping of (antenna, end) to AntennaMap
+    carrier_hz : float
+
+    Returns
+    -------
+    dict of str to str or bytes
+    """
     names = ", ".join(data.settings.flight.name for data in found.flights)
     notes = (
         f"aerpaw-cmp calibrate: {found.settings.calibration}, from {names}",
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
     )
-    out = {}
+    made = datetime.now(timezone.utc).isoformat(timespec="seconds")
+    out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
         stem = safe_name(f"{antenna}.{end}")
         out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, notes)
         pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
+        said = {
+            "title": f"{antenna}, antenna at the {end}",
+            "source": f"learned from the flights {names}",
+            "history": f"{made} written by aerpaw-cmp calibrate, calibration {found.settings.calibration}",
+            "institution": "not stated",
+            "references": "https://arxiv.org/abs/2502.10324",
+            "comment": "; ".join(notes[1:]),
+        }
+        sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
+        if sphere is not None:
+            out[f"{stem}.nc"] = sphere
     return out
 
 
@@ -90,10 +117,14 @@ def settings_text(found: Calibration, folder_name: str) -> str:
             f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
             f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
         ]
+    rough = None if found.ground is None else found.ground.used_m
     lines += [
         "# the gains were learned beside line of sight alone",
         "rt: {engine: image, max_depth: 0, attitude: logged}",
-    ]
+    ] if rough is None else [
+        "# a ground ray of this roughness is likelier than none beside the learned gains",
+        f"rt: {{engine: image, max_depth: 1, attitude: logged, ground_roughness_m: {rough:g}}}",
+    ]  # fmt: skip
     return "\n".join(lines) + "\n"
 
 
@@ -183,8 +214,8 @@ def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[s
     """
     maps = antenna_maps(found)
     carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
-    for file, text in antenna_files(found, maps, carrier).items():
-        write_file(folder / file, text)
+    for file, content in antenna_files(found, maps, carrier).items():
+        write_file(folder / file, content)
     text = settings_text(found, name)
     record = record_of(found, maps, text, stages_s)
     write_calibration(record, folder)

@@ -30,8 +30,16 @@ from ..propagation.image import planes_of
 from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
-from ..site.site import Trees
-from .replay import attitude_rotation, estimate_clocks, path_loss, replay_poses, telemetry_time, valid_poses
+from ..site.site import Site
+from .replay import (
+    attitude_rotation,
+    estimate_clocks,
+    path_loss,
+    replay_poses,
+    roughness_loss,
+    telemetry_time,
+    valid_poses,
+)
 
 MORE_SAMPLES = 10
 """Times the samples with which Sionna is asked again for paths that it lacks."""
@@ -175,7 +183,7 @@ def run_explain(
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
-    paths = _paths(data.site.trees, rt, found, link, pose, source)
+    paths = _paths(data.site, rt, found, link, pose, source)
     differences = None
     if engine == "both":
         differences = tuple(_differences(data, rt, found, link, pose, source, progress))
@@ -320,16 +328,22 @@ def _known(valid: Any, series: RssSeries | RankSeries, at: int) -> None:
         )
 
 
+SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
+
+
 def _paths(
-    trees: Trees, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
+    site: Site, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
 ) -> tuple[ExplainedPath, ...]:
     """The paths with their terms, foliage and roughness apart."""
-    through = path_loss(trees, rt.model_copy(update={"reflection_loss_db": 0.0}), link.carrier_hz)
+    through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
     further = {}
     if through is not None:
         further["foliage"] = through(found.paths, source[None], pose.position_m)
     if rt.reflection_loss_db:
         further["rough surfaces"] = rt.reflection_loss_db * found.paths.depth.astype(np.float64)
+    rough = roughness_loss(site, rt, link.carrier_hz)
+    if rough is not None:
+        further["rough ground"] = rough(found.paths, source[None], pose.position_m)
     return explain_paths(found.paths, found.faces, source, pose, link, further)
 
 
@@ -357,7 +371,7 @@ def _differences(
     ours, theirs = engines["image"], engines["sionna"]
     target = pose.position_m[0]
     mine, others = _by_plane(ours, theirs)
-    explained = {p.planes: p for p in _paths(data.site.trees, rt, ours, link, pose, source)}
+    explained = {p.planes: p for p in _paths(data.site, rt, ours, link, pose, source)}
     missing = [key for key in mine if key not in others]
     more: set[tuple[int, ...]] = set()
     if missing:
@@ -372,7 +386,7 @@ def _differences(
         else:
             reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
         yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    levels = {p.planes: p for p in _paths(data.site.trees, rt, theirs, link, pose, source)}
+    levels = {p.planes: p for p in _paths(data.site, rt, theirs, link, pose, source)}
     for key, sequence in others.items():
         if key in mine:
             continue

@@ -28,6 +28,7 @@ from ..propagation.tracer import Replay, replay
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
+from ..site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
 from .replay import FlightReplay, Replayed, attitude_rotation, fields_from, path_loss
 
@@ -40,8 +41,11 @@ MOST_SAMPLES = 4000
 AS_SET = "as set in flight.yaml"
 FREE_SPACE = "free space"
 
-Antennas = Literal["isotropic", "measured", "installed"]
-Ground = Literal["none", "coherent", "weakened", "power sum"]
+LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
+"""Behind the name of a rung that would be scored where it was fitted."""
+
+Antennas = Literal["isotropic", "measured", "installed", "learned"]
+Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
 
@@ -54,11 +58,16 @@ class Model:
     ground: Ground = "none"
     buildings: bool = False
     trees: Trees = "none"
+    roughness_m: float = 0.0
+    """Of ``ground: rough``: that of the flight file, where it has one."""
 
     @property
     def name(self) -> str:
         """What it holds, in words."""
-        parts = {"isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"]}[self.antennas]
+        parts = {
+            "isotropic": [], "measured": ["antennas"], "installed": ["antennas with learned gain"],
+            "learned": ["learned sphere"],
+        }[self.antennas]  # fmt: skip
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":
             parts.append(f"ground ({self.ground})")
@@ -74,6 +83,7 @@ class Model:
             "max_depth": depth,
             "attitude": self.attitude,
             "reflection_loss_db": WEAK_GROUND_DB if self.ground == "weakened" else 0.0,
+            **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
         if self.trees in ("p833", "weissberger"):
@@ -157,7 +167,11 @@ class _Climber:
 
     def _scored(self, rungs: Sequence[Rung]) -> Ladder:
         return climb(
-            self._measured, [s.time_s for s in self._series], rungs, replicates=self._data.settings.rss.bootstrap
+            self._measured,
+            [s.time_s for s in self._series],
+            rungs,
+            position_m=[s.replayed.poses.position_m[s.picked] for s in self._series],
+            replicates=self._data.settings.rss.bootstrap,
         )
 
     # the stages: what may be added to the best model so far
@@ -167,20 +181,23 @@ class _Climber:
         found = [Model()]
         if all(p.name == "iso" for p in patterns):
             return found
-        found.append(Model(antennas="measured"))
+        kind: Antennas = "learned" if any(isinstance(p, SpherePattern) for p in patterns) else "measured"
+        found.append(Model(antennas=kind))
         tracks = [s.replayed.track for s in self._series]
         if all(t is not None for t in tracks):
             known = np.concatenate([t.attitude_known for t in tracks if t is not None])
-            found.append(Model(antennas="measured", attitude="level"))
+            found.append(Model(antennas=kind, attitude="level"))
             if known.any():
-                found.append(Model(antennas="measured", attitude="logged"))
+                found.append(Model(antennas=kind, attitude="logged"))
         if any(isinstance(p, InstalledPattern) for p in patterns):
             found += [dataclasses.replace(m, antennas="installed") for m in found[1:]]
         return found
 
     def _ground(self, best: Model) -> list[Model]:
         kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
-        return [dataclasses.replace(best, ground=kind) for kind in kinds]
+        found = [dataclasses.replace(best, ground=kind) for kind in kinds]
+        rough = self._data.settings.rt.ground_roughness_m
+        return [*found, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
 
     def _buildings(self, best: Model) -> list[Model]:
         if not self._data.site.buildings:
@@ -197,9 +214,22 @@ class _Climber:
 
     def _as_set(self) -> Rung:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
-        return Rung(model=AS_SET, level_db=levels, seconds=sum(s.replayed.replay.seconds for s in self._series))
+        seconds = sum(s.replayed.replay.seconds for s in self._series)
+        if self._learned_here():
+            nothing = tuple(np.full(len(level), np.nan) for level in levels)
+            return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
+        return Rung(model=AS_SET, level_db=levels, seconds=seconds)
+
+    def _learned_here(self) -> bool:
+        """Whether antennas of the flight file were learned from this very flight."""
+        patterns = [p for s in self._series for a in _arrays(s.replayed.link) for p in a.patterns]
+        name = self._data.settings.flight.name
+        return any(isinstance(p, SpherePattern) and name in p.learned_from for p in patterns)
 
     def _rung(self, model: Model) -> Rung:
+        if model.antennas == "learned" and self._learned_here():
+            nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
+            return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
         found = [self._level(i, model) for i in range(len(self._series))]
         return Rung(model=model.name, level_db=tuple(f[0] for f in found), seconds=sum(f[1] for f in found))
 
@@ -210,8 +240,8 @@ class _Climber:
         begin = time.perf_counter()
         poses, link = self._poses(series, model.attitude), _link(series.replayed.link, model.antennas)
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
-        wanted = rt.model_copy(update=model.settings(rt.max_depth)["rt"])
-        loss = path_loss(self._data.site.trees, wanted, link.carrier_hz)
+        wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
+        loss = path_loss(self._data.site, wanted, link.carrier_hz)
         fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
@@ -276,9 +306,11 @@ def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> di
     changes = model.settings(int(result.get("rt", {}).get("max_depth", 2)))
     for section, change in changes.items():
         result[section] = {**result.get(section, {}), **change}
+    if model.ground != "rough":
+        result["rt"].pop("ground_roughness_m", None)
     if model.trees not in ("p833", "weissberger"):
         result["rt"].pop("foliage_model", None)
-    if model.antennas != "installed":
+    if model.antennas not in ("installed", "learned"):
         link = dict(result.get("link", {}))
         for name in [key for key in ("rss",) if key in link]:
             link[name] = _antennas_as(link[name], model.antennas)

@@ -1,18 +1,17 @@
 """Every file that a report was made from, besides the logs: settings, site, antennas, elevation, reference powers.
 
-No list of keys: whatever text of the flight file or of the site file names a file is one, so that a new key cannot be
-forgotten.
+Whatever text of the flight file or of the site file names a file is one (:mod:`aerpaw_cmp.common.inputs`).
 """
 
 from __future__ import annotations
 
-import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ..common.inputs import named_files
 from ..common.outputs import file_digest
 from ..flight.settings import FlightFile
 from ..report.data import InputFile
@@ -71,28 +70,6 @@ def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
     from ..site.siteyaml import site_model
 
     return site_model(site)
-
-
-def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
-    """Dotted key, text and place of every value that names a file."""
-    for key, text in _texts(content, ""):
-        for root in roots:
-            place = root / text
-            if text and "\0" not in text and os.path.isfile(place):  # noqa: PTH113  never raises
-                yield key, text, place
-                break
-
-
-def _texts(value: Any, key: str) -> Iterator[tuple[str, str]]:
-    """Every text in nested settings with its dotted key."""
-    if isinstance(value, (str, Path)):
-        yield key, str(value)
-    elif isinstance(value, dict):
-        for name, item in value.items():
-            yield from _texts(item, f"{key}.{name}" if key else str(name))
-    elif isinstance(value, (list, tuple)):
-        for index, item in enumerate(value):
-            yield from _texts(item, f"{key}.{index}" if key else str(index))
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:

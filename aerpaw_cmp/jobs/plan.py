@@ -253,6 +253,27 @@ def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link
     return PlannedStage(name=name, work=f"{work}; path search {estimate}", seconds=setup + estimate.seconds)
 
 
+def _map_by_first_faces(site: Site, settings: Any, heights: int) -> PlannedStage | None:
+    """The path search of a map among thousands of faces, from that of one piece of it; None among few."""
+    from ..maps.grid import Grid
+    from ..maps.job import CHUNK
+    from .coverage_map import SiteChannels
+
+    start = time.process_time()
+    spots = Grid.over_area(site.area_m, settings.spacing_m).positions_m(max(settings.rss_altitudes_m))
+    piece = spots[:: max(1, len(spots) // CHUNK)][:CHUNK]
+    poses = Poses(piece, np.tile(np.eye(3), (len(piece), 1, 1)))
+    estimate = estimate_search(site, SiteChannels(site, settings).siso, poses, max_depth=settings.max_depth, threads=1)
+    if estimate is None:
+        return None
+    setup, pieces = time.process_time() - start, heights * -(-len(spots) // CHUNK)
+    return PlannedStage(
+        name="path search",
+        work=f"path search in {pieces} pieces, each {estimate}",
+        seconds=setup + pieces * estimate.seconds,
+    )
+
+
 def map_plan(
     site: str, settings: Any, *, inputs: list[Path], out: Path, flight: Path | None = None, force: bool = False
 ) -> Plan:
@@ -293,10 +314,14 @@ def map_plan(
     factor = probe() / PROBE_S
     cost = {name: seconds * factor for name, seconds in MEASURED.items()}
     stages = [PlannedStage(name="imports", work="libraries", seconds=cost["imports"])]
+    searched = _map_by_first_faces(place, settings, heights) if settings.engine == "image" else None
     for mode in settings.foliage:
         work = f"{links} links: {positions} positions, {heights} heights, {len(place.towers)} towers"
         seconds: float | None = None
-        if settings.engine == "image":
+        if searched is not None:  # the modes share the paths
+            seconds = searched.seconds if mode == settings.foliage[0] else 0.0
+            work += f"; {searched.work}"
+        elif settings.engine == "image":
             coarse = dataclasses.replace(
                 settings, foliage=(mode,), spacing_m=settings.spacing_m * max(1.0, (positions / 80) ** 0.5)
             )

@@ -14,7 +14,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
-from ..common.units import BoolArray, FloatArray
+from ..common.units import BoolArray, FloatArray, wavelength_m
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
 from ..flight.data import FlightData, RssSeries, Times, rank_positions
@@ -435,8 +435,9 @@ def replay_poses(
             poses,
             towers_m,
             max_depth=rt.max_depth,
-            loss=path_loss(site.trees, rt, link.carrier_hz),
+            loss=path_loss(site, rt, link.carrier_hz),
             crowns=crowns,
+            power_cut_db=rt.power_cut_db,
             visibility=rt.visibility,
             threads=rt.threads,
             device=rt.device,
@@ -461,7 +462,7 @@ def replay_poses(
         max_depth=rt.max_depth,
         samples=rt.samples,
         batch=rt.batch,
-        loss=path_loss(site.trees, rt, link.carrier_hz),
+        loss=path_loss(site, rt, link.carrier_hz),
         crowns=crowns,
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
@@ -583,16 +584,17 @@ def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
 
 
 def path_loss(
-    trees: Trees, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
+    site: Site, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
 ) -> Loss | None:
     """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
 
     Parameters
     ----------
-    trees : Trees
-        Crowns and trunks of the site.
+    site : Site
+        Its crowns and trunks, and how high its ground lies.
     rt : RtSettings
-        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``.
+        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
+        ``ground_roughness_m``.
     carrier_hz : float
     foliage, leaves : str, optional
         In place of those of ``rt``.
@@ -602,15 +604,78 @@ def path_loss(
     callable or None
         ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
         through; None where no path loses anything.
+
+    Raises
+    ------
+    UsageError
+        ``rt.ground_roughness_m`` with a scene of triangles.
     """
-    through = _foliage_loss(trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
-    per_reflection = rt.reflection_loss_db
-    if per_reflection == 0.0:
+    through = _foliage_loss(site.trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
+    per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
+    if per_reflection == 0.0 and rough is None:
         return through
 
     def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
         trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
-        return np.asarray(trees_db + per_reflection * paths.depth, dtype=np.float64)
+        ground_db = 0.0 if rough is None else rough(paths, sources_m, targets_m)
+        return np.asarray(trees_db + ground_db + per_reflection * paths.depth, dtype=np.float64)
+
+    return loss
+
+
+ON_GROUND_M = 1e-6
+"""A reflection this near to a ground plane of the site is one off the ground."""
+
+
+def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
+
+    Parameters
+    ----------
+    site : Site
+        Its ground planes: that of the origin and those of its towers.
+    rt : RtSettings
+    carrier_hz : float
+
+    Returns
+    -------
+    callable or None
+        As :func:`path_loss` gives it.
+
+    Raises
+    ------
+    UsageError
+        A site that is a scene of triangles.
+
+    Notes
+    -----
+    Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
+    centres (:func:`aerpaw_cmp.propagation.baselines.specular_factor`, here as a loss, which does not underflow); what
+    leaves the specular direction is not followed.
+    """
+    sigma = rt.ground_roughness_m
+    if sigma == 0.0:
+        return None
+    if site.scene is not None:
+        raise UsageError(
+            "rt.ground_roughness_m on a site that is a scene of triangles",
+            expected="a site with a ground plane, or reflection_loss_db",
+            cause="no face of the scene is known to be its ground",
+        )
+    heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
+    wavelength = wavelength_m(carrier_hz)
+
+    def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
+        total, here = np.zeros(len(paths)), sources_m[paths.tower]
+        for step in range(paths.vertices_m.shape[1]):
+            corner = paths.vertices_m[:, step]
+            on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
+            on &= paths.tree[:, step] < 0
+            ray = corner[on] - here[on]
+            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)
+            total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
+            here = np.where(np.isfinite(corner), corner, here)
+        return total
 
     return loss
 

@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
+from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import FlightFile
@@ -227,12 +228,12 @@ def run_report(
     for given, known in ((figures, FIGURES), (style, STYLES)):
         if given not in known:
             raise UsageError(f"found {given!r}", expected="one of " + ", ".join(known), cause="--figures or --style")
+    if recommend is not None:
+        _beside(recommend, flight, logs_root)
     settings = _overridden(load_flight(flight), engine, audit)
     formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
-    if recommend is not None:
-        _beside(recommend, flight, logs_root)
     with ExitStack() as outputs:
         output = outputs.enter_context(OutputFolder(folder, job="report", inputs=inputs, force=force))
         target = None
@@ -362,14 +363,6 @@ def _beside(recommend: Path, flight: Path, logs_root: Path | None) -> None:
             expected="a name beside the flight file, whose paths are relative to its folder; or --logs-root",
             path=recommend,
         )
-
-
-def input_files(settings: Any, path: Path, logs_root: Path | None = None) -> list[Path]:
-    """A settings file and every file that one of its values names, against its folder or ``logs_root``."""
-    from .manifest import named_files
-
-    roots = [path.parent] if logs_root is None else [logs_root, path.parent]
-    return [path, *(place for _, _, place in named_files(settings.model_dump(), roots))]
 
 
 def _overridden(settings: Any, engine: str | None, audit: str | None) -> Any:
@@ -601,7 +594,7 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
     found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
-    loss = path_loss(site.trees, settings.rt, link.carrier_hz)
+    loss = path_loss(site, settings.rt, link.carrier_hz)
     if settings.rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
         found = found.select(np.isfinite(loss(found, sources, point)))

@@ -80,7 +80,7 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
     dict of str to (poses,)
         By what is assumed [dBm].
     """
-    link, loss = replayed.link, path_loss(site.trees, rt, replayed.link.carrier_hz)
+    link, loss = replayed.link, path_loss(site, rt, replayed.link.carrier_hz)
     changed: dict[str, tuple[Link, Poses]] = {}
     arrays = [*link.tower_arrays.values(), link.uav_array]
     if any(isinstance(p, InstalledPattern) for a in arrays for p in a.patterns):
@@ -119,7 +119,7 @@ def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict
         return {}
 
     def with_trees(foliage: str, leaves: str | None = None) -> Fields:
-        loss = path_loss(site.trees, rt, replayed.link.carrier_hz, foliage=foliage, leaves=leaves)
+        loss = path_loss(site, rt, replayed.link.carrier_hz, foliage=foliage, leaves=leaves)
         return evaluate(site, replayed, loss)
 
     foliage = "attenuating" if rt.foliage == "none" else rt.foliage

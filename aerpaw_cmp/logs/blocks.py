@@ -33,8 +33,9 @@ FROM_BYTES = 24 << 20
 _CHUNK = 4 << 20
 _AT_ONCE = 1 << 20
 """Rows that a step over a whole column takes at a time: what it needs beside the column stays small."""
-_DOUBLING = 1 << 22
-"""Rows up to which a column doubles its room; above, it grows by a sixteenth, in place."""
+_ROOM = 1 << 22
+"""Rows up to which a column takes room for eight times as many (which costs nothing before it is written to); above, it
+grows by a sixteenth, in place."""
 _MOST_RATIO = 1100
 """Deflate makes a file at most 1032 times smaller."""
 _SUMMED = re.compile(
@@ -119,6 +120,12 @@ def _unmarked(chunks: Iterator[bytes]) -> Iterator[bytes]:
     """The chunks of a file without its byte order mark."""
     for i, chunk in enumerate(chunks):
         yield chunk.removeprefix(b"\xef\xbb\xbf") if i == 0 else chunk
+
+
+def whole_lines(chunks: Iterator[bytes]) -> Iterator[bytes]:
+    """Blocks of whole lines, for a reader that keeps by itself what later lines hang on."""
+    for _, data in _blocks(_unmarked(chunks), None, None, ()):
+        yield data
 
 
 def first_line(data: bytes, options: ReadOptions) -> int:  # noqa: ARG001 - the contract of heads
@@ -234,7 +241,7 @@ class Gathered:
         self.rejected: list[RejectedLine] = []
         self.warnings = _Warnings()
         self.order: list[tuple[str, str]] = []
-        self.records: dict[tuple[str, str], _Records] = {}
+        self.records: dict[tuple[str, str], Records] = {}
         self.attributes: dict[tuple[str, str], dict[str, Attribute]] = {}
 
     def add(self, result: ReadResult, before: ReadResult | None) -> None:
@@ -266,7 +273,7 @@ class Gathered:
             if len(columns["line"]):
                 added.append(key)
                 columns["line"] = columns["line"] + shift
-                self.records.setdefault(key, _Records()).extend(columns)
+                self.records.setdefault(key, Records()).extend(columns)
                 self.attributes[key] = _joined(self.attributes.get(key), stream.attributes)
         self.order = in_order(self.order, added)
 
@@ -340,10 +347,10 @@ class _Column:
         self.count = end
 
     def _grow(self, need: int) -> None:
-        if need > _DOUBLING:
+        if need > _ROOM:
             self.values.resize(need + need // 16, refcheck=False)
             return
-        wider = np.empty(max(need, min(2 * len(self.values), _DOUBLING)), dtype=self.values.dtype)
+        wider = np.empty(min(8 * need, _ROOM), dtype=self.values.dtype)
         wider[: self.count] = self.values[: self.count]
         self.values = wider
 
@@ -382,7 +389,7 @@ class _Flags(_Column):
         return made
 
 
-class _Records:
+class Records:
     """The records of a stream, block behind block; a column that a block lacks is NaN there."""
 
     def __init__(self) -> None:

@@ -137,6 +137,7 @@ def replay_moving(
     done = 0
     for block in blocks:
         parts.append(_replay_block(site, link, name, poses, block, options))
+        options["check_power_cut"] = False  # one block tells what a cut costs
         done += len(block.rows)
         if progress is not None:
             progress(done / max(len(poses), 1))

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import csv
 import io
+from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
 
+from ..common.cf import CONVENTIONS, DB
 from ..common.errors import InputError
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
@@ -23,10 +25,20 @@ class SpherePattern(MeasuredPattern):
     name : str
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    learned_from : tuple of str
+        Flights that the gain was learned from, where the file says so: on those it must not be scored.
     """
 
-    def __init__(self, name: str, gain_dbi: FloatArray, sd_db: FloatArray, frequency_hz: float | None = None) -> None:
+    def __init__(
+        self,
+        name: str,
+        gain_dbi: FloatArray,
+        sd_db: FloatArray,
+        frequency_hz: float | None = None,
+        learned_from: tuple[str, ...] = (),
+    ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
+        self.learned_from = learned_from
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
@@ -56,6 +68,55 @@ def unit_mean_gain(gain_db: FloatArray) -> FloatArray:
     theta = np.linspace(0.0, np.pi, gain_db.shape[0])
     weight = np.sin(theta)[:, None] * np.ones_like(gain_db)
     return np.asarray(gain_db - db_from_power((power_from_db(gain_db) * weight).sum() / weight.sum()))
+
+
+def sphere_netcdf(
+    gain_dbi: FloatArray, sd_db: FloatArray, attributes: Mapping[str, str], frequency_hz: float
+) -> bytes | None:
+    """An antenna file as NetCDF after CF-1.11; None where netCDF4 is not installed (``aerpaw-cmp[geo]``).
+
+    Parameters
+    ----------
+    gain_dbi, sd_db : (thetas, phis)
+        Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
+    attributes : mapping of str to str
+        Of the file: ``title``, ``source``, ``history`` and what else there is to say.
+    frequency_hz : float
+
+    Returns
+    -------
+    bytes or None
+        ``gain`` and its ancillary ``gain_sd`` over ``elevation`` (90 to -90 deg) and ``azimuth`` (0 to below 360 deg,
+        counter-clockwise from x), in dB as UDUNITS has it, and the scalar ``frequency``.
+    """
+    try:
+        import netCDF4
+    except ImportError:
+        return None
+    rows, columns = gain_dbi.shape
+    book = netCDF4.Dataset("antenna", "w", memory=1 << 18)  # HDF5 ends the process where a disk is full
+    book.setncatts({"Conventions": CONVENTIONS, **attributes})
+    axes = {
+        "elevation": (90.0 - np.linspace(0.0, 180.0, rows), "angle above the x-y plane of the antenna's frame"),
+        "azimuth": (np.arange(columns) * (360.0 / columns), "angle in the x-y plane, counter-clockwise from x"),
+    }
+    for name, (values, meaning) in axes.items():
+        book.createDimension(name, len(values))
+        axis = book.createVariable(name, "f8", (name,), fill_value=False)
+        axis.setncatts({"long_name": meaning, "units": "degree"})
+        axis[:] = values
+    carrier = book.createVariable("frequency", "f8", ())
+    carrier.setncatts({"long_name": "frequency of the gain", "standard_name": "radiation_frequency", "units": "Hz"})
+    carrier[...] = frequency_hz
+    for name, values, meaning in (
+        ("gain", gain_dbi, "gain of the antenna as mounted, its mean power over the sphere 0 dBi"),
+        ("gain_sd", sd_db, "standard deviation of the gain"),
+    ):
+        variable = book.createVariable(name, "f4", ("elevation", "azimuth"), zlib=True)
+        variable.setncatts({"long_name": meaning, "units": DB, "coordinates": "frequency"})
+        variable[:] = values
+    book["gain"].ancillary_variables = "gain_sd"
+    return bytes(book.close())
 
 
 def sphere_csv(gain_dbi: FloatArray, sd_db: FloatArray, notes: tuple[str, ...] = ()) -> str:
@@ -103,7 +164,16 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     gain[row, column] = values[:, 2]
     if len(header) > 3:
         sd[row, column] = values[:, 3]
-    return SpherePattern(name or path.stem, gain, sd)
+    return SpherePattern(name or path.stem, gain, sd, learned_from=_flights_in(text))
+
+
+LEARNED = "# aerpaw-cmp calibrate: "
+"""Begins the comment that names a calibration and, after ``, from``, its flights."""
+
+
+def _flights_in(text: str) -> tuple[str, ...]:
+    first = next((line for line in text.splitlines() if line.startswith(LEARNED)), "")
+    return tuple(name.strip() for name in first.partition(", from ")[2].split(",") if name.strip())
 
 
 def _row(line: str, number: int, width: int, path: Path) -> list[float]:

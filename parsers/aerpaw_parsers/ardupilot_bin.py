@@ -68,12 +68,14 @@ def _form(body: bytes) -> tuple[int, _Form]:
     return kind, _Form(length, texts[0], texts[1], texts[2].split(","))
 
 
-def _messages(
-    data: bytes,
-) -> tuple[dict[str, list[tuple[int, tuple[float, ...]]]], dict[str, _Form], int, list[RejectedLine]]:
-    """Values of the wanted messages, their forms, the number of sound messages, and damaged stretches."""
+_Rows = dict[str, dict[tuple[str, ...], list[tuple[int, tuple[float, ...]]]]]
+"""Number and values of each message, by its name and the columns that it had: a log may describe a name anew."""
+
+
+def _messages(data: bytes) -> tuple[_Rows, int, list[RejectedLine]]:
+    """Values of the wanted messages, the number of sound messages, and damaged stretches."""
     forms: dict[int, _Form] = {_FMT: _Form(89, "FMT", "BBnNZ", ["Type", "Length", "Name", "Format", "Columns"])}
-    found: dict[str, list[tuple[int, tuple[float, ...]]]] = {name: [] for name in _WANTED}
+    found: _Rows = {name: {} for name in _WANTED}
     damaged: list[RejectedLine] = []
     count, at, end = 0, 0, len(data)
     while at + 3 <= end:
@@ -94,23 +96,22 @@ def _messages(
         elif form.name in found and form.sound:
             raw = form.layout.unpack(body)
             values = tuple(v * s if s else float("nan") for v, s in zip(raw, form.scales, strict=True))
-            found[form.name].append((count + len(damaged), values))
+            found[form.name].setdefault(tuple(form.columns), []).append((count + len(damaged), values))
         count += 1
         at += form.length
     if at < end:
         damaged.append(RejectedLine(count + len(damaged) + 1, f"{end - at} bytes at the end that are no message", ""))
-    return found, {form.name: form for form in forms.values()}, count, damaged
+    return found, count, damaged
 
 
-def _series(
-    found: dict[str, list[tuple[int, tuple[float, ...]]]], forms: dict[str, _Form], name: str
-) -> _autopilot.Series:
-    """Messages of one name; of several instances (sensors, filters) the first."""
-    rows, form = found.get(name) or [], forms.get(name)
-    if not rows or form is None or "TimeUS" not in form.columns:
+def _series(found: _Rows, name: str) -> _autopilot.Series:
+    """Messages of one name: of its descriptions the commonest, of instances (sensors, filters) the first."""
+    timed = {names: rows for names, rows in found[name].items() if "TimeUS" in names}
+    if not timed:
         return _autopilot.NONE
+    names, rows = max(timed.items(), key=lambda item: len(item[1]))
     table = np.array([values for _, values in rows], dtype=np.float64)
-    columns = {column: table[:, i] for i, column in enumerate(form.columns)}
+    columns = {column: table[:, i] for i, column in enumerate(names)}
     number = np.array([i for i, _ in rows], dtype=np.int64)
     for instance in ("I", "C", "Instance"):
         if instance in columns:
@@ -122,8 +123,8 @@ def _series(
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
-    found, forms, count, damaged = _messages(data)
-    series = {name: _series(found, forms, name) for name in _WANTED}
+    found, count, damaged = _messages(data)
+    series = {name: _series(found, name) for name in _WANTED}
     gps = series["GPS"]
     place = series["POS"] if len(series["POS"].time_s) else gps
     column = place.columns

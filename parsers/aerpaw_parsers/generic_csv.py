@@ -164,7 +164,7 @@ def _settled(result: ReadResult) -> ReadResult:
         return result
     frame = result.streams[0].frame
     flag = frame["flag"].to_numpy(dtype=object)
-    odd = [i for i in np.flatnonzero(flag != "").tolist() if "no_number" in flag[i].split(";")]
+    odd = [i for i, text in enumerate(flag.tolist()) if text and "no_number" in text.split(";")]
     if not odd:
         return result
     words = "1 row is" if len(odd) == 1 else f"{len(odd)} rows are"
@@ -325,8 +325,13 @@ def _clock(cells: AnyArray, options: ReadOptions) -> tuple[_time.Instants, BoolA
     if width > _MOST_BYTES:
         return None
     byte = cells.view(np.uint8).reshape(len(cells), width)
-    last = byte[np.arange(len(cells)), np.maximum(np.char.str_len(cells) - 1, 0)]
-    odd = np.flatnonzero((byte.max(axis=1) > 126) | (byte[:, 0] <= 32) | (last <= 32))
+    last = byte[:, -1]
+    if not last.all():
+        last = byte[np.arange(len(cells)), np.maximum(np.char.str_len(cells) - 1, 0)]
+    strange = (byte[:, 0] <= 32) | (last <= 32)
+    if byte.max() > 126:
+        strange |= (byte > 126).any(axis=1)
+    odd = np.flatnonzero(strange)
     if len(odd):  # blanks around, which are taken off, or letters of no time
         bare = [_bare(bytes(cells[i]).decode("utf-8", "replace")) for i in odd.tolist()]
         cells = cells.astype(f"S{max(width, *map(len, bare))}")

@@ -14,7 +14,7 @@ LTE                       20      rss ``lte_rsrp``
 NR5G-SA                   18      rss ``nr_rsrp`` (order RSRP, RSRQ, SINR)
 ========================= ======= ============================================================
 
-RI counts data layers, from 1; 0 means no CSI. Times are naive local time, taken after the answer.
+RI counts data layers, from 1; 0 means no CSI. Times are naive local time, taken after the answer; an offset wins.
 Writer: AERPAW ``QuectelLogger`` (``no_pandas_at_rm500q.py``, ``at_rm500q2.py``).
 """
 
@@ -34,7 +34,7 @@ from . import _frames, _lines, _table, _time
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
-_T = rb"^(" + _time.TIME + rb"),"
+_T = rb"^(" + _time.TIME + _time.ZONE + rb"),"
 
 
 def _token(command: bytes, word: bytes) -> bytes:
@@ -89,7 +89,7 @@ _SA = re.compile(
     + rb"[ \t]*\r?$",
     re.MULTILINE,
 )
-_ANY = re.compile(rb"^" + _time.TIME + rb',"?\+(?:QNWCFG|QENG|QENDC)')
+_ANY = re.compile(rb"^" + _time.TIME + _time.ZONE + rb',"?\+(?:QNWCFG|QENG|QENDC)')
 _RSRP_RANGE = (-156.0, -31.0)
 """3GPP TS 38.133 table 10.1.6.1-1: reported SS-RSRP lies between -156 and -31 dBm."""
 _SINR_RANGE = (-23.0, 40.0)
@@ -130,8 +130,6 @@ class _Rows:
 def _rows(
     lines: _lines.Lines, pattern: re.Pattern[bytes], options: ReadOptions, rejected: list[RejectedLine]
 ) -> _Rows | None:
-    if b"servingcell" not in lines.data:
-        return None  # a search of a whole log of CSI would find nothing, slowly
     number, groups = _lines.match(lines, pattern)
     if not len(number):
         return None
@@ -151,14 +149,14 @@ def _csi_rows(lines: _lines.Lines, options: ReadOptions, rejected: list[Rejected
     """CSI rows: those of the launched logger at once, others by the pattern; all columns but the first are numbers."""
     number, wall, value = _launched(lines)
     odd, groups = _lines.match_rest(lines, _CSI, number)
-    valid = np.ones(len(number), dtype=bool)
+    valid, zoned, offset_s = np.ones(len(number), dtype=bool), np.zeros(len(number), dtype=bool), np.zeros_like(number)
     if len(odd):
         column = _lines.columns(groups, _CSI.groups)
         parsed = _time.parse_texts(column[0])
         order = np.argsort(np.concatenate((number, odd)), kind="stable")
         number = np.concatenate((number, odd))[order]
-        wall = np.concatenate((wall, parsed[0]))[order]
-        valid = np.concatenate((valid, parsed[1]))[order]
+        known = (wall, valid, offset_s, zoned)
+        wall, valid, offset_s, zoned = (np.concatenate(pair)[order] for pair in zip(known, parsed, strict=True))
         read = [_values(cells) for cells in column[1:]]
         value = [np.concatenate(pair)[order] for pair in zip(value, read, strict=True)]
     if not len(number):
@@ -166,7 +164,9 @@ def _csi_rows(lines: _lines.Lines, options: ReadOptions, rejected: list[Rejected
     if not valid.all():
         rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
         number, wall, value = number[valid], wall[valid], [column[valid] for column in value]
-    instants = _time.wall_to_utc(wall, options, needed_by="quectel_csv")
+        offset_s, zoned = offset_s[valid], zoned[valid]
+    every = np.ones(len(number), dtype=bool)
+    instants = _time.parsed_to_utc(wall, every, offset_s, zoned, options, needed_by="quectel_csv")
     return _Rows(number, instants, [np.zeros(0), *value])
 
 
@@ -267,8 +267,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     lines = _lines.split(data)
     rejected: list[RejectedLine] = []
     csi = _csi_rows(lines, options, rejected)
-    lte = _rows(lines, _LTE, options, rejected)
-    sa = _rows(lines, _SA, options, rejected)
+    serving = b"servingcell" in data  # a search of a whole log of CSI would find nothing, slowly
+    lte = _rows(lines, _LTE, options, rejected) if serving else None
+    sa = _rows(lines, _SA, options, rejected) if serving else None
     streams: list[Stream | None] = []
     if csi is not None and len(csi.number):
         streams += [_rank(csi, 5, "nr5g_csi", lines, options), _rank(csi, 1, "lte_csi", lines, options)]

@@ -22,12 +22,14 @@ from __future__ import annotations
 import json
 import zlib
 from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 
@@ -77,47 +79,130 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     InputError
         If the schema is a later one than we know.
     """
-    records, rejected, blank = _records(data)
-    lines = len(records) + len(rejected) + blank
-    exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
-    header = next((record for _, record in records if record["kind"] == "header"), {})
-    if header and header.get("schema") != SCHEMA:
-        raise InputError(
-            f"the log has schema {header.get('schema')!r}", expected=SCHEMA, cause="it was written by another version"
-        )
+    return _read((data,), options)
+
+
+def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+    """The same from pieces of the file; only numbers are kept of a block."""
+    return _read(blocks.whole_lines(chunks), options)
+
+
+def _read(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
+    log = _Log()
+    for data in pieces:
+        log.add(data)
+    header = log.header or {}
     common: dict[str, Attribute] = {"clock": "utc"}
     for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
         if value is not None:
             common[name] = value
-    rsrp = _rsrp_frame(exchanges)
+    rsrp = log.rsrp.frame() if log.rsrp.count else None
     streams = []
-    for query, name in (("nr5g_csi", "nr5g"), ("lte_csi", "lte")):
-        frame = _rank_frame([item for item in exchanges if item[1].get("query") == query])
-        if len(frame) and (name == "nr5g" or frame["rank"].notna().any()):
+    for query, name in _RANKS:
+        if not log.rank[query].count:
+            continue
+        frame = log.rank[query].frame()
+        if name == "nr5g" or frame["rank"].notna().any():
             if name == "nr5g":
                 frame = _beside(frame, rsrp)
             ri_base = str(header.get("ri_base", "one"))
             streams.append(
                 Stream("rank", name, frame, {**common, "ri_base": ri_base, "channel": options.channel or name})
             )
-    if len(rsrp):
+    if rsrp is not None:
         streams.append(
             Stream("rss", "nr5g_rsrp", rsrp, {**common, "unit": "dBm", "channel": options.channel or "nr5g_rsrp"})
         )
-    comments = len(records) - len(exchanges)
     return ReadResult(
         reader="tap_jsonl",
         streams=tuple(streams),
-        lines=lines,
-        accepted=len(exchanges),
-        blank=blank + comments,
-        rejected=tuple(rejected),
-        warnings=_warnings(records, rejected),
+        lines=log.lines,
+        accepted=log.exchanges,
+        blank=log.blank,
+        rejected=tuple(log.rejected),
+        warnings=log.warnings(),
     )
 
 
-def _records(data: bytes) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
-    """Sound records with their line numbers, rejected lines, number of blank lines."""
+_RANKS = (("nr5g_csi", "nr5g"), ("lte_csi", "lte"))
+
+
+class _Log:
+    """What is kept of a log while it is read."""
+
+    def __init__(self) -> None:
+        self.header: dict[str, Any] | None = None
+        self.rank = {query: blocks.Records() for query, _ in _RANKS}
+        self.rsrp = blocks.Records()
+        self.lines = self.exchanges = self.blank = 0
+        self.rejected: list[RejectedLine] = []
+        self.events: list[str] = []
+        self.open_gap: dict[str, Any] | None = None
+        self.numbers: set[int] = set()
+        self.ended = False
+
+    def add(self, data: bytes) -> None:
+        """The next lines."""
+        records, rejected, blank = _records(data, self.lines)
+        self.lines += len(records) + len(rejected) + blank
+        self.rejected += rejected
+        exchanges = [(number, record) for number, record in records if record["kind"] == "exchange"]
+        self.exchanges += len(exchanges)
+        self.blank += blank + len(records) - len(exchanges)
+        for query, kept in self.rank.items():
+            _keep(kept, _rank_frame([item for item in exchanges if item[1].get("query") == query]))
+        _keep(self.rsrp, _rsrp_frame(exchanges))
+        for _, record in records:
+            self._note(record)
+
+    def _note(self, record: dict[str, Any]) -> None:
+        """What a record says about the log as a whole: gaps, clock steps, lost records, its end."""
+        kind = record["kind"]
+        if isinstance(record.get("n"), int):
+            self.numbers.add(int(record["n"]))
+        if kind == "header" and self.header is None:
+            self.header = record
+            if record.get("schema") != SCHEMA:
+                raise InputError(
+                    f"the log has schema {record.get('schema')!r}",
+                    expected=SCHEMA,
+                    cause="it was written by another version",
+                )
+        elif kind == "gap" and record.get("state") == "closed":
+            seconds = _int(record.get("duration_ns")) / 1e9
+            self.events.append(f"gap of {seconds:.1f} s: {record.get('reason', '')}")
+            self.open_gap = None
+        elif kind == "gap":
+            self.open_gap = record
+        elif kind == "clock":
+            self.events.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
+        elif kind == "disk":
+            self.events.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
+        elif kind in ("end", "rotate"):
+            self.ended = True
+
+    def warnings(self) -> tuple[str, ...]:
+        """Gaps, clock steps, lost and missing records, torn tail, missing end."""
+        found = list(self.events)
+        if self.open_gap is not None:
+            found.append(f"the log ends inside a gap: {self.open_gap.get('reason', '')}")
+        missing = max(self.numbers) - min(self.numbers) + 1 - len(self.numbers) if self.numbers else 0
+        if missing:
+            found.append(f"{missing} record numbers are missing in this segment")
+        if self.rejected and self.rejected[-1].reason.startswith("torn tail"):
+            found.append("the last line is torn (power loss or kill while writing)")
+        if not self.ended:
+            found.append("no end record: the session was cut")
+        return tuple(found)
+
+
+def _keep(records: blocks.Records, frame: pd.DataFrame) -> None:
+    if len(frame):
+        records.extend({str(name): frame[name].to_numpy() for name in frame.columns})
+
+
+def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
+    """Sound records with their line numbers, rejected lines, number of blank lines, behind some lines."""
     lines = data.split(b"\n")
     unterminated = lines[-1] != b""
     if not unterminated:
@@ -125,18 +210,19 @@ def _records(data: bytes) -> tuple[list[tuple[int, dict[str, Any]]], list[Reject
     records: list[tuple[int, dict[str, Any]]] = []
     rejected: list[RejectedLine] = []
     blank = 0
-    for number, line in enumerate(lines, 1):
+    last = before + len(lines)
+    for number, line in enumerate(lines, before + 1):
         if not line.strip():
             blank += 1
             continue
         line = line.removesuffix(b"\r")
         try:
             record = decode_line(line)
-            if unterminated and number == len(lines):  # whole by its checksum; flagged as in every other reader
+            if unterminated and number == last:  # whole by its checksum; flagged as in every other reader
                 record["flags"] = [*_flags(record), "unterminated_line"]
             records.append((number, record))
         except ValueError as error:
-            reason = f"torn tail: {error}" if unterminated and number == len(lines) else str(error)
+            reason = f"torn tail: {error}" if unterminated and number == last else str(error)
             rejected.append(RejectedLine(number, reason, line[:2000].decode("utf-8", errors="replace")[:500]))
     return records, rejected, blank
 
@@ -211,10 +297,10 @@ def _rsrp_frame(exchanges: list[tuple[int, dict[str, Any]]]) -> pd.DataFrame:
     return _frame(columns)
 
 
-def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame) -> pd.DataFrame:
+def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame | None) -> pd.DataFrame:
     """RSRP and SINR of the last serving-cell answer as columns of the rank frame."""
     rsrp_dbm, sinr_db = np.full(len(rank), np.nan), np.full(len(rank), np.nan)
-    if len(rsrp):
+    if rsrp is not None:
         times = rsrp["time"].to_numpy()
         order = np.argsort(times, kind="stable")
         at = np.searchsorted(times[order], rank["time"].to_numpy(), side="right") - 1
@@ -227,35 +313,6 @@ def _beside(rank: pd.DataFrame, rsrp: pd.DataFrame) -> pd.DataFrame:
     return rank
 
 
-def _warnings(records: list[tuple[int, dict[str, Any]]], rejected: list[RejectedLine]) -> tuple[str, ...]:
-    """Gaps, clock steps, lost and missing records, torn tail, missing end."""
-    found: list[str] = []
-    open_gap = None
-    for _, record in records:
-        kind = record["kind"]
-        if kind == "gap" and record.get("state") == "closed":
-            seconds = _int(record.get("duration_ns")) / 1e9
-            found.append(f"gap of {seconds:.1f} s: {record.get('reason', '')}")
-            open_gap = None
-        elif kind == "gap":
-            open_gap = record
-        elif kind == "clock":
-            found.append(f"the wall clock stepped by {_int(record.get('step_ns')) / 1e9:+.3f} s")
-        elif kind == "disk":
-            found.append(f"the disk failed ({record.get('reason')}); {record.get('lost')} records were lost")
-    if open_gap is not None:
-        found.append(f"the log ends inside a gap: {open_gap.get('reason', '')}")
-    numbers = sorted({int(record["n"]) for _, record in records if isinstance(record.get("n"), int)})
-    missing = numbers[-1] - numbers[0] + 1 - len(numbers) if numbers else 0
-    if missing:
-        found.append(f"{missing} record numbers are missing in this segment")
-    if rejected and rejected[-1].reason.startswith("torn tail"):
-        found.append("the last line is torn (power loss or kill while writing)")
-    if not any(record["kind"] in ("end", "rotate") for _, record in records):
-        found.append("no end record: the session was cut")
-    return tuple(found)
-
-
 READER = Reader(
     name="tap_jsonl",
     title="Log of 'aerpaw-cmp tap': rank indicator and serving cell of a Quectel modem (JSON lines)",
@@ -263,4 +320,5 @@ READER = Reader(
     sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...',
     sniff=sniff,
     read=read,
+    in_blocks=in_blocks,
 )

@@ -9,7 +9,8 @@ fields layout
 8      ``n,lon,lat,alt,volt,time,fix,satellites`` (2021)
 ====== =================================================================================================
 
-Radians; altitude above take-off; naive local time, or (2026 scripts) UTC with an offset.
+Further fields behind these are left out. Radians; altitude above take-off; naive local time, or (2026 scripts) UTC
+with an offset.
 Writers: AERPAW/aerpawlib ``examples/v1/{gps_logger,preplanned_trajectory,guided_mission_ping_iperf}.py``.
 """
 
@@ -35,28 +36,31 @@ _BODY = (
     _SEP.join((_N, _N, _N, _N)),  # 11 fields
     _N + rb"(?:" + _SEP + _N + rb")?",  # 8 and 9 fields
 )
-_ROW = re.compile(
-    _SEP.join(
-        (
-            rb'^ ?"?(\d{1,12})"?',
-            _N,
-            _N,
-            _N,
-            rb"(?:" + rb"|".join(_BODY) + rb")",
-            rb'"?(' + _time.TIME + _time.ZONE + rb')"?',
-            rb'"?(-?\d{1,3})"?',
-            rb'"?(-?\d{1,3})"?[ ,\t]{0,8}\r?$',
-        )
-    ),
-    re.MULTILINE,
+_FIELDS = _SEP.join(
+    (
+        rb'^ ?"?(\d{1,12})"?',
+        _N,
+        _N,
+        _N,
+        rb"(?:" + rb"|".join(_BODY) + rb")",
+        rb'"?(' + _time.TIME + _time.ZONE + rb')"?',
+        rb'"?(-?\d{1,3})"?',
+        rb'"?(-?\d{1,3})"?',
+    )
 )
+_END = rb"[ ,\t]{0,8}\r?$"
+_MORE = rb"(?:,[^,\n]{0,80})"
+_ROW = re.compile(_FIELDS + _END, re.MULTILINE)
+_LONGER = re.compile(_FIELDS + _MORE + rb"{1,6}" + _END, re.MULTILINE)
+"""A logger that writes further fields behind these: only where most rows have them, as glued rows look so too."""
+_EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END)
 _GROUPS = 20
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
 
 
 def sniff(head: bytes) -> bool:
     """Whether most of the first lines are telemetry rows."""
-    return _lines.mostly(head, _ROW)
+    return _lines.mostly(head, _ROW) or _lines.mostly(head, _LONGER)
 
 
 _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
@@ -104,7 +108,8 @@ _NUMBERS = ("index", "lon", "lat", "alt", "pitch", "yaw", "roll", "north", "east
 
 def _by_pattern(lines: _lines.Lines, done: IntArray) -> _Rows:
     """Rows of every layout, one by one and strictly: what the fast way left."""
-    rows, groups = _lines.match_rest(lines, _ROW, done)
+    longer = not len(done) and not _lines.mostly(lines.data, _ROW) and _lines.mostly(lines.data, _LONGER)
+    rows, groups = _lines.match_rest(lines, _LONGER if longer else _ROW, done)
     column = _lines.columns(groups, _GROUPS)
     value = {i: _lines.numbers(column[i]) for i in (*range(10), 11, 12, 13, 18, 19)}
     # groups 4-6 hold the angles of the 10-field layout, 11-13 those of the 11-field one
@@ -263,5 +268,5 @@ READER = Reader(
     sample='7,-78.6960001,35.7280002,30.1,"(0.01,1.57,-0.02)","(0.0,5.0,0.1)",48.1,2025-01-01 12:00:07.000000,4,18',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, apart=_ROW, settle=_settled),
+    in_blocks=blocks.by_lines(_read, apart=_EITHER, settle=_settled),
 )

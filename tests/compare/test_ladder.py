@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.ladder import Rung, climb, held_out_error_db, ladder_rows, stretches_of
+from aerpaw_cmp.compare.ladder import Rung, climb, held_out_error_db, ladder_rows, places_of, stretches_of
 
 
 def wave(n, seed, sd=1.0):
@@ -84,3 +84,23 @@ def test_nothing_measured_recommends_nothing():
     ladder = climb([np.full(10, np.nan)], [np.arange(10.0)], [rung("flat", np.zeros(10))])
     assert ladder.recommended is None
     assert ladder_rows(ladder, [("LW1", "A")])[0].n == 0
+
+
+def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
+    """Out and back along a line with a step in level at the middle: the offset of a place never has seen its level."""
+    out = np.linspace(0.0, 800.0, 400)
+    position = np.stack([np.r_[out, out[::-1]], np.zeros(800)], axis=1)
+    place = places_of(position)
+    np.testing.assert_array_equal(np.bincount(place), np.full(8, 100))
+    np.testing.assert_array_equal(place[:400], place[400:][::-1])
+    level = np.where((position[:, 0] > 400) & (position[:, 0] <= 500), 8.0, 0.0)  # one place alone
+    everywhere = np.ones(800, bool)
+    here = held_out_error_db(level, np.zeros(800), everywhere, place=place)[level > 0]
+    assert here == pytest.approx(8.0)
+    # in stretches of time the way back tells the way out
+    assert held_out_error_db(level, np.zeros(800), everywhere)[level > 0].mean() < 7.5
+    ladder = climb([level], [np.arange(800.0)], [Rung(model="m", level_db=(np.zeros(800),), seconds=0.0)],
+                   position_m=[position], replicates=2)  # fmt: skip
+    assert ladder.error_db[0][0][level > 0] == pytest.approx(8.0)
+    assert len(places_of(np.zeros((3, 2)))) == 3
+    assert len(places_of(np.zeros((0, 2)))) == 0

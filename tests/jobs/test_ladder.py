@@ -18,6 +18,7 @@ from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.ladder import Model, recommended_settings
+from aerpaw_cmp.site.sphere_pattern import sphere_csv
 
 pytestmark = pytest.mark.usefixtures("blank_pictures")
 
@@ -79,6 +80,27 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert again.rss[0].score.rmse_db == pytest.approx(1.0, abs=0.1)
     as_set = {r.model: r for r in again.ladder}["as set in flight.yaml"]
     assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
+
+
+def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> None:
+    """Antennas that a calibration learned: a rung of their own, and none on the flights that they were learned from."""
+    path = flight(tmp_path)
+    for named, scored in (("elsewhere, other", True), ("elsewhere, planted", False), ("planted_too", True)):
+        notes = (f"aerpaw-cmp calibrate: some, from {named}",)
+        (tmp_path / "a.csv").write_text(sphere_csv(np.zeros((7, 8)), np.ones((7, 8)), notes))
+        settings = load_flight(path)
+        stated = settings.model_dump(mode="json", exclude_unset=True)
+        stated["link"] = {"rss": {"carrier_hz": 3.3e9, "tower": {"antenna": {"model": "sphere", "file": "a.csv"}}}}
+        (tmp_path / "learned.yaml").write_text(yaml.safe_dump(stated), encoding="utf-8")
+        settings = load_flight(tmp_path / "learned.yaml")
+        found = run_flight(gather(settings, tmp_path, read_logs(settings, tmp_path)), audit=False, ladder=True)
+        rows = {row.model: row for row in found.result.ladder}
+        learned = {name: row for name, row in rows.items() if "learned sphere" in name or "as set" in name}
+        assert len(learned) >= 2
+        assert all(np.isfinite(row.rmse_heldout_db) == scored for row in learned.values())
+        assert all(("not scored" in name) != scored for name in learned)
+        assert np.isfinite(rows["free space"].rmse_heldout_db)
+        assert recommended_settings(stated, Model(antennas="learned"))["link"] == stated["link"]
 
 
 def test_recommended_file_must_stand_beside_its_flight(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

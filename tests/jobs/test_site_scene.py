@@ -144,6 +144,24 @@ def test_the_plan_of_a_flight_in_a_scene_has_the_estimate(flown: Path, capsys: p
     assert stage["seconds"] >= 0.0
 
 
+def test_the_plan_of_a_map_of_a_scene_searches_one_piece_of_it(
+    flown: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    from aerpaw_cmp.jobs import coverage_map
+
+    def never(*_: object) -> None:
+        raise AssertionError("a map was made for the plan")
+
+    monkeypatch.setattr(coverage_map, "make_maps", never)
+    capsys.readouterr()
+    site = flown.with_name("site.yaml")
+    assert main(["map", str(site), "--spacing", "20", "--dry-run", "--json", "--quiet"]) == 0
+    stages = [s for s in json.loads(capsys.readouterr().out)["stages"] if s["name"].startswith("maps, foliage")]
+    assert all(re.search(r"path search in \d+ pieces, each about \S+ s for 1 tower", stage["work"]) for stage in stages)
+    assert all(stage["seconds"] == 0.0 for stage in stages[1:])  # paths are shared
+    assert stages[0]["seconds"] > 0.0
+
+
 @pytest.mark.sionna
 def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]

@@ -82,3 +82,15 @@ def test_pyulog_reads_the_same_px4_log(tmp_path: object) -> None:
     frame = by_name("px4_ulog").read(LOGS["px4_ulog"], ReadOptions()).streams[0].frame
     assert np.array_equal(frame["latitude_deg"].to_numpy(), place["lat"])
     assert np.array_equal(frame["longitude_deg"].to_numpy(), place["lon"])
+
+
+@pytest.mark.parametrize("columns", ["TimeUS,Lat", "TimeUS,Lat,Lng,Alt,RelHomeAlt,RelOriginAlt,More"])
+def test_a_message_described_anew_keeps_what_was_read_before(columns: str) -> None:
+    """The rows before were written by the other description; the names of the last one once met their values."""
+    form = "QL" if columns.count(",") == 1 else "QLLffff"
+    size = 3 + struct.calcsize("<" + {"QL": "Qi", "QLLffff": "Qiiffff"}[form])
+    anew = struct.pack("<BB4s16s64s", 129, size, b"POS", form.encode(), columns.encode())
+    before = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"], ReadOptions()).streams[0].frame
+    data = LOGS["ardupilot_bin"] + b"\xa3\x95\x80" + anew
+    after = by_name("ardupilot_bin").read(data, ReadOptions()).streams[0].frame
+    pd.testing.assert_frame_equal(after, before)

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 
+import pandas as pd
 import pytest
 
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import by_name, identify
-from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, SAMPLES
+from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, QUECTEL_CSI, SAMPLES
 
 TEXTS = [
     (reader, name, data, accepted)
@@ -95,3 +97,29 @@ def test_what_fuzzing_found() -> None:
     assert by_name("amarisoft").read(row, OPTIONS).accepted == 2
     dotted = b"11,500.0,35.7300002,-78.7000003,.5,2.0,,,\n"
     assert by_name("nemo_csv").read(head + dotted, OPTIONS).accepted == 0
+
+
+@pytest.mark.parametrize("name", ["ten_fields", "eleven_fields", "nine_fields", "eight_fields"])
+def test_further_fields_behind_a_row_are_left_out(name: str) -> None:
+    """A logger that writes more; glued rows, which look so too, stay rejected in a log of the known layout."""
+    data = SAMPLES["vehicle_out"][name][0]
+    usual = by_name("vehicle_out").read(data, OPTIONS)
+    more = re.sub(rb"(\r?\n)", rb",7.5,AUTO\1", data)
+    assert identify(more).name == "vehicle_out"
+    longer = by_name("vehicle_out").read(more, OPTIONS)
+    assert (longer.accepted, longer.rejected) == (usual.accepted, usual.rejected)
+    pd.testing.assert_frame_equal(longer.streams[0].frame, usual.streams[0].frame)
+    first, second = data.splitlines(keepends=True)[:2]
+    glued = by_name("vehicle_out").read(data * 3 + first.rstrip() + second, OPTIONS)
+    assert (glued.accepted, len(glued.rejected)) == (3 * usual.accepted, 3 * len(usual.rejected) + 1)
+
+
+def test_an_offset_in_the_times_of_the_modem_logger_wins() -> None:
+    data = QUECTEL_CSI
+    zoned = re.sub(rb"(?m)^(20\d\d-\d\d-\d\d) (\d\d:\d\d:\d\d\.\d+)", rb"\1T\2-05:00", data)
+    assert zoned != data
+    usual = by_name("quectel_csv").read(data, OPTIONS)
+    result = by_name("quectel_csv").read(zoned, replace(OPTIONS, timezone=None))
+    assert result.accepted == usual.accepted
+    for one, other in zip(result.streams, usual.streams, strict=True):
+        pd.testing.assert_frame_equal(one.frame, other.frame)

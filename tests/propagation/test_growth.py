@@ -177,18 +177,25 @@ def test_flipped_and_degenerate_triangles_change_nothing():
 def test_the_power_cut_leaves_out_long_paths_only(way, of_link):
     """Faces that no short path goes over are not followed; a limit may be one for all or one of each link."""
     rng = np.random.default_rng(5)
-    walls = [
-        t for _ in range(25) for t in quad(rng.uniform(-60, 60, 3), 9 * rng.normal(size=3), 9 * rng.normal(size=3))
-    ]
-    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(25), 2)))
-    sources, targets = rng.uniform(-20, 20, (2, 3)), rng.uniform(-20, 20, (60, 3))
+    side = 60.0
+    walls = []
+    for low, one, two in (((0, 0, 0), 0, 1), ((0, 0, 0), 1, 2), ((0, 0, 0), 2, 0)):  # a closed room of six walls
+        for far in (0.0, side):
+            corner = np.array(low) + far * np.eye(3)[3 - one - two]
+            walls += quad(corner, side * np.eye(3)[one], side * np.eye(3)[two])
+    for low, high, size in ((5, 55, 7), (150, 400, 30)):  # things in it, and outside what no short path goes over
+        for _ in range(12):
+            walls += quad(rng.uniform(low, high, 3), size * rng.normal(size=3), size * rng.normal(size=3))
+    surfaces = merged(enumerate_.scene_of(walls, shapes=np.repeat(np.arange(30), 2)))
+    sources, targets = rng.uniform(15, 45, (2, 3)), rng.uniform(5, 55, (40, 3))
     targets[7] = np.nan
-    longest = power_cut.longest_m(sources, targets, 8.0) if of_link else 40.0
+    longest = power_cut.longest_m(sources, targets, 9.0) if of_link else 80.0
     every, effort = grow_paths(surfaces, sources, targets, max_depth=2, **way)
     some, less = grow_paths(surfaces, sources, targets, max_depth=2, longest_m=longest, **way)
-    limit = np.broadcast_to(longest, (2, 60))[every.tower, every.pose]
+    limit = np.broadcast_to(longest, (2, 40))[every.tower, every.pose]
     kept = every.select((path_lengths(every, sources, targets) <= limit) | (every.depth == 0))
-    assert 0 < (kept.depth > 0).sum() < (every.depth > 0).sum()
+    for depth in (1, 2):
+        assert 40 < (kept.depth == depth).sum() < (every.depth == depth).sum()
     assert less.sequences < effort.sequences or not way.get("beams", True)
     for column in ("pose", "tower", "faces"):
         assert np.array_equal(getattr(kept, column), getattr(some, column)), column

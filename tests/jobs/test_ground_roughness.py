@@ -1,0 +1,76 @@
+"""A rough ground in the replay of a flight: the closed form, its limits, and the same by the second implementation."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.settings import RtSettings
+from aerpaw_cmp.jobs.calibrate import GroundFit
+from aerpaw_cmp.jobs.ladder import Model, recommended_settings
+from aerpaw_cmp.jobs.replay import path_loss, replay_poses, roughness_loss
+from aerpaw_cmp.propagation import reference
+from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
+from aerpaw_cmp.propagation.baselines import two_ray_dbm
+from aerpaw_cmp.propagation.field_audit import Expected
+from aerpaw_cmp.site.siteyaml import load_site
+
+SITE = load_site("lake_wheeler")
+BARE = dataclasses.replace(SITE, buildings=())
+LINK = Link(3.4e9, {"LW1": single_element()}, single_element())
+N = 60
+LW1 = SITE.towers["LW1"].position_m
+POSES = Poses(
+    LW1 * [1, 1, 0] + np.stack([np.linspace(20, 500, N), np.linspace(-30, 80, N), np.linspace(5, 70, N)], axis=1),
+    np.broadcast_to(np.eye(3), (N, 3, 3)),
+)
+
+
+def rt(**more: object) -> RtSettings:
+    return RtSettings.model_validate({"max_depth": 1, "audit_links": 0, **more})
+
+
+@pytest.mark.parametrize("sigma", [0.0, 0.02, 0.1, 9.0])
+def test_the_replay_is_the_two_ray_form_of_that_roughness(sigma):
+    found = replay_poses(BARE, rt(ground_roughness_m=sigma), LINK, POSES)
+    expected = two_ray_dbm(LW1[None], POSES.position_m, 3.4e9, 40.0, roughness_m=sigma)
+    np.testing.assert_allclose(found.rss_dbm, expected, atol=1e-6)
+    assert found.has_path.all()
+
+
+def test_roofs_and_walls_stay_smooth_and_the_second_implementation_agrees():
+    settings = rt(ground_roughness_m=0.05, max_depth=2)
+    few = Poses(POSES.position_m[::6], POSES.rotation[::6])
+    found = replay_poses(SITE, settings, LINK, few)
+    rough = roughness_loss(SITE, settings, LINK.carrier_hz)
+    assert rough is not None
+    loss = rough(found.paths, LW1[None], few.position_m)
+    ground = (found.faces.solid[found.paths.faces] < 0) & (found.paths.faces >= 0)
+    np.testing.assert_array_equal(loss > 0, ground.any(axis=1))
+    expected = Expected.of(LINK, reference.ExpectedLoss(ground_roughness_m=0.05))
+    second = reference.Reference(SITE, "LW1", expected.link, expected.loss)
+    for row in np.flatnonzero(ground.any(axis=1) & (found.paths.depth == 1)):
+        target = tuple(few.position_m[found.paths.pose[row]].tolist())
+        mirrors = [m for m in second.mirrors if m.solid < 0]
+        assert second.loss_db(mirrors[:1], target) == pytest.approx(loss[row], rel=1e-9)
+
+
+def test_a_ground_that_is_not_known_is_refused():
+    scene = dataclasses.replace(BARE, scene=object())
+    with pytest.raises(UsageError, match="scene of triangles"):
+        path_loss(scene, rt(ground_roughness_m=0.1), 3.4e9)
+    assert path_loss(scene, rt(), 3.4e9) is None
+
+
+def test_a_calibration_uses_a_ray_only_where_none_is_less_likely():
+    heights = (0.0, 0.05, np.inf)
+    assert GroundFit(roughness_m=heights, log_likelihood=(-9.0, 5.0, 0.0)).used_m == 0.05
+    assert GroundFit(roughness_m=heights, log_likelihood=(-9.0, 1.5, 0.0)).used_m is None
+
+
+def test_the_ladder_writes_and_takes_away_the_roughness():
+    set_ = {"rt": {"max_depth": 1, "ground_roughness_m": 0.05}}
+    rough = Model(ground="rough", roughness_m=0.05)
+    assert recommended_settings(set_, rough)["rt"]["ground_roughness_m"] == 0.05
+    assert "ground_roughness_m" not in recommended_settings(set_, Model(ground="coherent"))["rt"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import functools
 import itertools
 import re
 import stat
@@ -136,6 +137,15 @@ def test_layers_stand_one_above_the_other() -> None:
     assert "ignore_imports" not in contracts[1]
 
 
+def modules() -> list[Path]:
+    return sorted([*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers" / "aerpaw_parsers").rglob("*.py")])
+
+
+@functools.cache
+def parsed(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
 def sections(docstring: str) -> dict[str, list[str]]:
     """Lines of each section of a NumPy docstring."""
     found: dict[str, list[str]] = {}
@@ -174,11 +184,11 @@ def lacking(function: ast.FunctionDef) -> list[str]:
 def test_functions_of_four_parameters_describe_each_and_what_they_return() -> None:
     """Every public function of a public module; those of the command line describe themselves in ``--help``."""
     found, seen = {}, 0
-    for path in sorted([*(ROOT / "aerpaw_cmp").rglob("*.py"), *(ROOT / "parsers" / "aerpaw_parsers").rglob("*.py")]):
+    for path in modules():
         inside = path.relative_to(ROOT)
         if inside.parts[1] == "cli" or inside.stem.startswith("_"):
             continue
-        for name, function in public_functions(ast.parse(path.read_text()).body, inside.as_posix()):
+        for name, function in public_functions(parsed(path).body, inside.as_posix()):
             seen += 1
             if missing := lacking(function):
                 found[name] = missing
@@ -205,3 +215,34 @@ def f(a, b, *, c, d) -> int:
     (function,) = ast.parse(source).body
     assert isinstance(function, ast.FunctionDef)
     assert lacking(function) == ["c", "Returns"]
+
+
+def built_by_position(tree: ast.AST, classes: set[str], most: int) -> list[tuple[int, str]]:
+    """Lines that build one of ``classes`` of more than ``most`` positional values."""
+    calls = [node for node in ast.walk(tree) if isinstance(node, ast.Call) and len(node.args) > most]
+    names = [(call.lineno, ast.unparse(call.func).split(".")[-1]) for call in calls]
+    return [(line, name) for line, name in names if name in classes]
+
+
+def test_records_of_many_fields_are_built_by_keyword() -> None:
+    """Six values of like types, one of them in the wrong place, make a record that nothing refuses."""
+    trees = {path: parsed(path) for path in modules()}
+    classes = {node.name for tree in trees.values() for node in ast.walk(tree) if isinstance(node, ast.ClassDef)}
+    assert len(classes) > 300
+    found = {p.name: lines for p, tree in trees.items() if (lines := built_by_position(tree, {*classes, "cls"}, 5))}
+    assert found == {}
+    assert built_by_position(ast.parse("x = m.Link(1, 2, 3)\ny = Link(1, 2, c=3)"), {"Link"}, 2) == [(1, "Link")]
+
+
+def private_imports(tree: ast.AST) -> list[str]:
+    """Names with one underscore in front that a module takes from another."""
+    taken = [alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    return [name for name in taken if name.startswith("_") and not name.startswith("__")]
+
+
+def test_no_module_takes_a_private_name_of_another() -> None:
+    """A private module of a package may be imported (the parsers share some); a private name of a module may not."""
+    found = {path.name: names for path in modules() if (names := private_imports(parsed(path)))}
+    own = {path.stem for path in (ROOT / "parsers" / "aerpaw_parsers").glob("_*.py")}
+    assert {name: left for name, names in found.items() if (left := set(names) - own)} == {}
+    assert private_imports(ast.parse("from .replay import Replay, _poses\nfrom . import __version__")) == ["_poses"]

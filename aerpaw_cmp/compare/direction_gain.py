@@ -194,12 +194,31 @@ def _knots(points_m: FloatArray, spacing_m: float) -> FloatArray:
 def _features(block: _Block, argument: FloatArray) -> FloatArray:
     """Unit-variance features (n, columns of the block)."""
     if block.knots_m is None:
-        return gaussian_features(argument, block.term.length)
+        return _direction_features(argument, block.term.length)
     from scipy.linalg import cholesky, solve_triangular
 
     knots, length = block.knots_m, block.term.length
     lower = cholesky(_gaussian(knots, knots, length) + 1e-6 * np.eye(len(knots)), lower=True)
     return np.asarray(solve_triangular(lower, _gaussian(knots, argument, length), lower=True).T)
+
+
+FEATURES_MIB = 320
+"""Features of directions that are kept at most: the same samples are predicted by one fit after the other."""
+
+_kept_features: OrderedDict[bytes, FloatArray] = OrderedDict()
+
+
+def _direction_features(direction: FloatArray, length: float) -> FloatArray:
+    """:func:`.sphere.gaussian_features`, kept."""
+    digest = hashlib.blake2b(repr((length, direction.shape)).encode())
+    digest.update(np.ascontiguousarray(direction).tobytes())
+    key = digest.digest()
+    if key not in _kept_features:
+        _kept_features[key] = gaussian_features(direction, length)
+        while len(_kept_features) > 1 and sum(f.nbytes for f in _kept_features.values()) > FEATURES_MIB << 20:
+            _kept_features.popitem(last=False)
+    _kept_features.move_to_end(key)
+    return _kept_features[key]
 
 
 def _gaussian(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
@@ -275,27 +294,35 @@ _kept: OrderedDict[bytes, _SeriesEquations] = OrderedDict()
 same equations, since nuisance and noise keep their ratio and whitening is linear in their scale."""
 
 
-def _columns(blocks: Sequence[_Block], antenna: str) -> tuple[list[_Block], IntArray]:
-    """Blocks that act on an antenna, and their columns (q,)."""
-    own = [b for b in blocks if b.antenna in (None, antenna)]
-    columns = [np.arange(b.start, b.stop) for b in own]
-    return own, np.concatenate([np.zeros(0, dtype=np.int64), *columns])
+def _runs(own: Sequence[_Block]) -> list[tuple[slice, slice]]:
+    """Columns of each block in the whole, and among those of its series."""
+    ends = np.cumsum([0, *(b.stop - b.start for b in own)]).tolist()
+    return [(slice(b.start, b.stop), slice(ends[i], ends[i + 1])) for i, b in enumerate(own)]
 
 
-def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
-    """Equations of one series, kept or made."""
-    ratio = float(f"{model.own_sd_db / model.noise_sd_db:.12g}")
-    digest = hashlib.blake2b(repr((ratio, model.own_length_m, len(samples))).encode())
+def _ratio(model: GainModel) -> float:
+    """Of nuisance and noise; scaled models share it but for the last digits."""
+    return float(f"{model.own_sd_db / model.noise_sd_db:.12g}")
+
+
+def _key(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> bytes:
+    """What the equations of a series depend on."""
+    digest = hashlib.blake2b(repr((_ratio(model), model.own_length_m, len(samples))).encode())
     for name in _ARRAYS:
         digest.update(np.ascontiguousarray(getattr(samples, name)).tobytes())
     for block in own:
         digest.update(repr((block.term.frame, block.term.length)).encode())
         digest.update(b"" if block.knots_m is None else np.ascontiguousarray(block.knots_m).tobytes())
-    key = digest.digest()
+    return digest.digest()
+
+
+def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
+    """Equations of one series, kept or made."""
+    key = _key(model, own, samples)
     if key in _kept:
         _kept.move_to_end(key)
         return _kept[key]
-    found = _made_equations(dataclasses.replace(model, own_sd_db=ratio, noise_sd_db=1.0), own, samples)
+    found = _made_equations(dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0), own, samples)
     _kept[key] = found
     while len(_kept) > 1 and sum(one.gram.nbytes for one in _kept.values()) > KEPT_MIB << 20:
         _kept.popitem(last=False)
@@ -326,21 +353,48 @@ def _assemble(
     model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
 ) -> tuple[_System, dict[str, FloatArray]]:
     """Sum of the normal equations of all series, and the mean of the features (p,) per antenna."""
-    width, noise = blocks[-1].stop if blocks else 0, model.noise_sd_db
+    noise = model.noise_sd_db
+    one, centre = _summed(model, series, blocks)
+    rows = sum(map(len, series))
+    scaled = _System(
+        one.gram / noise**2, one.right / noise**2, one.square / noise**2, one.log_det + rows * math.log(noise)
+    )
+    return scaled, centre
+
+
+_last_sum: dict[tuple[bytes, ...], tuple[_System, dict[str, FloatArray]]] = {}
+"""The last sum: a fit at another spread, or of another common scale, asks for it again."""
+
+
+def _summed(
+    model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
+) -> tuple[_System, dict[str, FloatArray]]:
+    """What :func:`_assemble` gives, with the noise as the unit."""
+    width = blocks[-1].stop if blocks else 0
+    own = [[b for b in blocks if b.antenna in (None, s.antenna)] for s in series]
+    keys = tuple(
+        _key(model, mine, s) + repr([b.start for b in mine]).encode() for mine, s in zip(own, series, strict=True)
+    )
+    if keys in _last_sum:
+        return _last_sum[keys]
     gram, right, square, log_det = np.zeros((width, width)), np.zeros(width), 0.0, 0.0
     total = {s.antenna: np.zeros(width) for s in series}
     count = dict.fromkeys(total, 0)
-    for samples in series:
-        own, columns = _columns(blocks, samples.antenna)
-        one = _series_equations(model, own, samples)
-        gram[np.ix_(columns, columns)] += one.gram
-        right[columns] += one.right
+    for samples, mine in zip(series, own, strict=True):
+        one = _series_equations(model, mine, samples)
+        runs = _runs(mine)
+        for rows, from_row in runs:
+            for columns, from_column in runs:
+                gram[rows, columns] += one.gram[from_row, from_column]
+            right[rows] += one.right[from_row]
+            total[samples.antenna][rows] += one.rows * one.mean[from_row]
         square += one.square
-        log_det += one.log_det + one.rows * math.log(noise)
-        total[samples.antenna][columns] += one.rows * one.mean
+        log_det += one.log_det
         count[samples.antenna] += one.rows
     centre = {antenna: total[antenna] / count[antenna] for antenna in total}
-    return _System(gram / noise**2, right / noise**2, square / noise**2, log_det), centre
+    _last_sum.clear()
+    _last_sum[keys] = _System(gram, right, square, log_det), centre
+    return _last_sum[keys]
 
 
 def _scale(blocks: Sequence[_Block], model: GainModel) -> FloatArray:
@@ -583,9 +637,9 @@ def choose_model(
     coarse = dataclasses.replace(model, bin_s=model.bin_s * max(1, math.ceil(total / MOST_ROWS)))
     folds = _folds(series)
     errors: dict[float, float] = {}
-    for factor in spreads if folds else ():
-        tried = _with_spread(coarse, factor)
-        squares = [_left_out_squares(train, test, tried) for train, test in folds]
+    # one fold after the other: all factors share its equations
+    found = [[_left_out_squares(train, test, _with_spread(coarse, f)) for f in spreads] for train, test in folds]
+    for factor, squares in zip(spreads, zip(*found, strict=True), strict=False):
         if rows := sum(n for _, n in squares):
             errors[factor] = float(np.sqrt(sum(square for square, _ in squares) / rows))
     best = min(errors, key=lambda f: errors[f]) if errors else 1.0

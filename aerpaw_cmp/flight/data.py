@@ -175,7 +175,15 @@ def ground_nodes(
         height = node.antenna_height_m
         if node.height == "logged":
             height = found.height_m
-        towers[name] = Tower(name, latitude, longitude, float(east[0]), float(north[0]), height, source=source)
+        towers[name] = Tower(
+            name=name,
+            latitude_deg=latitude,
+            longitude_deg=longitude,
+            east_m=float(east[0]),
+            north_m=float(north[0]),
+            antenna_height_m=height,
+            source=source,
+        )
     return dataclasses.replace(site, towers=towers), nodes
 
 

@@ -186,7 +186,7 @@ def run_explain(
     paths = _paths(data.site, rt, found, link, pose, source)
     differences = None
     if engine == "both":
-        differences = tuple(_differences(data, rt, found, link, pose, source, progress))
+        differences = tuple(_differences(data.site, rt, found, link, pose, source, progress))
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
     if found.pairs_differ is not None and found.pairs_differ.any():
@@ -361,22 +361,22 @@ def _elsewhere(found: Replay) -> str:
 
 
 def _differences(
-    data: FlightData, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
+    site: Site, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
 ) -> Iterator[OtherEngine]:
     """Paths of one engine that the other has not, both ways, with the reason."""
     engines = {found.engine: found}
     for name in ("image", "sionna"):
         if name not in engines:
-            engines[name] = replay_poses(data.site, rt, link, pose, engine=name, progress=progress)  # type: ignore[arg-type]
+            engines[name] = replay_poses(site, rt, link, pose, engine=name, progress=progress)  # type: ignore[arg-type]
     ours, theirs = engines["image"], engines["sionna"]
     target = pose.position_m[0]
     mine, others = _by_plane(ours, theirs)
-    explained = {p.planes: p for p in _paths(data.site, rt, ours, link, pose, source)}
+    explained = {p.planes: p for p in _paths(site, rt, ours, link, pose, source)}
     missing = [key for key in mine if key not in others]
     more: set[tuple[int, ...]] = set()
     if missing:
         wide = rt.model_copy(update={"samples": MORE_SAMPLES * max(theirs.samples, 1), "cache": False})
-        more = set(_by_plane(ours, replay_poses(data.site, wide, link, pose, engine="sionna", progress=progress))[1])
+        more = set(_by_plane(ours, replay_poses(site, wide, link, pose, engine="sionna", progress=progress))[1])
     for key in missing:
         path = explained[mine[key]]
         if near_an_edge(ours.faces, source, target, path, ours.surfaces):
@@ -386,7 +386,7 @@ def _differences(
         else:
             reason = f"not found with {MORE_SAMPLES * theirs.samples} samples either: a small face or a weak reflection"
         yield OtherEngine(found_by="image", path=path.words, level_dbm=_level(path.level_dbm), reason=reason)
-    levels = {p.planes: p for p in _paths(data.site, rt, theirs, link, pose, source)}
+    levels = {p.planes: p for p in _paths(site, rt, theirs, link, pose, source)}
     for key, sequence in others.items():
         if key in mine:
             continue

@@ -40,6 +40,12 @@ CONNECT_S = 10.0
 RECONNECT_S = 60.0
 """How long a scheduler that went away is waited for."""
 
+NO_WORKER_S = 30.0
+"""A scheduler that has had no worker for so long is spoken of, again and again."""
+
+_LOOKED_S = 2.0
+"""How often workers are counted."""
+
 _MEMORY_SHARE = 0.85
 """Of the machine's memory (or of the container's), shared by the workers of this machine."""
 
@@ -197,10 +203,11 @@ class Cluster:
         active: dict[Any, int] = {}
         killed: list[int] = []
         came = threading.Event()
-        window, looked = self.count, time.monotonic()
+        window, looked, seen = self.count, time.monotonic(), time.monotonic()
         while waiting or active:
-            if time.monotonic() - looked > 2.0:  # workers may join and leave
+            if time.monotonic() - looked > _LOOKED_S:  # workers may join and leave
                 window, looked = self.count, time.monotonic()
+                seen = self._looked_for_workers(seen)
             try:
                 while waiting and len(active) < 2 * window + 2:
                     number = waiting.popleft()
@@ -233,6 +240,17 @@ class Cluster:
                 active.clear()
                 self._reconnect()
         return killed
+
+    def _looked_for_workers(self, seen_s: float) -> float:
+        """When a worker was last there, or its absence was last told [s]."""
+        if self._client.status == "running" and not self._client.nthreads():
+            if time.monotonic() - seen_s < NO_WORKER_S:
+                return seen_s
+            place = f" at {self._address}" if self._address else ""
+            self._progress(
+                f"no worker is with the scheduler{place} since {NO_WORKER_S:.0f} s: waiting; what was finished is kept"
+            )
+        return time.monotonic()
 
     def _reconnect(self) -> None:
         """Wait for the scheduler to come back; InputError where it does not."""

@@ -281,7 +281,14 @@ class Framer:
         if self._open is None:
             raise ValueError("no command in flight")
         now, self._open = self._open, None
-        answer = Answer(now.command, tuple(now.lines), status, None, tuple(now.flags), self._buffer.peek())
+        answer = Answer(
+            command=now.command,
+            lines=tuple(now.lines),
+            status=status,
+            code=None,
+            flags=tuple(now.flags),
+            partial=self._buffer.peek(),
+        )
         self._echo_seen = now.echoed  # a reset modem may have stopped echoing
         if status == "lost":
             for _ in self._buffer.flush():

@@ -259,10 +259,10 @@ def held_out_study(
     space = OrdinaryKriging(in_space, neighbours, np.inf, vertical_scale=scale)
     sizes = tuple(size for size in learning_sizes if size < len(grid))
     return HeldOutStudy(
-        blocked(wide, points, values, block_m),
-        altitude_held_out(space, points, altitudes_m, values),
-        scale,
-        None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
-        sizes,
-        learning_curve(wide, points, values, sizes, seed=seed),
+        blocked=blocked(wide, points, values, block_m),
+        altitude_held_out=altitude_held_out(space, points, altitudes_m, values),
+        vertical_scale=scale,
+        trajectory=None if trajectory_m is None else along_trajectory(wide, grid, values, trajectory_m),
+        learning_sizes=sizes,
+        learning_mae=learning_curve(wide, points, values, sizes, seed=seed),
     )

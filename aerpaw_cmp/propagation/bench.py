@@ -125,7 +125,9 @@ def speed_against_error(
     list of Row
         Image engine first: once Sionna is loaded the process stays larger.
     """
-    run = _Runner(site, link, poses, depth, tuple(ks), batch, progress or silent)
+    run = _Runner(
+        site=site, link=link, poses=poses, depth=depth, ks=tuple(ks), batch=batch, progress=progress or silent
+    )
     rows = [run.image(d) for d in depths]
     rows += [run.thinned(n) for n in thinning]
     for count in samples:

@@ -75,7 +75,14 @@ class _Facets:
         offset = np.einsum("fi,fi->f", normal, corners_m[:, 0])
         inward = np.cross(normal[:, None], np.roll(corners_m, -1, axis=1) - corners_m)
         inward /= np.linalg.norm(inward, axis=2, keepdims=True)
-        return cls(corners_m, normal, offset, number, inward, np.einsum("fki,fki->fk", inward, corners_m))
+        return cls(
+            corners_m=corners_m,
+            normal=normal,
+            offset_m=offset,
+            number=number,
+            inward=inward,
+            edge_m=np.einsum("fki,fki->fk", inward, corners_m),
+        )
 
     def contain(self, rows: IntArray, point_m: FloatArray, tolerance_m: float) -> BoolArray:
         """Whether points (n, 3) in the planes of the facets ``rows`` (n,) lie inside them."""
@@ -273,7 +280,16 @@ class _Search:
             sequence[:, int(self.before)] = number
             points[:, :depth] = vertices
             tree[:, int(self.before)] = number // FACES_PER_CROWN
-            pieces.append(PathSet(pose, np.full(len(pose), tower), np.full(len(pose), depth), sequence, points, tree))
+            pieces.append(
+                PathSet(
+                    pose=pose,
+                    tower=np.full(len(pose), tower),
+                    depth=np.full(len(pose), depth),
+                    faces=sequence,
+                    vertices_m=points,
+                    tree=tree,
+                )
+            )
         return merge(pieces, max_depth, None)
 
     def _height(self, point_m: FloatArray) -> FloatArray:
@@ -355,7 +371,14 @@ class _Beams:
         ray = corners - image
         falls, rises = (ray[:, 2] <= 0).any(axis=0), (ray[:, 2] >= 0).any(axis=0)
         floor = np.where(falls, -np.inf, corners[:, 2].min(axis=0))
-        return cls(lit, height[lit], image, ray, floor, np.where(rises, np.inf, corners[:, 2].max(axis=0)))
+        return cls(
+            facet=lit,
+            height_m=height[lit],
+            image_m=image,
+            ray_m=ray,
+            floor_m=floor,
+            ceiling_m=np.where(rises, np.inf, corners[:, 2].max(axis=0)),
+        )
 
 
 def _single_bounces(

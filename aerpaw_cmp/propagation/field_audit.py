@@ -128,7 +128,7 @@ def against_reference(
         reference = Reference(site, name, expected.link, expected.loss)
         for row in chosen:
             mine = np.flatnonzero((replay.paths.pose == row) & (replay.paths.tower == number))
-            link = _OneLink(reference, replay, poses, int(row), number, mine)
+            link = _OneLink(reference=reference, replay=replay, poses=poses, row=int(row), tower=number, mine=mine)
             total += link.paths_checked(max_depth, complete and site.dem is None)
             try:
                 total += link.field_checked(ks)
@@ -159,7 +159,14 @@ def impossible(site: Site, poses: Poses, replay: Replay, rows: IntArray, expecte
     for row in rows:
         tower = int(replay.paths.tower[row])
         reference = Reference(site, replay.towers[tower], expected.link, expected.loss)
-        link = _OneLink(reference, replay, poses, int(replay.paths.pose[row]), tower, np.array([row]))
+        link = _OneLink(
+            reference=reference,
+            replay=replay,
+            poses=poses,
+            row=int(replay.paths.pose[row]),
+            tower=tower,
+            mine=np.array([row]),
+        )
         sequence = link.sequence(int(row))
         if not replay.paths.off_crown[row] and (sequence is None or reference.verdict(sequence, link.target) is False):
             count += 1

@@ -139,7 +139,15 @@ def grow_paths(
     found: list[PathSet] = []
     effort = Effort()
     margin = SOLID_MARGIN if solids else 0.0
-    rules = _Rules(max_depth, 2.0 * surfaces.merge_m, END_M, margin, SIDE_M, beams, shadows)
+    rules = _Rules(
+        depth=max_depth,
+        clearance=2.0 * surfaces.merge_m,
+        end=END_M,
+        margin=margin,
+        side=SIDE_M,
+        beams=beams,
+        shadows=shadows,
+    )
     longest = np.broadcast_to(np.asarray(longest_m, dtype=np.float64), (len(sources_m), len(targets_m)))
     for tower, source in enumerate(sources_m):
         poses = _searched(source, targets_m, None if excluded is None else excluded[tower])
@@ -147,7 +155,14 @@ def grow_paths(
             continue
         front_only = np.full(len(surfaces), solids)
         mirrors = _mirrors(surfaces, None if usable is None else usable[tower], front_only)
-        one = _Search(mirrors, surfaces, source, targets_m[poses], longest[tower, poses], rules)
+        one = _Search(
+            mirrors=mirrors,
+            surfaces=surfaces,
+            source=source,
+            targets=targets_m[poses],
+            longest=longest[tower, poses],
+            rules=rules,
+        )
         found.append(_pad(one.direct(), poses, tower, max_depth))
         if max_depth:
             first, hidden = one.first_faces()
@@ -227,7 +242,14 @@ def estimate(
         if not len(poses) or not max_depth:
             continue
         mirrors = _mirrors(surfaces, None if usable is None else usable[tower], np.full(len(surfaces), solids))
-        one = _Search(mirrors, surfaces, source, targets_m[poses], longest[tower, poses], rules)
+        one = _Search(
+            mirrors=mirrors,
+            surfaces=surfaces,
+            source=source,
+            targets=targets_m[poses],
+            longest=longest[tower, poses],
+            rules=rules,
+        )
         return one.estimate(one.first_faces()[0], thread_count(threads)).times(len(sources_m) - tower)
     return None
 

@@ -123,7 +123,9 @@ class PathSet:
     def select(self, rows: AnyArray) -> PathSet:
         """The paths of a mask or of indices."""
         pose, tower, depth, tree = self.pose[rows], self.tower[rows], self.depth[rows], self.tree[rows]
-        return PathSet(pose, tower, depth, self.faces[rows], self.vertices_m[rows], tree)
+        return PathSet(
+            pose=pose, tower=tower, depth=depth, faces=self.faces[rows], vertices_m=self.vertices_m[rows], tree=tree
+        )
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:

@@ -250,7 +250,16 @@ def _fill(
     for name, shape, area in _parts(
         _without_overlaps(_parts_first(_without_duplicates(shapes["building"], actions), actions), actions), actions
     ):
-        result.buildings.append(Building(name, area, round(shape.height_m, 2), 0.0, shape.material, shape.source))
+        result.buildings.append(
+            Building(
+                name=name,
+                footprint=area,
+                height_m=round(shape.height_m, 2),
+                base_m=0.0,
+                material=shape.material,
+                source=shape.source,
+            )
+        )
     for name, shape, area in _parts(_first_keeps(_without_duplicates(shapes["forest"], actions), actions), actions):
         result.forests.append(Forest(name, area, trees_per_hectare, minimum_spacing_m, shape.source))
     for name, _, area in _parts(shapes["geofence"], actions):
@@ -494,7 +503,14 @@ def _higher_first(group: list[_Shape], actions: list[str]) -> list[_Shape]:
             continue
         same = next((h for j in higher if (h := home[j]) is not None and _alike(h, shape)), None)
         if same is None:
-            same = _Shape(shape.name, shape.source, free, shape.height_m, shape.stated, shape.material)
+            same = _Shape(
+                name=shape.name,
+                source=shape.source,
+                area=free,
+                height_m=shape.height_m,
+                stated=shape.stated,
+                material=shape.material,
+            )
             pieces[id(same)] = [free]
             if shape.area.area - free.area > 0.01:
                 actions.append(f"{shape.source}: the part under a higher building was cut away")

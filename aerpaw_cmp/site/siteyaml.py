@@ -602,7 +602,14 @@ def _building(model: BuildingModel, footprint: Polygon, dem: Dem | None) -> Buil
     base = model.base_m
     if dem is not None:  # a floor is level: the ground under the middle
         base += float(np.nan_to_num(dem.ground_m(footprint.centroid.x, footprint.centroid.y)))
-    return Building(model.name, footprint, model.height_m, base, model.material, model.source)
+    return Building(
+        name=model.name,
+        footprint=footprint,
+        height_m=model.height_m,
+        base_m=base,
+        material=model.material,
+        source=model.source,
+    )
 
 
 def _trees(

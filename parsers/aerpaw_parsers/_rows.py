@@ -176,13 +176,13 @@ class Rows:
         kept = tuple(stream for stream in streams if stream is not None)
         back = [text for stream in kept[:1] for text in _frames.steps_back(stream.frame)]
         return ReadResult(
-            self.reader,
-            kept,
-            self.lines,
-            len(self),
-            self.blank,
-            tuple(sorted(self.rejected, key=lambda line: line.number)),
-            tuple(dict.fromkeys([*self.warnings, *back])),
+            reader=self.reader,
+            streams=kept,
+            lines=self.lines,
+            accepted=len(self),
+            blank=self.blank,
+            rejected=tuple(sorted(self.rejected, key=lambda line: line.number)),
+            warnings=tuple(dict.fromkeys([*self.warnings, *back])),
         )
 
 
@@ -272,7 +272,19 @@ def built(
         rows, at, time, flag = rows[valid], at[valid], time[valid], flag[valid]
         column = {name: cells[valid] for name, cells in column.items()}
     return Rows(
-        reader, options, len(lines), rows, time, flag, column, blank, rejected, warnings, relative, at, lines.data
+        reader=reader,
+        options=options,
+        lines=len(lines),
+        row=rows,
+        time=time,
+        flag=flag,
+        columns=column,
+        blank=blank,
+        rejected=rejected,
+        warnings=warnings,
+        relative=relative,
+        at=at,
+        data=lines.data,
     )
 
 

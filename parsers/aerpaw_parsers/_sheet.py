@@ -252,4 +252,6 @@ def nothing(data: bytes, reader: str, reason: str) -> ReadResult:
     lines = _lines.split(data)
     left = np.flatnonzero(~lines.blank)
     rejected = tuple(lines.reject_all(left, reason))
-    return ReadResult(reader, (), len(lines), 0, len(lines) - len(left), rejected)
+    return ReadResult(
+        reader=reader, streams=(), lines=len(lines), accepted=0, blank=len(lines) - len(left), rejected=rejected
+    )

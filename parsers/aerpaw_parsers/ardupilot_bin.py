@@ -129,7 +129,14 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     place = series["POS"] if len(series["POS"].time_s) else gps
     column = place.columns
     if "Lat" not in column or "Lng" not in column:
-        return ReadResult("ardupilot_bin", (), count + len(damaged), 0, count, tuple(damaged))
+        return ReadResult(
+            reader="ardupilot_bin",
+            streams=(),
+            lines=count + len(damaged),
+            accepted=0,
+            blank=count,
+            rejected=tuple(damaged),
+        )
     altitude = column.get("RelHomeAlt", column.get("Alt", np.full(len(place.time_s), np.nan)))
     if "RelHomeAlt" not in column and len(altitude):
         altitude = altitude - altitude[0]

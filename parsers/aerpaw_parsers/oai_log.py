@@ -114,7 +114,7 @@ def _result(
         "rank", options.channel or "oai", beside, pick=reported, flag=flag, ri_base="one", source="CSI report, last one"
     )
     levels = [
-        _cells.Reading(int(i), "nr", np.nan, np.nan, value["rsrp"][i], True)
+        _cells.Reading(row=int(i), rat="nr", pci=np.nan, arfcn=np.nan, rsrp_dbm=value["rsrp"][i], serving=True)
         for i in np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
     ]  # a gNB prints 0 of 0 measurements
     return rows.result([rank, *_cells.streams(rows, levels, source="OpenAirInterface")])

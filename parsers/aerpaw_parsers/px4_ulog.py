@@ -127,7 +127,9 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     gps_name = gps_name if len(tables[gps_name]) else "sensor_gps"
     latitude, longitude, altitude = (_column(place, name) for name in ("lat", "lon", "alt"))
     if latitude is None or longitude is None or not len(place):
-        return ReadResult("px4_ulog", (), count + len(damaged), 0, count, tuple(damaged))
+        return ReadResult(
+            reader="px4_ulog", streams=(), lines=count + len(damaged), accepted=0, blank=count, rejected=tuple(damaged)
+        )
     height = np.full(len(place), np.nan) if altitude is None else altitude - _home(tables["home_position"], altitude)
     position = _series(
         place,

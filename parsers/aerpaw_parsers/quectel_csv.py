@@ -291,13 +291,13 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     kept = tuple(stream for stream in streams if stream is not None)
     warnings += [text for stream in kept[:1] for text in _frames.steps_back(stream.frame)]
     return ReadResult(
-        "quectel_csv",
-        kept,
-        len(lines),
-        sum(len(number) for number in numbers),
-        blank,
-        tuple(sorted(rejected + others, key=lambda line: line.number)),
-        tuple(dict.fromkeys(warnings)),
+        reader="quectel_csv",
+        streams=kept,
+        lines=len(lines),
+        accepted=sum(len(number) for number in numbers),
+        blank=blank,
+        rejected=tuple(sorted(rejected + others, key=lambda line: line.number)),
+        warnings=tuple(dict.fromkeys(warnings)),
     )
 
 

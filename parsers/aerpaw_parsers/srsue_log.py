@@ -20,8 +20,7 @@ _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *(?P<cc>\d{1,2}|lte|nr)"
     + _N % b"pci" + _N % b"rsrp" + _N % b"pl" + _N % b"cfo"
-    + rb" \|" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}\|[^\n]{0,80}$",
-    re.MULTILINE,
+    + rb" \|" + _N % b"mcs" + _N % b"snr" + rb"[^\n|]{0,80}\|[^\n]{0,80}$", re.MULTILINE,
 )  # fmt: skip
 
 
@@ -29,7 +28,15 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     rsrp, loss, snr, cfo, pci = (rows.si(name) for name in ("rsrp", "pl", "snr", "cfo", "pci"))
     rats = ["nr" if cc == "nr" else "lte" for cc in rows.text("cc")]
     readings = [
-        _cells.Reading(i, rats[i], pci[i], np.nan, rsrp[i], True, (np.nan, np.nan, snr[i], loss[i]))
+        _cells.Reading(
+            row=i,
+            rat=rats[i],
+            pci=pci[i],
+            arfcn=np.nan,
+            rsrp_dbm=rsrp[i],
+            serving=True,
+            beside=(np.nan, np.nan, snr[i], loss[i]),
+        )
         for i in range(len(rows))
     ]
     yield from _cells.streams(rows, readings, source="srsUE")

@@ -123,7 +123,9 @@ def _by_pattern(lines: _lines.Lines, done: IntArray) -> _Rows:
 def _at_once(lines: _lines.Lines) -> _Rows:
     """Rows of the two common layouts, plain numbers and times of 26 characters, without a loop over lines."""
     none = np.zeros(0, dtype=np.int64)
-    nothing = _Rows(none, np.empty((len(_NUMBERS), 0)), none, none > 0, none, none > 0)
+    nothing = _Rows(
+        line=none, number=np.empty((len(_NUMBERS), 0)), wall=none, valid=none > 0, offset_s=none, zoned=none > 0
+    )
     for count, time in ((14, 11), (8, 5), (9, 6)):
         found = _table.fields(lines, count)
         mine = found.width(time) == 26
@@ -147,7 +149,7 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         if not keep.all():
             rows, number, wall = rows[keep], number[:, keep], wall[keep]
         zero = np.zeros(len(rows), dtype=np.int64)
-        return _Rows(rows, number, wall, zero == 0, zero, zero > 0)
+        return _Rows(line=rows, number=number, wall=wall, valid=zero == 0, offset_s=zero, zoned=zero > 0)
     return nothing
 
 
@@ -196,13 +198,13 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
     warnings = [*instants.warnings, *warnings, *_frames.steps_back(frame)]
     stream = Stream("telemetry", "vehicle", frame, _frames.attributes(options, source="vehicleOut"))
     return ReadResult(
-        "vehicle_out",
-        (stream,) if len(frame) else (),
-        len(lines),
-        len(frame),
-        blank,
-        tuple(sorted(rejected, key=lambda line: line.number)),
-        tuple(warnings),
+        reader="vehicle_out",
+        streams=(stream,) if len(frame) else (),
+        lines=len(lines),
+        accepted=len(frame),
+        blank=blank,
+        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
+        warnings=tuple(warnings),
     )
 
 

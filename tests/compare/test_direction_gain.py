@@ -7,6 +7,7 @@ import pytest
 from scipy.spatial.distance import cdist
 
 from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.compare import direction_gain
 from aerpaw_cmp.compare.direction_gain import (
     PLACE_TERM,
     TOWER_TERMS,
@@ -85,10 +86,11 @@ def test_features_give_the_gaussian_kernel_of_the_chord(length):
     assert 0.999 < sum(gaussian_spectrum(length)) <= 1.0 + 1e-12
 
 
-def test_fit_equals_the_exact_gaussian_process():
+@pytest.mark.parametrize(("own_sd", "noise_sd"), [(1.0, 1.0), (3.0, 1.7)])
+def test_fit_equals_the_exact_gaussian_process(own_sd, noise_sd):
     """Against the dense textbook solution with the exact kernel, no harmonics."""
     train = [s.part(np.arange(0, len(s), 3)) for s in TRAIN[:2]]
-    model = dataclasses.replace(MODEL, bin_s=1.0)
+    model = dataclasses.replace(MODEL, bin_s=1.0, own_sd_db=own_sd, noise_sd_db=noise_sd)
     fit = fit_gain(train, model)
     body, mast = (np.concatenate([getattr(s, k) for s in train]) for k in ("at_uav", "at_tower"))
     where = np.concatenate([s.position_m for s in train])
@@ -99,7 +101,7 @@ def test_fit_equals_the_exact_gaussian_process():
         k = 2.5**2 * np.exp(-cdist(b1, b2, "sqeuclidean") / 0.5)
         return k + 3.0**2 * np.exp(-cdist(m1, m2, "sqeuclidean") / 0.32) * (s1[:, None] == s2[None])
 
-    own = (np.exp(-cdist(where, where) / 20.0) + 1e4) * same + np.eye(len(where))
+    own = (own_sd**2 * np.exp(-cdist(where, where) / 20.0) + 1e4) * same + noise_sd**2 * np.eye(len(where))
     y = np.concatenate([s.residual_db - s.residual_db.mean() for s in train])
     weights = np.linalg.solve(kernel(body, mast, series, body, mast, series) + own, y)
     for i, test in enumerate(TEST):
@@ -229,3 +231,38 @@ def test_directions_that_are_not_known_are_not_predicted():
     assert np.isnan(gain[:7]).all()
     assert np.isnan(sd[:7]).all()
     assert np.isfinite(gain[7:]).all()
+
+
+def test_what_is_kept_changes_nothing():
+    """Fits of other flights, of other strengths and with other knots in between: the numbers of a first fit."""
+    model = dataclasses.replace(MODEL, terms=(*TERMS, PLACE_TERM))
+    wanted = []
+    for kept in (False, True):
+        found = []
+        for series, tried in ((TRAIN, model), (TRAIN[:2], model), (TRAIN, MODEL), (TRAIN[2:], MODEL), (TRAIN, model)):
+            if not kept:
+                for store in (direction_gain._kept, direction_gain._kept_features, direction_gain._last_sum):
+                    store.clear()
+            for factor in (1.0, 1.9):
+                scaled = dataclasses.replace(tried, own_sd_db=factor, noise_sd_db=factor)
+                fit = fit_gain(series, scaled)
+                found += [fit.log_evidence, *fit.mean(series[0].part(np.arange(0, 30, 7)))]
+        wanted.append(found)
+    np.testing.assert_allclose(wanted[1], wanted[0], rtol=1e-9)
+
+
+def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():
+    """The difference of two strengths against Gaussian densities of the whole covariance."""
+    found, dense = [], []
+    for own_sd, noise_sd in ((1.0, 1.0), (2.4, 1.7)):
+        model = dataclasses.replace(MODEL, own_sd_db=own_sd, noise_sd_db=noise_sd)
+        found.append(fit_gain(TRAIN[:1], model).log_evidence)
+        s = TRAIN[0].binned(model.bin_s)
+        whole = 2.5**2 * np.exp(-cdist(s.at_uav, s.at_uav, "sqeuclidean") / 0.5)
+        whole += 3.0**2 * np.exp(-cdist(s.at_tower, s.at_tower, "sqeuclidean") / 0.32)
+        whole += own_sd**2 * np.exp(-cdist(s.position_m, s.position_m) / 20.0) + (100.0 * noise_sd) ** 2
+        whole[np.diag_indices(len(s))] += noise_sd**2
+        y = s.residual_db - s.residual_db.mean()
+        dense.append(-0.5 * (y @ np.linalg.solve(whole, y) + np.linalg.slogdet(whole)[1]))
+    assert found[1] - found[0] == pytest.approx(dense[1] - dense[0], abs=1.0)
+    assert abs(dense[1] - dense[0]) > 20.0

@@ -80,3 +80,53 @@ def test_without_dask_there_are_processes_and_a_line_says_so(monkeypatch: pytest
     monkeypatch.setattr(builtins, "__import__", without)
     with pytest.raises(UsageError, match=r"aerpaw-cmp\[cluster\]"), open_workers(1, "tcp://127.0.0.1:1"):
         pass
+
+
+class NoWorkers:
+    """A client of a scheduler that loses its last worker and gets one when its absence was told twice."""
+
+    status = "running"
+
+    def __init__(self, told: list[str]) -> None:
+        self._told = told
+
+    def nthreads(self) -> dict[str, int]:
+        return {} if len(self._told) < 2 else {"tcp://one": 1}
+
+    def submit(self, function: Any, item: Any, pure: bool) -> Any:
+        assert not pure
+        return Later(self, function(item))
+
+
+class Later:
+    """Done when a worker is there."""
+
+    status = "finished"
+
+    def __init__(self, client: NoWorkers, value: Any) -> None:
+        self._client, self._value = client, value
+
+    def add_done_callback(self, _call: Any) -> None:
+        """None is needed: the loop looks by itself."""
+
+    def done(self) -> bool:
+        return bool(self._client.nthreads())
+
+    def result(self) -> Any:
+        return self._value
+
+    def release(self) -> None:
+        """Nothing is held."""
+
+
+def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A season waited for half an hour without a word for workers that had given up while the machine was busy."""
+    monkeypatch.setattr(workers, "NO_WORKER_S", 0.1)
+    monkeypatch.setattr(workers, "_LOOKED_S", 0.05)
+    told: list[str] = []
+    crew = workers.Cluster(NoWorkers(told), "tcp://there", lambda text, _share=None: told.append(text))
+    found: dict[int, Any] = {}
+    crew.run(abs, [-2, 3], found.__setitem__)
+    assert found == {0: 2, 1: 3}
+    assert len(told) == 2
+    assert "no worker is with the scheduler at tcp://there" in told[0]

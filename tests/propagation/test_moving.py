@@ -112,3 +112,15 @@ def test_messages_of_blocks_are_counted_together():
     (text,) = found.left_out
     assert text.startswith("2 poses further than 100 km")
     assert np.isnan(found.rss_dbm[[3, 80]]).all()
+
+
+def test_a_place_that_is_visited_again_keeps_the_order_of_the_poses():
+    """Out and back: poses of one place lie far apart, and their paths stand where other parts look for them."""
+    way = np.concatenate([rover(N // 2), rover(N // 2)[::-1]])
+    found = replay_moving(SITE, LINK, poses(), way, max_depth=1)
+    assert (np.diff(found.paths.pose) >= 0).all()
+    for i in (3, N // 2 + 5, N - 4):
+        one = Poses(poses().position_m[i : i + 1], np.eye(3)[None])
+        alone = replay(site_with_tower_at(SITE, "LW1", way[i]), LINK, one, max_depth=1)
+        rows = slice(*np.searchsorted(found.paths.pose, [i, i + 1]))
+        np.testing.assert_allclose(found.paths.vertices_m[rows], alone.paths.vertices_m, rtol=1e-12)

@@ -124,7 +124,8 @@ def test_offsets_in_the_text(text: bytes, expected: str) -> None:
 
 
 @given(
-    st.lists(st.sampled_from([0, 1, 61, 3600, 86_400, 40_000_000]), min_size=1, max_size=12), st.sampled_from([0, 3])
+    st.lists(st.sampled_from([0, 1, 61, 3600, 86_400, 2_505_600, 40_000_000]), min_size=1, max_size=12),
+    st.sampled_from([0, 3]),
 )
 def test_times_that_come_back_are_read_like_times_alone(steps: list[int], fraction: int) -> None:
     """Runs of one minute are read once: a minute, a date that comes again later is a run of its own."""

@@ -357,13 +357,15 @@ def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
     try:
         with (
             dask.config.set(settings),
-            LocalCluster(
-                n_workers=workers,
-                threads_per_worker=1,
-                memory_limit=limit,
-                local_directory=scratch,
-                dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
-                silence_logs=50,
+            _closed_at_last(
+                LocalCluster(
+                    n_workers=workers,
+                    threads_per_worker=1,
+                    memory_limit=limit,
+                    local_directory=scratch,
+                    dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
+                    silence_logs=50,
+                )
             ) as local,
             Client(local, set_as_default=False) as client,
         ):
@@ -372,6 +374,20 @@ def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
             yield Cluster(client, progress=progress)
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+
+
+@contextlib.contextmanager
+def _closed_at_last(cluster: Any) -> Iterator[Any]:
+    """A cluster that is closed, whatever its closing says: all results are there by then.
+
+    One whose worker is just being started anew refuses to end it ("can only join a started process"); the worker ends
+    with this process.
+    """
+    try:
+        yield cluster
+    finally:
+        with contextlib.suppress(Exception):
+            cluster.close()
 
 
 def _quiet() -> None:

@@ -130,3 +130,15 @@ def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatc
     assert found == {0: 2, 1: 3}
     assert len(told) == 2
     assert "no worker is with the scheduler at tcp://there" in told[0]
+
+
+def test_a_cluster_that_cannot_be_closed_costs_no_result() -> None:
+    class Starting:
+        def close(self) -> None:
+            raise AssertionError("can only join a started process")
+
+    with workers._closed_at_last(Starting()):
+        found = 3
+    assert found == 3
+    with pytest.raises(KeyError, match="ours"), workers._closed_at_last(Starting()):
+        raise KeyError("ours")

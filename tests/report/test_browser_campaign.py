@@ -161,9 +161,12 @@ def test_pointing_at_a_flight_marks_it_everywhere(driver, data):
     rows = driver.find_elements("css selector", "#flights tbody tr")
     driver.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", rows[2])
     ActionChains(driver).move_to_element(rows[2]).perform()
-    frame(driver)
     name = rows[2].find_element("tag name", "th").text
     number = data.flights.index(name)
+    for _ in range(100):  # the pointer crosses other rows, and the page scrolls under it
+        frame(driver)
+        if driver.execute_script("return campaignExplorer.state.flight") == number:
+            break
     assert driver.execute_script("return campaignExplorer.state.flight") == number
     assert name in driver.find_element("id", "marked").text
     yellow = (

@@ -38,9 +38,7 @@ ROOT = Path(__file__).parents[1]
 EQUIVALENT = Path(__file__).with_name("mutation_equivalent.txt")
 _PHYSICS = "tests/propagation/"
 TARGETS: dict[str, tuple[str, ...]] = {
-    "aerpaw_cmp/common/units.py": (
-        "aerpaw_cmp/common/units.py", _PHYSICS + "test_channel.py", "tests/jobs/test_noise_floor.py"
-    ),
+    "aerpaw_cmp/common/units.py": ("aerpaw_cmp/common/units.py", "tests/common/test_units.py"),
     "aerpaw_cmp/propagation/arrays.py": (
         "aerpaw_cmp/propagation/arrays.py", _PHYSICS + "test_channel.py", _PHYSICS + "test_attitude_chain.py",
         _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
@@ -59,7 +57,8 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py",),
     "parsers/aerpaw_parsers/_lines.py": ("tests/parsers/test_law.py", "tests/parsers/test_formats.py"),
     "parsers/aerpaw_parsers/_rows.py": (
-        "tests/parsers/test_formats.py", "tests/parsers/test_base_stations.py", "tests/parsers/test_phones.py"
+        "tests/parsers/test_rows.py", "tests/parsers/test_formats.py", "tests/parsers/test_base_stations.py",
+        "tests/parsers/test_phones.py",
     ),
     "parsers/aerpaw_parsers/_time.py": ("tests/parsers/test_time.py", "tests/parsers/test_formats.py"),
     "parsers/aerpaw_parsers/vehicle_out.py": ("tests/parsers/test_formats.py", "tests/parsers/test_law.py"),
@@ -278,9 +277,9 @@ class Trials:
     got the changed code. What is no body of a function (constants, defaults, fields) is planted by a new import.
     """
 
-    def __init__(self, path: str, chosen: list[Mutant]) -> None:
-        self.path, self.chosen = path, chosen
-        self.found: list[tuple[Mutant, str, float]] = []
+    def __init__(self, path: str, chosen: list[Mutant], pipe: Any) -> None:
+        self.path, self.chosen, self.pipe = path, chosen, pipe
+        self.done = 0
         self.fault = ""
 
     def pytest_runtestloop(self, session: Any) -> bool:
@@ -301,7 +300,8 @@ class Trials:
                 limit = min(TIMEOUT_S, 20 + 10 * sum(s for s, _ in near))
                 tests = [items[k] for _, k in near]
                 kind = in_child(lambda one=mutant, at=place, those=tests: self._fails(one, at, those), limit)
-            self.found.append((mutant, kind, time.monotonic() - begin))
+            self.pipe.send((mutant, kind, time.monotonic() - begin))
+            self.done += 1
         return True
 
     def _reached(self, item: Any, after: Any) -> tuple[float, set[int]]:
@@ -446,25 +446,24 @@ def run(path: str, chosen: list[Mutant], account: Path | None, known: dict[str, 
     child = multiprocessing.get_context("fork").Process(target=_tried, args=(path, chosen, there))
     child.start()
     there.close()
-    found, fault = here.recv()
-    child.join()
-    if fault:
-        raise SystemExit(f"{path}: its tests fail without any change ({fault})")
     counts = {"killed": 0, "survived": 0, "equivalent": 0}
     survivors = []
-    for mutant, result, took in found:
-        if result.startswith("broken"):
-            raise SystemExit(f"{mutant.name}: {result}")
-        kind = "killed" if result.startswith("killed") else "survived"
-        if kind == "survived" and change_of(mutant) in known:
-            kind = "equivalent"
-        counts[kind] += 1
-        if kind == "survived":
-            survivors.append(f"{mutant.line}: {change_of(mutant)}")
-        row = {"mutant": mutant.name, "outcome": result, "as": kind, "seconds": round(took, 1)}
-        if account is not None:
-            with account.open("a", encoding="utf-8") as file:
-                file.write(json.dumps(row) + "\n")
+    with contextlib.suppress(EOFError):
+        while True:
+            mutant, result, took = here.recv()
+            if mutant is None or result.startswith("broken"):
+                raise SystemExit(f"{path if mutant is None else mutant.name}: {result}")
+            kind = "killed" if result.startswith("killed") else "survived"
+            if kind == "survived" and change_of(mutant) in known:
+                kind = "equivalent"
+            counts[kind] += 1
+            if kind == "survived":
+                survivors.append(f"{mutant.line}: {change_of(mutant)}")
+            row = {"mutant": mutant.name, "outcome": result, "as": kind, "seconds": round(took, 1)}
+            if account is not None:
+                with account.open("a", encoding="utf-8") as file:
+                    file.write(json.dumps(row) + "\n")
+    child.join()
     return {"path": path, **counts, "survivors": survivors}
 
 
@@ -472,9 +471,10 @@ def _tried(path: str, chosen: list[Mutant], pipe: Any) -> None:
     os.chdir(ROOT)
     sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
     importlib.import_module(module_name(path))  # before pytest, which would load the file for its doctests
-    trials = Trials(path, chosen)
+    trials = Trials(path, chosen, pipe)
     code = pytest_on(TARGETS[path], [trials])
-    pipe.send((trials.found, trials.fault or ("" if trials.found or not chosen else f"pytest ended with {code}")))
+    if trials.fault or trials.done < len(chosen):
+        pipe.send((None, f"its tests fail without any change: {trials.fault or f'pytest ended with {code}'}", 0.0))
     pipe.close()
     os._exit(0)
 

@@ -36,7 +36,7 @@ import psutil
 from season_flights import write_season
 
 from aerpaw_cmp.jobs import campaign as job
-from aerpaw_cmp.jobs.campaign_plan import kept_outcomes, run_tasks
+from aerpaw_cmp.jobs.campaign_plan import batched, kept_outcomes, run_tasks
 from aerpaw_cmp.jobs.campaign_tasks import Done, Order, carry_out
 from aerpaw_cmp.jobs.workers import Here, open_workers
 
@@ -169,9 +169,16 @@ def run_child(campaign: Path, keep: Path, address: str) -> None:
     result(campaign, keep, scheduler=address, progress=lambda text, share=None: None if share else print(f"  {text}"))
 
 
-def nothing(order: Order) -> Done:
-    """The shape of a task without its work."""
-    return Done(outcome=None, host=order.task.flight)
+def nothing(orders: tuple[Order, ...]) -> list[Done]:
+    """The shape of a batch of tasks without its work."""
+    return [Done(outcome=None, host=order.task.flight) for order in orders]
+
+
+def as_sent(orders: dict[int, Order], count: int) -> list[tuple[Order, ...]]:
+    """So many orders in batches, as a campaign of that size sends them to two workers."""
+    some = list(orders.values())
+    many = dict(enumerate((some * -(-count // len(some)))[:count]))
+    return [tuple(many[number] for number in batch) for batch in batched(many, 2)]
 
 
 def overhead(campaign: Path, folder: Path) -> bool:
@@ -191,12 +198,14 @@ def overhead(campaign: Path, folder: Path) -> bool:
     around = statistics.mean(outer[1:]) - task
     cluster = Cluster(2)
     with open_workers(2, cluster.address) as crew:
-        crew.run(nothing, list(orders.values()) * 4, lambda *_: None)  # warm
+        crew.run(nothing, as_sent(orders, 100), lambda *_: None)  # warm
         count, before, start = 1000, cluster.cpu_s(), time.process_time()
-        crew.run(nothing, (list(orders.values()) * -(-count // len(orders)))[:count], lambda *_: None)
+        crew.run(nothing, as_sent(orders, count), lambda *_: None)
         here, there = (time.process_time() - start) / count, (cluster.cpu_s() - before) / count
     cluster.close()
     whole = around + taking + here + there
+    sent = as_sent(orders, count)
+    print(f"{count / len(sent):.1f} tasks an order. ", end="")
     print(f"a task: {1e3 * task:.0f} CPU ms. Around it: key and store {1e3 * around:.1f} ms, taking it from the store")
     print(
         f"{1e3 * taking:.1f} ms, this process {1e3 * here:.1f} ms, scheduler and worker {1e3 * there:.1f} ms: ", end=""
@@ -216,7 +225,7 @@ def memory(campaign: Path, folder: Path, count: int) -> bool:
         seen[len(seen) + 1] = process.memory_info().rss / 2**20 if len(seen) % 100 == 0 else np.nan
 
     with open_workers(2, cluster.address) as crew:
-        crew.run(nothing, (list(orders.values()) * -(-count // len(orders)))[:count], done)
+        crew.run(nothing, as_sent(orders, count), done)
     cluster.close()
     known = {number: size for number, size in seen.items() if np.isfinite(size)}
     sizes = list(known.values())

@@ -232,3 +232,17 @@ def test_records_of_many_fields_are_built_by_keyword() -> None:
     found = {p.name: lines for p, tree in trees.items() if (lines := built_by_position(tree, {*classes, "cls"}, 5))}
     assert found == {}
     assert built_by_position(ast.parse("x = m.Link(1, 2, 3)\ny = Link(1, 2, c=3)"), {"Link"}, 2) == [(1, "Link")]
+
+
+def private_imports(tree: ast.AST) -> list[str]:
+    """Names with one underscore in front that a module takes from another."""
+    taken = [alias.name for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names]
+    return [name for name in taken if name.startswith("_") and not name.startswith("__")]
+
+
+def test_no_module_takes_a_private_name_of_another() -> None:
+    """A private module of a package may be imported (the parsers share some); a private name of a module may not."""
+    found = {path.name: names for path in modules() if (names := private_imports(parsed(path)))}
+    own = {path.stem for path in (ROOT / "parsers" / "aerpaw_parsers").glob("_*.py")}
+    assert {name: left for name, names in found.items() if (left := set(names) - own)} == {}
+    assert private_imports(ast.parse("from .replay import Replay, _poses\nfrom . import __version__")) == ["_poses"]

@@ -22,10 +22,12 @@ def input_files(settings: BaseModel, path: Path, logs_root: Path | None = None) 
 def named_files(content: Any, roots: Sequence[Path]) -> Iterator[tuple[str, str, Path]]:
     """Dotted key, text and place of every value that names a file."""
     for key, text in _texts(content, ""):
+        if not text or "\0" in text:
+            continue
         for root in roots:
-            place = root / text
-            if text and "\0" not in text and os.path.isfile(place):  # noqa: PTH113  never raises
-                yield key, text, place
+            # most texts name nothing: a Path is made of those that do
+            if os.path.isfile(os.path.join(root, text)):  # noqa: PTH113, PTH118  never raises
+                yield key, text, root / text
                 break
 
 

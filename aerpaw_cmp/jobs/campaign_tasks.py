@@ -8,6 +8,7 @@ import platform
 import sys
 import time
 import traceback
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from datetime import datetime, timezone
 from functools import cache, lru_cache
@@ -181,11 +182,11 @@ def carry_out(order: Order) -> Done:
     if store is not None and order.key is not None and store.sound(order.key):
         return Done(outcome=None, host=platform.node())
     facts, trouble = _checked(order)
-    start, cpu = time.perf_counter(), time.process_time()
+    start, cpu = time.perf_counter(), _cpu_s()
     tried, outcome = 1, trouble or run_task(task)
     while trouble is None and outcome.failure is not None and tried < TRIES:
         tried, outcome = tried + 1, run_task(task)
-    seconds, cpu_s = time.perf_counter() - start, time.process_time() - cpu
+    seconds, cpu_s = time.perf_counter() - start, _cpu_s() - cpu
     links = sum(len(row.measured_db) for row in outcome.rss) + sum({row.tower: row.n for row in outcome.rank}.values())
     done = Done(outcome=outcome, seconds=seconds, cpu_s=cpu_s, links=links, host=platform.node())
     if store is None or order.key is None:
@@ -205,6 +206,11 @@ def carry_out(order: Order) -> Done:
     return dataclasses.replace(done, outcome=None) if store.save(order.key, outcome, manifest) else done
 
 
+def carry_out_all(orders: Sequence[Order]) -> list[Done]:
+    """:func:`carry_out` of one order after the other; each outcome is kept as soon as its task ends."""
+    return [carry_out(order) for order in orders]
+
+
 def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
     """What the task depends on as this process sees it, and its failure where that is something else."""
     if order.key is None:
@@ -214,6 +220,12 @@ def _checked(order: Order) -> tuple[Facts | None, Outcome | None]:
     except (AerpawCmpError, OSError) as error:
         return None, _failed(order.task, f"an input can no longer be read: {error}", error)
     return facts, None if facts.key == order.key else _not_the_same(order.task)
+
+
+def _cpu_s() -> float:
+    """Processor time of this process and of those that it waited for."""
+    spent = os.times()
+    return time.process_time() + spent.children_user + spent.children_system
 
 
 @cache

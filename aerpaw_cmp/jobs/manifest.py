@@ -5,6 +5,7 @@ Whatever text of the flight file or of the site file names a file is one (:mod:`
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 from functools import lru_cache
 from importlib import resources
@@ -37,12 +38,12 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
     """
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
-    found = {flight.resolve(): _entry(flight.name, flight, "flight file")}
+    found = {os.path.realpath(flight): _entry(flight.name, flight, "flight file")}
     for key, text, place in named_files(content, roots):
         if key != "site.file":
-            found.setdefault(place.resolve(), _entry(text, place, key))
+            found.setdefault(os.path.realpath(place), _entry(text, place, key))
     for entry, place in _site_inputs(settings.site.file, flight.parent):
-        found.setdefault(place.resolve(), entry)
+        found.setdefault(os.path.realpath(place), entry)
     return tuple(found.values())
 
 
@@ -72,7 +73,21 @@ def _site_model(site: str | Path, _size: int, _mtime_ns: int) -> Any:
     return site_model(site)
 
 
+@lru_cache(maxsize=1024)
+def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
+    """SHA-256 of a file as it was when its size and time were those: a campaign asks with every task."""
+    return file_digest(place)
+
+
 def _entry(name: str, place: Path, role: str) -> InputFile:
+    found = os.stat(place)  # noqa: PTH116
     return InputFile(
-        path=name, sha256=file_digest(place), reader="", lines=0, accepted=0, rejected=0, blank=0, role=role
+        path=name,
+        sha256=digest_of(place, found.st_size, found.st_mtime_ns),
+        reader="",
+        lines=0,
+        accepted=0,
+        rejected=0,
+        blank=0,
+        role=role,
     )

@@ -9,7 +9,6 @@ import io
 import json
 import math
 import os
-import zlib
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
@@ -20,12 +19,12 @@ from typing import Any
 import numpy as np
 
 from ..common.files import seal, unseal
-from ..common.outputs import file_digest
+from ..common.units import AnyArray
 from ..flight.settings import FlightFile
-from .manifest import other_inputs
+from .manifest import digest_of, other_inputs
 from .place import Place, open_place
 
-LAYOUT = 3
+LAYOUT = 4
 """Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
@@ -68,7 +67,7 @@ class OutcomeStore:
             )
             return None
         with np.load(io.BytesIO(content), allow_pickle=False) as parts:
-            return self._decode(json.loads(str(parts["content"])), zlib.decompress(parts["arrays"].tobytes()))
+            return self._decode(json.loads(parts["content"].tobytes()), _Packed(parts["arrays"]))
 
     def _knows(self, value: Any) -> bool:
         """Whether :meth:`load` could give a record back."""
@@ -76,17 +75,16 @@ class OutcomeStore:
 
     def save(self, key: str, outcome: Any, manifest: Mapping[str, Any] | None = None) -> bool:
         """Write an entry whole or not at all, then its manifest; False where the place does not take it."""
-        arrays = io.BytesIO()
-        content = json.dumps(self._encode(outcome, arrays))
-        packed = np.frombuffer(zlib.compress(arrays.getbuffer(), level=1), dtype=np.uint8)
+        packed = _Packed()
+        content = np.frombuffer(json.dumps(self._encode(outcome, packed)).encode(), dtype=np.uint8)
         entry = io.BytesIO()
-        np.savez(entry, content=np.array(content), arrays=packed)
+        np.savez(entry, content=content, arrays=packed.bytes())
         sealed = seal(entry.getvalue(), _SEAL)
         try:
             self.place.write(f"{key}.npz", sealed)
             if manifest is not None:
                 whole = {**manifest, "sha256": hashlib.sha256(sealed).hexdigest(), "bytes": len(sealed)}
-                self.place.write(f"{key}.json", (json.dumps(whole, indent=1, default=str) + "\n").encode())
+                self.place.write(f"{key}.json", _text(whole))
         except OSError:
             return False
         self.place.remove(f"{key}.failed.json")
@@ -95,7 +93,7 @@ class OutcomeStore:
     def save_failure(self, key: str, manifest: Mapping[str, Any]) -> None:
         """Remember that a task failed, and how; it is never taken for an outcome."""
         with contextlib.suppress(OSError):
-            self.place.write(f"{key}.failed.json", (json.dumps(manifest, indent=1, default=str) + "\n").encode())
+            self.place.write(f"{key}.failed.json", _text(manifest))
 
     def manifests(self, keys: Iterable[str], *, failed: bool = False) -> dict[str, dict[str, Any]]:
         """What stands beside the outcomes (or failures) of some keys, where it can be read."""
@@ -122,18 +120,18 @@ class OutcomeStore:
             return True
         return False
 
-    def _encode(self, value: Any, arrays: io.BytesIO) -> Any:
+    def _encode(self, value: Any, arrays: _Packed) -> Any:
+        if value is None or type(value) in _AS_THEY_ARE:
+            return value
         if dataclasses.is_dataclass(value) and not isinstance(value, type):
             if not self._knows(value):
                 raise TypeError(f"{type(value).__name__} is no record that an outcome may hold")
-            fields = {f.name: self._encode(getattr(value, f.name), arrays) for f in dataclasses.fields(value) if f.init}
+            fields = {name: self._encode(getattr(value, name), arrays) for name in _field_names(type(value))}
             return {"is": type(value).__name__, "of": fields}
         if isinstance(value, np.ndarray):
             if value.dtype.hasobject:
                 raise TypeError("an outcome holds no arrays of objects")
-            place = {"from": arrays.tell(), "kind": value.dtype.str, "shape": value.shape}
-            arrays.write(np.ascontiguousarray(value).tobytes())
-            return {"is": "array", "of": place}
+            return {"is": "array", "of": arrays.put(value)}
         if isinstance(value, (tuple, list)):
             return {"is": type(value).__name__, "of": [self._encode(item, arrays) for item in value]}
         if isinstance(value, Mapping):
@@ -141,22 +139,73 @@ class OutcomeStore:
             return {"is": "dict", "of": pairs}
         return value.item() if isinstance(value, np.generic) else value
 
-    def _decode(self, value: Any, arrays: bytes) -> Any:
+    def _decode(self, value: Any, arrays: _Packed) -> Any:
         if not isinstance(value, dict):
             return value
         kind, content = value["is"], value["of"]
         if kind == "array":
-            count = math.prod(content["shape"])
-            if not count:
-                return np.zeros(content["shape"], dtype=content["kind"])
-            flat = np.frombuffer(arrays, dtype=content["kind"], count=count, offset=content["from"])
-            return flat.reshape(content["shape"]).copy()
+            return arrays.get(content["from"], content["kind"], tuple(content["shape"]))
         if kind in ("tuple", "list"):
             items = [self._decode(item, arrays) for item in content]
             return tuple(items) if kind == "tuple" else items
         if kind == "dict":
             return {self._decode(k, arrays): self._decode(v, arrays) for k, v in content}
         return self._types[kind](**{name: self._decode(item, arrays) for name, item in content.items()})
+
+
+class _Packed:
+    """Arrays one after the other, each once: channels of a tower share times and places, half of all that is kept.
+
+    Parameters
+    ----------
+    content : (bytes,) uint8, optional
+        As :meth:`bytes` gave it.
+    """
+
+    def __init__(self, content: AnyArray | None = None) -> None:
+        self._content = content
+        self._parts: list[bytes] = []
+        self._size = 0
+        self._known: dict[Any, Any] = {}
+
+    def put(self, array: AnyArray) -> dict[str, Any]:
+        """Where an array lies."""
+        raw = np.ascontiguousarray(array).tobytes()
+        start = self._known.setdefault(raw, self._size)
+        if start == self._size and raw:
+            self._parts.append(raw)
+            self._size += len(raw)
+        return {"from": start, "kind": array.dtype.str, "shape": array.shape}
+
+    def bytes(self) -> AnyArray:
+        """All of them."""
+        return np.frombuffer(b"".join(self._parts), dtype=np.uint8)
+
+    def get(self, start: int, kind: str, shape: tuple[int, ...]) -> AnyArray:
+        """The array that was put; the same one for those that were equal."""
+        count = math.prod(shape)
+        if self._content is None or not count:
+            return np.zeros(shape, dtype=kind)
+        key = (start, kind, shape)
+        if key not in self._known:
+            size = count * np.dtype(kind).itemsize
+            self._known[key] = self._content[start : start + size].copy().view(kind).reshape(shape)
+        found: AnyArray = self._known[key]
+        return found
+
+
+_AS_THEY_ARE = frozenset({str, int, float, bool})
+
+
+@cache
+def _field_names(kind: type) -> tuple[str, ...]:
+    return tuple(field.name for field in dataclasses.fields(kind) if field.init)
+
+
+def _text(manifest: Mapping[str, Any]) -> bytes:
+    """A manifest as JSON, a line per entry: indented, it would cost as much as all else that keeps an outcome."""
+    lines = [f"{json.dumps(str(key))}: {json.dumps(value, default=str)}" for key, value in manifest.items()]
+    return ("{\n" + ",\n".join(lines) + "\n}\n").encode()
 
 
 def records_of(*modules: ModuleType) -> set[type]:
@@ -209,12 +258,7 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
 
 def _content(path: Path) -> str:
     found = os.stat(path)  # noqa: PTH116  the times make the key of the cache
-    return _digest_of(path, found.st_size, found.st_mtime_ns)
-
-
-@cache
-def _digest_of(path: Path, _size: int, _mtime_ns: int) -> str:
-    return file_digest(path)
+    return digest_of(path, found.st_size, found.st_mtime_ns)
 
 
 _ROOMS_ASIDE = ("cli/", "live/", "maps/", "report/", "__main__.py")

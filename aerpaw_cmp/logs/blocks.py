@@ -27,10 +27,14 @@ from .records import Attribute, ReadResult, RejectedLine, Stream
 if TYPE_CHECKING:
     import pandas as pd
 
-BLOCK_BYTES = 4 << 20
+BLOCK_BYTES = 2 << 20
+"""What a step over such a block needs is taken and given back without a question to the system."""
 FROM_BYTES = 24 << 20
 """Smaller files are read in one piece."""
-_CHUNK = 4 << 20
+_CHUNK = 2 << 20
+_KEPT_BYTES = 31 << 20
+"""Taken and given back once, unwritten: from then on the C library keeps (up to twice) as much for the next step,
+instead of giving each block's arrays back to the system and asking for them again, page by page."""
 _AT_ONCE = 1 << 20
 """Rows that a step over a whole column takes at a time: what it needs beside the column stays small."""
 _ROOM = 1 << 22
@@ -103,6 +107,7 @@ def by_lines(
     """
 
     def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+        np.empty(_KEPT_BYTES, dtype=np.uint8)
         gathered = Gathered()
         top_of = None if head is None else lambda data: head(data, options)
         before: tuple[bytes, ReadResult | None] = b"", None
@@ -178,23 +183,41 @@ def _blocks(
         size += len(chunk)
         if size < enough:
             continue
-        data = b"".join(parts)
-        cut = _cut(data, apart)
+        data, rest = _joined_to_cut(parts, apart if begun or head is None else _NEVER)
+        cut: int | None = len(data)
+        if rest is None:
+            cut = _cut(data, apart)
         if cut is not None and (cut <= len(front) or (not begun and head is not None and head(data) > cut)):
             cut = None
         if cut is None:  # one run of suppressed samples, or one line: more is needed
-            parts, size, enough = [data], len(data), 2 * size
+            parts, enough = [data, rest or b""], 2 * size
             continue
-        yield front, data[:cut]
+        if rest is None:
+            data, rest = data[:cut], data[cut:]
+        yield front, data
         if not begun and head is not None:
-            top = data[: head(data)]
+            top = data[: head(data + rest)]
         kept = [_last_line(p, data, len(front), cut) or line for p, line in zip(keep, kept, strict=True)]
         last = data[data.rfind(b"\n", 0, cut - 1) + 1 : cut] if apart is not None else b""
         front = _front(top, kept, last)
-        begun, parts, size, enough = True, [front, data[cut:]], len(data) - cut, BLOCK_BYTES
+        begun, parts, size, enough = True, [front, rest], len(rest), BLOCK_BYTES
     data = b"".join(parts)
     if len(data) > len(front) or not begun:
         yield front, data
+
+
+_NEVER = re.compile(b"(?!)")
+_TAIL = 1 << 16
+
+
+def _joined_to_cut(parts: Sequence[bytes], apart: re.Pattern[bytes] | None) -> tuple[bytes, bytes | None]:
+    """The pieces as one up to the cut, and the rest: one copy, where the last piece shows a cut near its end."""
+    last = parts[-1]
+    begin = max(len(last) - _TAIL, 0)
+    cut = _cut(last[begin:], apart)
+    if cut is None:
+        return b"".join(parts), None
+    return b"".join([*parts[:-1], memoryview(last)[: begin + cut]]), last[begin + cut :]
 
 
 def _front(top: bytes, kept: Sequence[bytes], last: bytes) -> bytes:

@@ -90,6 +90,22 @@ class Lines:
         return np.asarray(self.buffer[self.starts[numbers][:, None] + np.arange(width)])
 
 
+SLICE = 1 << 17
+"""Bytes that a look at each byte takes at a time: they stay in the processor's cache."""
+
+
+def places(buffer: AnyArray, one: int, other: int | None = None) -> IntArray:
+    """Where one of two bytes stands, shape (n,)."""
+    found = []
+    for first in range(0, len(buffer), SLICE):
+        piece = buffer[first : first + SLICE]
+        mask = piece == one
+        if other is not None:
+            mask |= piece == other
+        found.append(np.flatnonzero(mask) + first)
+    return np.concatenate(found).astype(np.int64, copy=False) if found else np.zeros(0, dtype=np.int64)
+
+
 def split(data: bytes) -> Lines:
     r"""Cut a file into lines.
 
@@ -99,7 +115,7 @@ def split(data: bytes) -> Lines:
     [b'a', b'', b'b']
     """
     buffer = np.frombuffer(data, dtype=np.uint8)
-    ends = np.flatnonzero(buffer == 10).astype(np.int64)
+    ends = places(buffer, 10)
     starts = np.empty(len(ends) + 1, dtype=np.int64)
     starts[0] = 0
     np.add(ends, 1, out=starts[1:])

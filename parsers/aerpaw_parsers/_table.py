@@ -15,10 +15,9 @@ import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 
+from . import _lines
 from ._lines import Lines
 
-_SLICE = 1 << 17
-"""Bytes that a look at each byte takes at a time: they stay in the processor's cache."""
 _LONGEST = 400
 """Longer lines hold numbers that the pattern of numbers does not take."""
 _PLAIN = b"0123456789+-.eE,\r\n"
@@ -86,7 +85,7 @@ class Fields:
 def fields(lines: Lines, count: int, separator: int = 44) -> Fields:
     """Fields of all lines that have exactly ``count`` of them; quotes mean nothing here."""
     buffer = lines.buffer
-    places = np.flatnonzero((buffer == separator) | (buffer == 10))
+    places = _lines.places(buffer, separator, 10)
     stop = np.append(lines.starts[1:], len(buffer) + lines.unterminated) - 1  # line ends, CRs not looked at
     if lines.unterminated:
         places = np.append(places, len(buffer))
@@ -179,8 +178,8 @@ def numbers(
 def _bare_point(data: bytes) -> bool:
     """Whether a point stands behind anything but a digit: pandas reads '.5', the pattern of numbers does not."""
     buffer = np.frombuffer(data, dtype=np.uint8)
-    for first in range(0, len(buffer) - 1, _SLICE):
-        piece = buffer[first : first + _SLICE + 1]
+    for first in range(0, len(buffer) - 1, _lines.SLICE):
+        piece = buffer[first : first + _lines.SLICE + 1]
         point = piece[1:] == 46
         point &= (piece[:-1] - np.uint8(48)) > 9
         if point.any():

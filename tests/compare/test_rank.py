@@ -369,3 +369,23 @@ def test_a_period_is_taken_when_19_of_20_changes_fall_on_it():
         for at in sorted(changes + odd):
             now[at:] = 3.0 - now[at]
         assert stale_reports(np.arange(400) * 0.1, now).verdict == verdict
+
+
+def test_each_interval_is_that_of_its_own_number():
+    rng = np.random.default_rng(23)
+    one = slow_ranks(rng, 3000, 4).astype(float)
+    two = np.where(rng.random(3000) < 0.5, one, np.clip(one + 1, 1, 4))
+    fit = compare_ranks(one, two, replicates=200)
+    values = [fit.agreement, fit.kappa, fit.total_variation, fit.wasserstein]
+    spans = [fit.agreement_ci95, fit.kappa_ci95, fit.total_variation_ci95, fit.wasserstein_ci95]
+    for k, value in enumerate(values):
+        inside = [low <= value <= high for low, high in spans]
+        assert inside[k]
+        assert sum(inside) == 1, "the four lie far enough apart here"
+
+
+def test_rows_without_a_report_are_counted():
+    h = with_profile(np.sort(np.random.default_rng(2).random((50, 4)))[:, ::-1])
+    measured = channel_rank(h, 5).astype(float)
+    measured[[3, 7, 20]] = NAN
+    assert compare_rank(measured, h, replicates=50).n_no_csi == 3

@@ -35,6 +35,8 @@ from aerpaw_cmp.report.build import (
 )
 from aerpaw_cmp.report.data import RssPanel
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 ORIGIN = "2025-06-01T14:00:00Z"
 LW1 = (35.72750947, -78.69595819)
 FLOOR_DB = -758.6  # what the sounder writes without a signal

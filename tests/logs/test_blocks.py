@@ -188,11 +188,11 @@ def test_a_damaged_head_of_a_drawn_table_counts_alike_in_blocks(head: bytes, dam
 
 def test_a_column_grows_by_pages_and_keeps_its_values(monkeypatch: pytest.MonkeyPatch) -> None:
     """Beyond the size where its room is moved and not copied, with a type that widens on the way."""
-    monkeypatch.setattr(blocks, "_ROOM", 100)
+    monkeypatch.setattr(blocks, "_ROOM", 500)
     monkeypatch.setattr(blocks, "_AT_ONCE", 37)
     records = blocks.Records()
     expected = []
-    for i, size in enumerate((30, 90, 1, 250, 7, 600)):
+    for i, size in enumerate((30, 290, 1, 250, 7, 600)):
         more = {
             "line": np.arange(size),
             "flag": np.array([f"reason_{i}_{n % 400}" if n % 3 else "" for n in range(size)], dtype=object),

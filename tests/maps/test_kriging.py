@@ -479,3 +479,9 @@ def test_targets_of_one_geometry_share_one_system():
     assert group[0] == group[2] == group[4]
     assert len({int(group[k]) for k in (0, 1, 3)}) == 3
     np.testing.assert_allclose(offsets[example][group], offsets, atol=1e-9)
+
+
+def test_one_neighbour_gets_all_the_weight():
+    from aerpaw_cmp.maps.kriging import _solve_reduced
+
+    assert _solve_reduced(np.zeros((3, 1, 1)), np.array([[0.2], [0.5], [1.0]])).tolist() == [[1.0]] * 3

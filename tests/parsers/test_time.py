@@ -121,3 +121,18 @@ def test_offsets_in_the_text(text: bytes, expected: str) -> None:
     assert valid.all()
     assert made.time[0] == np.datetime64(expected, "ns")
     assert made.time[1] == np.datetime64("2025-07-02T14:00:00.25", "ns")
+
+
+@given(
+    st.lists(st.sampled_from([0, 1, 61, 3600, 86_400, 2_505_600, 40_000_000]), min_size=1, max_size=12),
+    st.sampled_from([0, 3]),
+)
+def test_times_that_come_back_are_read_like_times_alone(steps: list[int], fraction: int) -> None:
+    """Runs of one minute are read once: a minute, a date that comes again later is a run of its own."""
+    start = datetime(2024, 2, 28, 23, 59, 30, tzinfo=timezone.utc).timestamp()
+    seconds = [int(start) + step for step in (*steps, *steps[::-1], steps[0])]
+    texts = [datetime.fromtimestamp(s, timezone.utc).strftime("%Y-%m-%d %H:%M:%S") for s in seconds]
+    rows = [(text + (".250" if fraction else "")).encode() for text in texts]
+    wall, valid = _time.parse_digits(np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), -1), fraction)
+    assert valid.all()
+    assert wall.tolist() == [s * 10**9 + (250_000_000 if fraction else 0) for s in seconds]

@@ -15,7 +15,6 @@ from __future__ import annotations
 import argparse
 import json
 import os
-import resource
 import statistics
 import subprocess
 import sys
@@ -31,17 +30,20 @@ LIGHT = "import matplotlib.pyplot, pandas"
 
 
 def run(command: list[str], **environment: str) -> dict[str, float]:
-    """Seconds and peak memory [MiB] of one process."""
-    started, before = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
+    """Seconds (with its children) and peak memory [MiB] of one process, the largest of it and its children."""
     path = f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"
-    done = subprocess.run(
-        command, capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": path, **environment}
-    )
-    if done.returncode:
-        raise SystemExit(f"{' '.join(command)}\n{done.stderr}")
-    after = resource.getrusage(resource.RUSAGE_CHILDREN)
-    cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-    return {"wall_s": time.perf_counter() - started, "cpu_s": cpu, "peak_mib": after.ru_maxrss / 1024}
+    with tempfile.TemporaryFile() as said:
+        started = time.perf_counter()
+        process = subprocess.Popen(
+            command, stdout=said, stderr=said, env={**os.environ, "PYTHONPATH": path, **environment}
+        )
+        _, status, used = os.wait4(process.pid, 0)  # RUSAGE_CHILDREN has the peak of all processes before it
+        process.returncode = os.waitstatus_to_exitcode(status)
+        wall = time.perf_counter() - started
+        if process.returncode:
+            said.seek(0)
+            raise SystemExit(f"{' '.join(command)}\n{said.read().decode(errors='replace')}")
+    return {"wall_s": wall, "cpu_s": used.ru_utime + used.ru_stime, "peak_mib": used.ru_maxrss / 1024}
 
 
 def report(flight: Path, out: Path, *options: str) -> list[str]:

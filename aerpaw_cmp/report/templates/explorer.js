@@ -331,6 +331,7 @@
     const tower = rss() ? rss().tower : rank() ? rank().tower : "";
     for (const t of data.site.towers) {
       const foot = project(t.at), top = project([t.at[0], t.at[1], t.top]);
+      if (Math.max(foot[1], top[1] + 4) > h - KEY) continue; // half a mark at the edge of the key says nothing
       polyline([foot, top], css("--accent"), 3);
       polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
     }

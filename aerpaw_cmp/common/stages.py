@@ -78,8 +78,8 @@ class Stages:
         try:
             yield
         finally:
-            give_memory_back()
             self.seconds[name] = self.seconds.get(name, 0.0) + time.perf_counter() - start
+            give_memory_back()
 
 
 def give_memory_back() -> None:

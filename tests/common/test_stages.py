@@ -8,6 +8,7 @@ import time
 import pytest
 
 from aerpaw_cmp.cli import shown
+from aerpaw_cmp.common import stages
 from aerpaw_cmp.common.stages import Stages, share_of
 
 
@@ -63,3 +64,13 @@ def test_quiet_leaves_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     progress("maps", 0.5)
     progress.warn("warning: a clock is off")
     assert capsys.readouterr().err == "warning: a clock is off\n"
+
+
+def test_the_seconds_of_a_stage_are_of_its_work_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Giving memory back takes milliseconds: a stage that had nothing to do once seemed to have run."""
+    found = Stages()
+    known: list[bool] = []
+    monkeypatch.setattr(stages, "give_memory_back", lambda: known.append("work" in found.seconds))
+    with found("work"):
+        pass
+    assert known == [True]

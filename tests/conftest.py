@@ -46,6 +46,20 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
 
 
 @pytest.fixture(scope="module")
+def sionna() -> Any:
+    """The module that drives Sionna RT, its variant loaded; skips where Sionna or a device for Dr.Jit is missing."""
+    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
+    from aerpaw_cmp.common.errors import CheckError, UsageError
+    from aerpaw_cmp.propagation import sionna
+
+    try:
+        sionna.load_variant()
+    except (CheckError, UsageError) as error:
+        pytest.skip(f"no device for Dr.Jit: {error}")
+    return sionna
+
+
+@pytest.fixture(scope="module")
 def blank_pictures() -> Iterator[None]:
     """Every figure is made from its data as ever, and then an empty one of its size is saved: an eighth of the time.
 

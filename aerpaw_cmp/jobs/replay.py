@@ -564,14 +564,11 @@ def _joined_replays(parts: list[Replay]) -> Replay:
     left_out = list(dict.fromkeys(text for p in parts for text in p.left_out))
     sets = [dataclasses.replace(p.paths, pose=p.paths.pose + s) for p, s in zip(parts, starts, strict=False)]
     parts.clear()
-    columns: dict[str, Any] = {}
-    for field in dataclasses.fields(PathSet):
-        columns[field.name] = np.concatenate([getattr(s, field.name) for s in sets])
     return dataclasses.replace(
         first,
         **arrays,
         pairs_differ=np.concatenate(differ) if differ else None,
-        paths=PathSet(**columns),
+        paths=PathSet.one_after_another(sets),
         seconds=seconds,
         search_seconds=search,
         left_out=left_out,

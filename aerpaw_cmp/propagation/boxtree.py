@@ -84,6 +84,19 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
+def _opened(tree, node, todo, waiting, found, total):  # type: ignore[no-untyped-def]
+    """The children of a node join the nodes that wait, the items of a leaf those found; how many both are then."""
+    _, _, child, start, count, items = tree
+    if child[node] >= 0:
+        todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
+        return waiting + 2, total
+    for k in range(start[node], start[node] + count[node]):
+        found[total] = items[k]
+        total += 1
+    return waiting, total
+
+
+@njit(**OPTIONS)
 def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many.
 
@@ -100,7 +113,7 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     int
         How many there are.
     """
-    lower, upper, child, start, count, items = tree
+    lower, upper = tree[0], tree[1]
     todo = np.empty(DEEPEST, np.int64)
     todo[0] = 0
     waiting, total = 1, 0
@@ -113,13 +126,7 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
                 out = True
         if out:
             continue
-        if child[node] >= 0:
-            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-            waiting += 2
-        else:
-            for k in range(start[node], start[node] + count[node]):
-                found[total] = items[k]
-                total += 1
+        waiting, total = _opened(tree, node, todo, waiting, found, total)
     return total
 
 
@@ -146,7 +153,7 @@ def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-
     int
         How many there are.
     """
-    lower, upper, child, start, count, items = tree
+    lower, upper = tree[0], tree[1]
     todo = np.empty(DEEPEST, np.int64)
     todo[0] = 0
     waiting, total = 1, 0
@@ -157,13 +164,7 @@ def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-
             continue
         if np.isfinite(reach[9]) and way_over_box(lower, upper, node, reach) > reach[9]:
             continue
-        if child[node] >= 0:
-            todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
-            waiting += 2
-        else:
-            for k in range(start[node], start[node] + count[node]):
-                found[total] = items[k]
-                total += 1
+        waiting, total = _opened(tree, node, todo, waiting, found, total)
     return total
 
 

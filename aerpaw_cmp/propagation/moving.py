@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -206,11 +206,8 @@ def _put_together(parts: list[Replay], rows: list[IntArray], name: str) -> Repla
         for at, part in zip(rows, parts, strict=True):
             differ[at] = part.pairs_differ
         arrays["pairs_differ"] = differ
-    columns: dict[str, Any] = {}
-    for field in fields(PathSet):
-        columns[field.name] = np.concatenate([getattr(paths, field.name) for paths in shifted])
-    columns["pose"] = np.concatenate([at[paths.pose] for at, paths in zip(rows, shifted, strict=True)])
-    paths = PathSet(**columns)
+    in_flight = [replace(paths, pose=at[paths.pose]) for at, paths in zip(rows, shifted, strict=True)]
+    paths = PathSet.one_after_another(in_flight)
     return replace(
         first,
         **arrays,

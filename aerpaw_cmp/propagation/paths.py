@@ -6,7 +6,8 @@ and fields are not stored: :mod:`aerpaw_cmp.propagation.channel` evaluates them 
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
 
 import numpy as np
 from shapely.geometry import Polygon
@@ -126,6 +127,11 @@ class PathSet:
         return PathSet(
             pose=pose, tower=tower, depth=depth, faces=self.faces[rows], vertices_m=self.vertices_m[rows], tree=tree
         )
+
+    @classmethod
+    def one_after_another(cls, pieces: Sequence[PathSet]) -> PathSet:
+        """The paths of all pieces, one at least, as they come; nothing is sorted."""
+        return cls(**{one.name: np.concatenate([getattr(p, one.name) for p in pieces]) for one in fields(cls)})
 
     @classmethod
     def empty(cls, max_depth: int) -> PathSet:

@@ -683,10 +683,7 @@ def own_coefficients(
                     gains.append(np.einsum("pab,au,pbv->puv", gain, weights[0], weights[1]))
                     pieces.append(part)
             del built
-    empty = PathSet.empty(max_depth)
-    paths = empty if not pieces else PathSet(
-        *(np.concatenate([getattr(p, n) for p in pieces]) for n in ("pose", "tower", "depth", "faces", "vertices_m"))
-    )  # fmt: skip
+    paths = PathSet.one_after_another(pieces) if pieces else PathSet.empty(max_depth)
     gain = np.concatenate(gains) if gains else np.zeros((0, 2, 2), dtype=np.complex128)
     kept = ~excluded[paths.tower, paths.pose]
     paths, gain = paths.select(kept), gain[kept]

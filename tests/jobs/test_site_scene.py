@@ -11,7 +11,7 @@ import yaml
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.site_scene import is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.tracer import replay
@@ -163,17 +163,11 @@ def test_the_plan_of_a_map_of_a_scene_searches_one_piece_of_it(
 
 
 @pytest.mark.sionna
+@pytest.mark.usefixtures("sionna")
 def test_a_report_of_a_scene_is_audited_and_its_paths_explained(
     flown: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     """Sionna gets the same triangles: no path is missing or too many, and the fields are its own."""
-    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
-    from aerpaw_cmp.propagation import sionna
-
-    try:
-        sionna.load_variant()
-    except (CheckError, UsageError) as error:
-        pytest.skip(f"no device for Dr.Jit: {error}")
     out = tmp_path / "out"
     assert main(["report", str(flown), "-o", str(out), "--figures", "none", "--strict", "--quiet"]) == 0
     found = json.loads((out / "metrics.json").read_text())["rt"]

@@ -10,7 +10,7 @@ from shapely.geometry import box
 
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
-from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation import image, power_cut, prisms
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
@@ -321,15 +321,8 @@ def test_what_a_scene_cannot_do_is_said(scenes, tmp_path):
 
 
 @pytest.mark.sionna
-def test_every_path_of_pathsolver_is_found(scenes):
+def test_every_path_of_pathsolver_is_found(scenes, sionna):
     """PathSolver on the same triangles: nothing of it is missing, and nothing is found twice."""
-    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
-    from aerpaw_cmp.propagation import sionna
-
-    try:
-        sionna.load_variant()
-    except (CheckError, UsageError) as error:
-        pytest.skip(f"no device for Dr.Jit: {error}")
     rng = np.random.default_rng(9)
     site = scenes.site((), ((-20.0, 0.0, 20.0),), scene=placed_scene(enumerate_.shipped("simple_street_canyon")))
     spots = np.column_stack([rng.uniform(-40, 40, 25), rng.uniform(-8, 8, 25), rng.uniform(1, 30, 25)])

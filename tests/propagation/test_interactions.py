@@ -7,7 +7,7 @@ import pytest
 from scipy.special import modfresnelm
 from shapely.geometry import box
 
-from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight.settings import RtSettings
 from aerpaw_cmp.jobs.replay import check_interactions
@@ -29,18 +29,6 @@ from aerpaw_cmp.site.site import Building
 
 SEARCH = {"samples": 20_000, "batch": 10, "cache_dir": ""}
 ROOF_M, EDGE_M = 12.0, 50.0
-
-
-@pytest.fixture(scope="module")
-def sionna():
-    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
-    from aerpaw_cmp.propagation import sionna
-
-    try:
-        sionna.load_variant()
-    except (CheckError, UsageError) as error:
-        pytest.skip(f"no device for Dr.Jit: {error}")
-    return sionna
 
 
 def hall(scenes, name, **settings):

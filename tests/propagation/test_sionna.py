@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from shapely.geometry import box
 
-from aerpaw_cmp.common.errors import CheckError, UsageError
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation import channel, field_audit
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
@@ -21,18 +21,6 @@ pytestmark = pytest.mark.sionna
 
 SAMPLES = 100_000
 BATCH = 25
-
-
-@pytest.fixture(scope="module")
-def sionna():
-    pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
-    from aerpaw_cmp.propagation import sionna
-
-    try:
-        sionna.load_variant()
-    except (CheckError, UsageError) as error:
-        pytest.skip(f"no device for Dr.Jit: {error}")
-    return sionna
 
 
 @pytest.fixture(scope="module")

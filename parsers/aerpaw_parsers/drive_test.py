@@ -18,7 +18,7 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _cells, _lines, _pose, _quantities, _rows, _sheet, aadm_snr, nemo_csv, own_csv, pose_csv, quectel_ri
+from . import _cells, _lines, _nemo, _pose, _quantities, _rows, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri
 
 _PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
 _ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
@@ -63,9 +63,8 @@ def is_header(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Whether a header of such names stands in front, and it is none of the narrower formats."""
-    return _sheet.starts(head, is_header) and not any(
-        r.READER.sniff(head) for r in (nemo_csv, quectel_ri, aadm_snr, own_csv)
-    )
+    narrower = (_nemo.sniff, *(r.READER.sniff for r in (quectel_ri, aadm_snr, own_csv)))
+    return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 
 @dataclass

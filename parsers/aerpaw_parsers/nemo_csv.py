@@ -13,26 +13,18 @@ import numpy as np
 from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, _rows, _table
+from . import _lines, _nemo, _rows, _table
 
-_NAMES = b"index rel_time_ms lat lon alt_m pdsch_rank nr_rsrp_dbm nr_sinr_db wb_cqi".split()
-_HEADER = re.compile(rb"(?:\xef\xbb\xbf)?" + b", ?".join(_NAMES) + rb"[ \t]*\r?")
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
 _ROW = re.compile(rb"^(\d{1,12}), ?" + _N + (rb", ?" + _CELL) * 7 + rb"[ \t]*\r?$", re.MULTILINE)
-NO_RANK = "no_rank_in_row"
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 
 
-def sniff(head: bytes) -> bool:
-    """Whether the first line is the header."""
-    return _HEADER.fullmatch(head[:400].split(b"\n", 1)[0]) is not None
-
-
 def _reason(line: bytes) -> str | None:
-    if _HEADER.fullmatch(line):
+    if _nemo.HEADER.fullmatch(line):
         return None
     fields = line.count(b",") + 1
     if fields != 9:
@@ -75,21 +67,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     number, column = _columns(lines)
     content = {"time": column[1], **dict(zip(_COLUMNS, column[2:], strict=True))}
     rows = _rows.built(lines, number, content, options, reader="nemo_csv", reason=_reason, clock="relative_ms")
-    return rows.result([pdsch_rank(rows, dict(rows.columns))])
-
-
-def pdsch_rank(rows: _rows.Rows, values: dict[str, FloatArray]) -> Stream | None:
-    """Stream of the scheduled rank; ``values`` holds ``ri_raw`` and what stands beside it."""
-    raw = values["ri_raw"]
-    missing = np.isnan(raw)
-    odd = ~missing & ~((raw >= 1) & (raw <= 8))
-    rows.mark(missing, NO_RANK)
-    rows.mark(odd & (raw != 0), "rank_out_of_range")
-    rows.mark(odd & (raw == 0), "no_csi")
-    values["rank"] = np.where(missing | odd, np.nan, raw)
-    clock = "relative" if rows.relative else "utc"
-    name = rows.options.channel or "pdsch_rank"
-    return rows.stream("rank", name, values, ri_base="one", source="scheduled PDSCH rank", clock=clock)
+    return rows.result([_nemo.pdsch_rank(rows, dict(rows.columns))])
 
 
 READER = Reader(
@@ -97,7 +75,7 @@ READER = Reader(
     title="Keysight Nemo NR rank, CSV with relative times",
     kinds=("rank",),
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0",
-    sniff=sniff,
+    sniff=_nemo.sniff,
     read=read,
     in_blocks=blocks.by_lines(read, head=blocks.first_line),
 )

@@ -15,7 +15,7 @@ from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _lines, _quantities, _rows
-from .nemo_csv import pdsch_rank
+from ._nemo import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"
 _GAP = rb"[^\n]{0,60}?"

@@ -9,7 +9,7 @@ from __future__ import annotations
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _pose, _quantities, _sheet, nemo_csv, quectel_ri, vehicle_out
+from . import _nemo, _pose, _quantities, _sheet, quectel_ri, vehicle_out
 
 
 def is_header(names: list[str]) -> bool:
@@ -31,7 +31,8 @@ def _has_time(names: list[str]) -> bool:
 
 def sniff(head: bytes) -> bool:
     """Whether a header with position and time stands in front, and it is not AERPAW's own layout."""
-    return _sheet.starts(head, is_header) and not any(r.READER.sniff(head) for r in (vehicle_out, nemo_csv, quectel_ri))
+    narrower = (vehicle_out.READER.sniff, _nemo.sniff, quectel_ri.READER.sniff)
+    return _sheet.starts(head, is_header) and not any(known(head) for known in narrower)
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

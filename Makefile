@@ -12,6 +12,8 @@ REPORT := reports/sample
 
 # a PYTHONPATH from another project must not reach into our environment
 unexport PYTHONPATH PYTHONHOME PIP_USER
+# without bytecode kept, every worker and every child of a test compiles the package and rewrites the tests anew
+unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help setup report test bench bench-all docs clean

@@ -47,14 +47,17 @@ report: $(READY) $(LLVM)
 	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
+# the order of files is that of tests/conftest.py: the dearest first
+WORKERS := -q -n auto --dist loadfile --no-loadscope-reorder
+
 # mypy uses one core, so it runs beside pytest; what it says comes last
 test: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	@said=$$(mktemp); $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
-	echo "$(BIN)/python -m pytest -q -n auto --dist loadfile"; \
-	$(BIN)/python -m pytest -q -n auto --dist loadfile; tested=$$?; \
+	echo "$(BIN)/python -m pytest $(WORKERS)"; \
+	$(BIN)/python -m pytest $(WORKERS); tested=$$?; \
 	echo "$(BIN)/mypy"; wait $$types; typed=$$?; cat "$$said"; rm -f "$$said"; \
 	[ $$tested -eq 0 ] && [ $$typed -eq 0 ]
 

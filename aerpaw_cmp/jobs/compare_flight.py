@@ -39,12 +39,12 @@ from ..compare.result import (
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.replay import FlightReplay, Replayed, direct_foliage_m, processes_for
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
-from .replay import FlightReplay, Replayed, direct_foliage_m, processes_for
 from .what_if import (
     expected_offset,
     foliage_rank_difference,

@@ -17,10 +17,10 @@ from ..common.stages import Stages
 from ..compare.ladder import LadderRow, series_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
+from ..flight.replay import Clock, FlightReplay, estimate_clocks, processes_for, replay_rank, replay_rss
 from .audit_flight import audit_replays
 from .compare_flight import FEWEST_SERIES, compare_flight
 from .ladder import FlightLadder, flight_ladder
-from .replay import Clock, FlightReplay, estimate_clocks, processes_for, replay_rank, replay_rss
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -62,7 +62,7 @@ def replay_flight(
     clocks : sequence of Clock or None, optional
         One per RSS series, in place of what ``rss.lag`` asks for.
     meanwhile : callable, optional
-        As for :func:`~aerpaw_cmp.jobs.replay.estimate_clocks`.
+        As for :func:`~aerpaw_cmp.flight.replay.estimate_clocks`.
 
     Returns
     -------

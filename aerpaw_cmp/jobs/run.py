@@ -581,10 +581,10 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     """Propagation paths of all towers to one point of the track, as polylines."""
     import numpy as np
 
+    from ..flight.replay import path_loss, reflecting_crowns
     from ..propagation.arrays import Link, Poses, single_element
     from ..propagation.tracer import replay
     from ..report.site_view import PathLine
-    from .replay import path_loss, reflecting_crowns
 
     if track is None or not 0 <= pose < len(track.time):
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
@@ -617,11 +617,11 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
 
     from ..compare.rank import channel_rank
     from ..flight.data import choose_site
+    from ..flight.replay import replay_poses
     from ..flight.settings import load_flight
     from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
-    from .replay import replay_poses
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)

@@ -16,11 +16,6 @@ from ..common.forked import ahead
 from ..common.stages import Progress, share_of, silent
 from ..common.units import BoolArray, FloatArray, wavelength_m
 from ..compare.result import APPLIED, GIVEN, ClockResult
-from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
-from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.lag import DIRECTION_TERMS, terms_from
-from ..flight.settings import RtSettings
-from ..flight.track import TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
 from ..propagation.crowns import Crowns
@@ -30,6 +25,11 @@ from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
 from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
 from ..site.site import Site, Trees
+from .clock import ClockChannel, ClockEstimate, judge_clock
+from .data import FlightData, RssSeries, Times, rank_positions
+from .lag import DIRECTION_TERMS, terms_from
+from .settings import RtSettings
+from .track import TrackPoses
 
 COHERENT_STEP_S = 0.02
 """Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""

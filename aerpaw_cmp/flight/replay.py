@@ -13,7 +13,7 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.forked import ahead
-from ..common.stages import Progress, share_of, silent
+from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray, wavelength_m
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
@@ -88,6 +88,39 @@ class FlightReplay:
     def all(self) -> tuple[Replayed, ...]:
         """RSS first, then rank."""
         return (*self.rss, *self.rank)
+
+
+def replay_flight(
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    clocks: Sequence[Clock | None] | None = None,
+    meanwhile: Callable[[], object] | None = None,
+) -> FlightReplay:
+    """Clocks and replay alone.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks" and "replay".
+    clocks : sequence of Clock or None, optional
+        One per RSS series, in place of what ``rss.lag`` asks for.
+    meanwhile : callable, optional
+        As for :func:`estimate_clocks`.
+
+    Returns
+    -------
+    FlightReplay
+        Of every RSS and rank series.
+    """
+    stages = stages or Stages()
+    with stages("clocks"):
+        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
+    with stages("replay"):
+        return FlightReplay(
+            rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
+        )
 
 
 def replay_rss(
@@ -167,7 +200,7 @@ def estimate_clocks(
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
-    with ahead(calls, processes_for(data)) as estimates:
+    with ahead(calls) if may_share(data) else ahead(calls, 1) as estimates:
         if meanwhile is not None:
             meanwhile()
         for tower in towers:
@@ -194,9 +227,9 @@ SHARED_UP_TO = 200_000
 """RSS samples of a flight up to which its series are shared by several processes."""
 
 
-def processes_for(data: FlightData) -> int | None:
-    """Processes for the series of a flight: as many as are safe; one on a long flight, where each holds much memory."""
-    return None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
+def may_share(data: FlightData) -> bool:
+    """Whether processes may share the series of a flight: not of a long one, where each would hold much memory."""
+    return sum(len(series.time) for series in data.rss) <= SHARED_UP_TO
 
 
 BLOCK = 100_000
@@ -425,7 +458,6 @@ def replay_poses(
     check_interactions(rt)
     others = engine is None if others is None else others
     engine = engine or rt.engine
-    crowns = reflecting_crowns(site.trees, rt)
     if towers_m is not None:
         name = "+".join(link.tower_arrays)
         _check_moving(rt, engine, name)
@@ -436,7 +468,7 @@ def replay_poses(
             towers_m,
             max_depth=rt.max_depth,
             loss=path_loss(site, rt, link.carrier_hz),
-            crowns=crowns,
+            crowns=reflecting_crowns(site.trees, rt),
             power_cut_db=rt.power_cut_db,
             visibility=rt.visibility,
             threads=rt.threads,
@@ -444,7 +476,8 @@ def replay_poses(
             progress=share_of(progress, f"replay {name}, which moves"),
         )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
+    whole = rt.relevance_db is not None or crowns_reflect(site.trees, rt)
+    if len(poses) > BLOCK and engine == "image" and not whole:
         parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
@@ -463,7 +496,7 @@ def replay_poses(
         samples=rt.samples,
         batch=rt.batch,
         loss=path_loss(site, rt, link.carrier_hz),
-        crowns=crowns,
+        crowns=reflecting_crowns(site.trees, rt),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         power_cut_db=rt.power_cut_db,
@@ -575,9 +608,14 @@ def _joined_replays(parts: list[Replay]) -> Replay:
     )
 
 
+def crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
+    """Whether crowns reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
+    return rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0
+
+
 def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
-    """Crowns that reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
-    return Crowns(trees) if rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0 else None
+    """Crowns that reflect, or None."""
+    return Crowns(trees) if crowns_reflect(trees, rt) else None
 
 
 def path_loss(

@@ -215,6 +215,7 @@ def run_report(
         With what was found, expected, and the likely cause.
     """
     from ..flight.data import load_data
+    from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
@@ -231,7 +232,6 @@ def run_report(
     if recommend is not None:
         _beside(recommend, flight, logs_root)
     settings = _overridden(load_flight(flight), engine, audit)
-    formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -239,10 +239,12 @@ def run_report(
         target = None
         if recommend is not None:
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
+        formats = chosen_formats(settings.report.export, export)
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
-        found = run_flight(data, stages, ladder=True, meanwhile=partial(prepare_report, figures))
+        replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
+        found = run_flight(data, stages, replays=replays, ladder=True)
         record = report_record(found, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)

@@ -18,7 +18,8 @@ from ..common.units import AnyArray, FloatArray
 from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
-from ..flight.replay import Replayed, attitude_rotation, part_of, path_loss, reflecting_crowns
+from ..flight.losses import path_loss, reflecting_crowns
+from ..flight.replay import Replayed, attitude_rotation, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses

@@ -39,7 +39,8 @@ from ..compare.result import (
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
-from ..flight.replay import FlightReplay, Replayed, direct_foliage_m, may_share
+from ..flight.losses import direct_foliage_m
+from ..flight.replay import FlightReplay, Replayed, may_share
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site

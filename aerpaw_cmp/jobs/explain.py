@@ -16,15 +16,8 @@ from ..common.errors import UsageError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
-from ..flight.replay import (
-    attitude_rotation,
-    estimate_clocks,
-    path_loss,
-    replay_poses,
-    roughness_loss,
-    telemetry_time,
-    valid_poses,
-)
+from ..flight.losses import path_loss, roughness_loss
+from ..flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
 from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
 from ..propagation.explained import (

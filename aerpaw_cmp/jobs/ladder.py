@@ -20,7 +20,8 @@ from ..common.units import FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
 from ..flight.data import FlightData
-from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from, path_loss
+from ..flight.losses import path_loss
+from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ..flight.settings import FlightFile
 from ..propagation.arrays import Link, Poses
 from ..propagation.channel import mean_pair_power, rss_dbm

@@ -583,7 +583,7 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     """Propagation paths of all towers to one point of the track, as polylines."""
     import numpy as np
 
-    from ..flight.replay import path_loss, reflecting_crowns
+    from ..flight.losses import path_loss, reflecting_crowns
     from ..propagation.arrays import Link, Poses, single_element
     from ..propagation.tracer import replay
     from ..report.site_view import PathLine

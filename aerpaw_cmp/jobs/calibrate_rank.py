@@ -34,10 +34,10 @@ from ..compare.receiver import (
 )
 from ..compare.rss import seconds
 from ..flight.data import FlightData, RankSeries, rank_positions
+from ..flight.replay import attitude_rotation
 from ..flight.settings import Settings
 from ..propagation.arrays import Link, Poses
 from ..propagation.geometries import Geometry, every_geometry, singular_values_of
-from .replay import attitude_rotation
 
 FORMAT = "aerpaw-cmp receiver 1"
 """First key of a receiver file."""

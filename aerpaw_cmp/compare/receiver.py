@@ -560,7 +560,21 @@ def choose_features(
 
 
 def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray, penalty: float = 10.0) -> float:
-    """Log score [nat] of the mean forecast of several geometries (geometries, n, features) on groups left out."""
+    """Log score of the mean forecast of several geometries on groups left out.
+
+    Parameters
+    ----------
+    features : (geometries, n, features)
+    rank, groups : (n,)
+        As :func:`fit_receiver`.
+    penalty : float
+        The same for all.
+
+    Returns
+    -------
+    float
+        [nat].
+    """
     alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
     _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
     x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]

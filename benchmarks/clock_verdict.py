@@ -27,9 +27,9 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.flight.clock import ClockChannel, ClockEstimate, judge_clock
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.lag import direction_terms
+from aerpaw_cmp.flight.replay import estimate_clocks
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import Track
-from aerpaw_cmp.jobs.replay import estimate_clocks
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm

@@ -21,8 +21,8 @@ import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray, IntArray
 from aerpaw_cmp.flight.data import gather, rank_positions, read_logs
+from aerpaw_cmp.flight.replay import replay_rss
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs.replay import replay_rss
 from aerpaw_cmp.maps.evaluate import interval_coverage
 from aerpaw_cmp.maps.interpolate import InverseDistance, Nearest
 from aerpaw_cmp.maps.kriging import OrdinaryKriging

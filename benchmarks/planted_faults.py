@@ -242,7 +242,7 @@ class Change:
 
 def replays_of(data: Any) -> Any:
     """All series, replayed."""
-    from aerpaw_cmp.jobs.flight_run import replay_flight
+    from aerpaw_cmp.flight.replay import replay_flight
 
     return replay_flight(data).all
 

@@ -1,7 +1,8 @@
 """Rank as a receiver decides it: fitted on one real NR flight, scored on the other, both ways (needs the field logs).
 
-Geometry of the UAV's antennas (mount, slants, strength of the ground ray), penalty and decision are chosen by the log
-score on sectors of directions left out within the training flight; nothing of the scored flight takes part. Beside it:
+Geometry of the UAV's antennas (mount, slants, strength of the ground ray), timing (how much later the positions, over
+how long the channel is averaged), penalty and decision are chosen by the log score on sectors of directions left out
+within the training flight; nothing of the scored flight takes part. Beside it:
 one threshold per stream, an ordered regression, the same with directions left out (fitted and scored in different
 sectors of one flight), the coherent ground, distance and elevation alone, the rate of a Type I codebook, cross-polar
 discrimination, the hysteresis of the report, always the commonest rank, and what another flight's reports at the same
@@ -32,44 +33,31 @@ from aerpaw_cmp.compare.forecast import constant_forecast, one_hot, repeat_ceili
 from aerpaw_cmp.compare.rank import cohen_kappa
 from aerpaw_cmp.compare.receiver import (
     PENALTIES,
-    choose_features,
-    fit_mixture,
     fit_ordered,
     fit_receiver,
     fit_thresholds,
     out_of_group,
     rank_by_thresholds,
     sector_groups,
-    stream_features,
 )
+from aerpaw_cmp.jobs.calibrate_rank import RankFitSettings, RankSamples, Timing, Tried, features_of
 from aerpaw_cmp.propagation.arrays import (
+    Link,
     Poses,
     rotation_from_yaw_pitch_roll,
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.geometries import Geometry, basis_fields, every_geometry, singular_values_of, slant_basis
+from aerpaw_cmp.propagation.geometries import Geometry, basis_fields, slant_basis
 
 LW1 = (35.72750947, -78.69595819)
 ANTENNA_M = np.array([0.0, 0.0, 12.0])
 CARRIER_HZ = 3.4e9
 LOWEST_M = 10.0
 FLIGHTS = ("1", "3")
-TOWER_SLANTS = ((45.0, -45.0, 45.0, -45.0),)
+TOWER_SLANTS = (45.0, -45.0, 45.0, -45.0)
 """Two dual-port sector antennas at +-45 deg; the second the other way round changes nothing that the data can tell."""
-UAV_SLANTS = (
-    (45.0, -45.0, 45.0, -45.0), (45.0, -45.0, -45.0, 45.0), (45.0, 45.0, -45.0, -45.0),
-    (-45.0, 45.0, -45.0, 45.0), (-45.0, 45.0, 45.0, -45.0), (-45.0, -45.0, 45.0, 45.0),
-    (0.0, 90.0, 0.0, 90.0), (0.0, 90.0, 90.0, 0.0), (0.0, 0.0, 90.0, 90.0),
-    (90.0, 0.0, 90.0, 0.0), (90.0, 0.0, 0.0, 90.0), (90.0, 90.0, 0.0, 0.0),
-    (0.0, 0.0, 0.0, 0.0), (90.0, 90.0, 90.0, 90.0),
-)  # fmt: skip
-GROUNDS = (0.0, 0.2, 0.5, 1.0)
 HEADLINE = "multinomial, mean of tied geometries"
-MEMBERS = 20
-"""Of the geometries that cannot be told apart, the best that the mean forecast is made of."""
-THIN = 4
-"""Every fourth sample (2 s) chooses the geometry; all samples fit and score."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -81,8 +69,19 @@ class Flight:
     sinr_db: FloatArray
     time_s: FloatArray
 
-    def thinned(self, step: int) -> Flight:
-        return Flight(self.position_m[::step], self.rank[::step], self.sinr_db[::step], self.time_s[::step])
+    def samples(self, name: str) -> RankSamples:
+        """As ``calibrate`` takes them, the handset level in axes of the site."""
+        tower = dataclasses.replace(tower_comparison_array(), slant_rad=np.radians(TOWER_SLANTS))
+        link = Link(CARRIER_HZ, {"LW1": tower}, uav_comparison_array(wavelength_m(CARRIER_HZ)), uav_transmits=False)
+        return RankSamples(
+            flight=name,
+            tower="LW1",
+            tower_m=ANTENNA_M,
+            poses=Poses(self.position_m, np.tile(np.eye(3), (len(self.rank), 1, 1))),
+            rank=self.rank.astype(np.float64),
+            link=link,
+            time_s=self.time_s,
+        )
 
 
 def read_flight(root: Path, name: str) -> Flight:
@@ -92,22 +91,6 @@ def read_flight(root: Path, name: str) -> Flight:
     position = np.column_stack([east, north, log.alt_m.to_numpy()])
     return Flight(position, log.pdsch_rank.to_numpy().astype(np.int64), log.nr_sinr_db.to_numpy(),
                   log.rel_time_ms.to_numpy() / 1e3)  # fmt: skip
-
-
-def geometries(step_deg: float, how: str) -> tuple[Geometry, ...]:
-    """Upright, rolled by 90 deg (half a turn of yaw is the same), lying flat."""
-    half, full = np.arange(0.0, 180.0, step_deg), np.arange(0.0, 360.0, step_deg)
-    mounts = [(y, 0.0, r) for r in (0.0, 90.0) for y in half] + [(y, 90.0, 0.0) for y in full]
-    return every_geometry(mounts, TOWER_SLANTS, UAV_SLANTS, GROUNDS, (how,))  # type: ignore[arg-type]
-
-
-def features_of(which: tuple[Geometry, ...], flight: Flight) -> FloatArray:
-    """Features (geometries, n, 4)."""
-    n = len(flight.rank)
-    poses = Poses(flight.position_m, np.broadcast_to(np.eye(3), (n, 3, 3)))
-    uav = uav_comparison_array(wavelength_m(CARRIER_HZ))
-    found = singular_values_of(which, tower_comparison_array(), ANTENNA_M, uav, poses, CARRIER_HZ)
-    return np.stack([stream_features(sigma).astype(np.float32) for sigma in found]).astype(np.float64)
 
 
 def channel_of(geometry: Geometry, flight: Flight) -> Any:
@@ -123,21 +106,21 @@ def channel_of(geometry: Geometry, flight: Flight) -> Any:
 
 def one_way(train: Flight, test: Flight, step_deg: float, how: str, replicates: int) -> dict[str, Any]:
     """Everything fitted on ``train`` and scored on ``test``."""
-    which = geometries(step_deg, how)
-    thin = train.thinned(THIN)
-    choice = choose_features(features_of(which, thin), thin.rank, sector_groups(thin.position_m, ANTENNA_M))
-    best = which[choice.best]
-    alike = tuple(which[i] for i in choice.tied[:MEMBERS])
-    here, there = features_of((best,), train)[0], features_of((best,), test)[0]
+    settings = RankFitSettings(yaw_step_deg=step_deg, sum=how)  # type: ignore[arg-type]
+    tried, other = Tried.of([train.samples("train")], settings), test.samples("test")
+    fitted = tried.fit([0])
+    plain = dataclasses.replace(tried, settings=settings.model_copy(update={"shift_s": [0.0], "average_s": [0.0]}))
+    mixture, best = fitted.mixture, fitted.geometries[0]
+    here, there = (features_of((best,), one, fitted.timing)[0] for one in (tried.samples[0], other))
     groups = sector_groups(train.position_m, ANTENNA_M)
     receiver = fit_receiver(here, train.rank, groups)
     constant = constant_forecast(train.rank)
     p = receiver.probabilities(there)
-    mixture = fit_mixture(features_of(alike, train), train.rank, groups, penalties=(3.0, 10.0, 30.0))
-    mixed = mixture.probabilities(features_of(alike, test))
+    mixed, said = fitted.forecast(other)
     rows: dict[str, Any] = {
-        HEADLINE: (mixed, mixture.decide(mixed)),
+        HEADLINE: (mixed, said),
         "the same, most probable rank": (mixed, mixed.argmax(axis=1) + 1),
+        "the same, no shift, no average": plain.fit([0]).forecast(other),
         "multinomial regression, best geometry": (p, receiver.decide(p)),
     }
     ordered = fit_ordered(here, train.rank).probabilities(there)
@@ -156,19 +139,20 @@ def one_way(train: Flight, test: Flight, step_deg: float, how: str, replicates: 
     rows["always the commonest rank"] = (np.tile(constant, (len(test.rank), 1)), np.full(len(test.rank), commonest))
     return {
         "geometry": best.in_words(),
-        "tied": [which[i].in_words() for i in choice.tied],
-        "candidates": choice.candidates,
-        "left_out_log_score": float(choice.log_score[0]),
+        "tied": fitted.tied,
+        "alike": [one.in_words() for one in fitted.geometries],
+        "candidates": len(tried.geometries),
+        "timing": dataclasses.asdict(fitted.timing),
         "penalty": mixture.members[0].penalty,
         "decision_weight": mixture.decision_weight.tolist(),
         "thresholds_db": limits,
         "rows": {name: scored(test.rank, *row, constant, replicates) for name, row in rows.items()},
-        "cross_polar": cross_polar(best, train, test),
+        "cross_polar": cross_polar(best, tried.samples[0], other, fitted.timing),
         "sector_left_out": sectors(here, train, receiver.penalty, constant, replicates),
     }
 
 
-def cross_polar(geometry: Geometry, train: Flight, test: Flight) -> dict[str, float]:
+def cross_polar(geometry: Geometry, train: RankSamples, test: RankSamples, timing: Timing) -> dict[str, float]:
     """Kappa with ports of finite cross-polar discrimination: each port slanted off by atan(10^(-XPD/20))."""
     found = {}
     for xpd_db in (30.0, 20.0, 15.0, 10.0):
@@ -178,8 +162,9 @@ def cross_polar(geometry: Geometry, train: Flight, test: Flight) -> dict[str, fl
             uav_slant_deg=tuple(s - np.copysign(off, s) for s in geometry.uav_slant_deg),
             tower_slant_deg=tuple(s - np.copysign(off, s) for s in geometry.tower_slant_deg),
         )
-        receiver = fit_receiver(features_of((leaky,), train)[0], train.rank, sector_groups(train.position_m, ANTENNA_M))
-        p = receiver.probabilities(features_of((leaky,), test)[0])
+        groups = sector_groups(train.poses.position_m, ANTENNA_M)
+        receiver = fit_receiver(features_of((leaky,), train, timing)[0], train.rank, groups)
+        p = receiver.probabilities(features_of((leaky,), test, timing)[0])
         found[f"{xpd_db:g} dB"] = cohen_kappa(test.rank, receiver.decide(p))
     return found
 
@@ -262,8 +247,10 @@ def show(found: dict[str, Any]) -> None:
     for how, ways in found["ways"].items():
         for way, row in ways.items():
             print(f"\nflight {way}, ground {how.replace('_', ' ')}: {row['geometry']}")
-            print(f"  of {row['candidates']} geometries, {len(row['tied'])} cannot be told apart from it, among them")
-            for words in row["tied"][1:4]:
+            timing = row["timing"]
+            print(f"  positions {timing['shift_s']:g} s later, channel averaged over {timing['average_s']:g} s")
+            print(f"  of {row['candidates']} geometries, {row['tied']} cannot be told apart from it, among them")
+            for words in row["alike"][1:4]:
                 print(f"    {words}")
             print(f"  {'':38s}" + " ".join(f"{h:>13s}" for h in heads))
             for name, s in [*row["rows"].items(), ("fitted flight, sectors left out", row["sector_left_out"])]:

@@ -20,10 +20,10 @@ import numpy as np
 
 from aerpaw_cmp.common.stages import Stages
 from aerpaw_cmp.flight.data import FlightData, RankSeries, RssSeries, choose_site
+from aerpaw_cmp.flight.replay import replay_flight
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.flight.track import Track
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
-from aerpaw_cmp.jobs.flight_run import replay_flight
 
 ANTENNA = {"model": "tr38901", "installed_db": [1.0, 0.0]}
 

@@ -65,6 +65,50 @@ def stream_features(sigma: ArrayLike) -> FloatArray:
     return np.asarray(np.where(alive, features, np.nan))
 
 
+def time_means(power: FloatArray, time_s: FloatArray, shift_s: float, average_s: float) -> FloatArray:
+    """Mean of squared singular values over a while around each sample, some seconds later.
+
+    Parameters
+    ----------
+    power : (..., n, m)
+        Squares of singular values.
+    time_s : (n,)
+        Of the samples, in any order [s].
+    shift_s : float
+        Positive: the report belongs to a later position than the log says [s].
+    average_s : float
+        Length of the mean, centred; 0: the sample next in time.
+
+    Returns
+    -------
+    (..., n, m)
+        Where no sample lies in the interval (a gap, the end of the log), the sample next in time stands for the mean.
+
+    Notes
+    -----
+    A receiver decides by an estimate that is seconds old, the network grants what was reported before that, and the
+    positions of a handset lag as well: neither can be told from a log. Ripple of a modelled channel that is finer than
+    these seconds says nothing about a report.
+
+    Examples
+    --------
+    >>> time_means(np.array([[1.0], [2.0], [6.0]]), np.array([0.0, 1.0, 2.0]), 1.0, 2.0).ravel().tolist()
+    [3.0, 4.0, 6.0]
+    """
+    order = np.argsort(time_s, kind="stable")
+    time, centre = time_s[order], time_s + shift_s
+    low = np.searchsorted(time, centre - 0.5 * average_s - 1e-9)
+    high = np.searchsorted(time, centre + 0.5 * average_s + 1e-9, side="right")
+    after = np.searchsorted(time, centre).clip(0, len(time) - 1)
+    before = np.maximum(after - 1, 0)
+    nearest = np.where(np.abs(time[before] - centre) < np.abs(time[after] - centre), before, after)
+    empty = high <= low
+    low, high = np.where(empty, nearest, low), np.where(empty, nearest + 1, high)
+    sums = np.zeros((*power.shape[:-2], len(time) + 1, power.shape[-1]))
+    np.cumsum(power[..., order, :], axis=-2, out=sums[..., 1:, :])
+    return np.asarray((sums[..., high, :] - sums[..., low, :]) / (high - low)[:, None])
+
+
 def sector_groups(position_m: FloatArray, tower_m: FloatArray, sectors: int = 8) -> IntArray:
     """Sector of directions from the tower of each sample (n,), with about equally many samples in each.
 
@@ -92,8 +136,8 @@ class Receiver:
     mean, scale : (features,)
         Of the training features.
     decision_weight : (ranks,)
-        The decided rank is that of the largest probability times weight. All ones: the most probable rank. Weights
-        for the largest kappa are fitted on out-of-sector forecasts of the training flights.
+        The decided rank is that of the largest probability times weight. All ones: the most probable rank. Others are
+        fitted for kappa on out-of-sector forecasts of the training flights (:func:`decision_weights`).
     penalty : float
         Ridge penalty.
     constant : (ranks,)
@@ -179,7 +223,7 @@ def fit_receiver(
     x, y, group = _training(features, rank, groups)
     left_out = [out_of_group(x, y, group, penalty) for penalty in penalties]
     best = int(np.argmin([log_losses(p, y).mean() for p in left_out]))
-    return _fitted(x, y, float(penalties[best]), _kappa_weights(left_out[best], y))
+    return _fitted(x, y, float(penalties[best]), decision_weights(left_out[best], y, group))
 
 
 def _fitted(x: FloatArray, rank: IntArray, penalty: float, decision_weight: FloatArray | None = None) -> Receiver:
@@ -329,6 +373,29 @@ def _hessian(
     return result
 
 
+def decision_weights(probability: FloatArray, rank: IntArray, groups: IntArray) -> FloatArray:
+    """Weights (ranks,) of the decision: those of largest kappa, if they earn it where they were not chosen; else ones.
+
+    Parameters
+    ----------
+    probability : (n, ranks)
+        Forecasts of groups left out.
+    rank : (n,) int
+    groups : (n,) int
+        Each is decided once with the weights that suit the others.
+    """
+    said, plain_said = np.zeros_like(rank), decide(probability, np.ones(MAX_RANK))
+    for group in np.unique(groups):
+        out = groups == group
+        if np.ptp(rank[~out]) > 0:
+            said[out] = decide(probability[out], _kappa_weights(probability[~out], rank[~out]))
+        else:
+            said[out] = plain_said[out]
+    if cohen_kappa(rank, said) > np.nan_to_num(cohen_kappa(rank, plain_said)):
+        return _kappa_weights(probability, rank)
+    return np.ones(MAX_RANK)
+
+
 def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
     """Weights (ranks,) for the largest kappa: one for ranks below the commonest, one for those above.
 
@@ -405,7 +472,7 @@ def fit_mixture(
     best = int(np.argmin([log_losses(p, y).mean() for p in means]))
     return ReceiverMixture(
         members=tuple(_fitted(one, y, float(penalties[best])) for one in x),
-        decision_weight=_kappa_weights(means[best], y),
+        decision_weight=decision_weights(means[best], y, group),
     )
 
 
@@ -490,6 +557,28 @@ def choose_features(
     return FeatureChoice(
         best=int(final[rows[0]]), order=final[rows], log_score=score[rows], tied=tied, candidates=len(features)
     )
+
+
+def mixture_loss(features: FloatArray, rank: ArrayLike, groups: IntArray, penalty: float = 10.0) -> float:
+    """Log score of the mean forecast of several geometries on groups left out.
+
+    Parameters
+    ----------
+    features : (geometries, n, features)
+    rank, groups : (n,)
+        As :func:`fit_receiver`.
+    penalty : float
+        The same for all.
+
+    Returns
+    -------
+    float
+        [nat].
+    """
+    alive = np.asarray(np.isfinite(features).all(axis=(0, 2)))
+    _, y, group = _training(np.where(alive[:, None], features[0], np.nan), rank, groups)
+    x = features[:, alive & (np.nan_to_num(np.asarray(rank, dtype=np.float64)) >= 1)]
+    return float(log_losses(out_of_group(x, y, group, penalty).mean(axis=0), y).mean())
 
 
 def _own_losses(x: FloatArray, rank: IntArray, penalty: float) -> FloatArray:

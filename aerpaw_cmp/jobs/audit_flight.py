@@ -18,6 +18,8 @@ from ..common.units import AnyArray, FloatArray
 from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
+from ..flight.losses import path_loss, reflecting_crowns
+from ..flight.replay import Replayed, attitude_rotation, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
@@ -38,7 +40,6 @@ from ..propagation.reference import (
     turned,
 )
 from ..site.site import Site
-from .replay import Replayed, attitude_rotation, part_of, path_loss, reflecting_crowns
 
 ATTITUDE_ROWS = 200
 """Logged attitudes that are turned into rotations a second time."""

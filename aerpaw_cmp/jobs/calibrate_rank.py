@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,19 +21,23 @@ from ..common.errors import InputError, UsageError
 from ..common.units import FloatArray, IntArray
 from ..compare.forecast import ForecastScore, constant_forecast, score_forecast
 from ..compare.receiver import (
+    FeatureChoice,
     Receiver,
     ReceiverMixture,
     choose_features,
     fit_mixture,
+    mixture_loss,
     out_of_group,
     sector_groups,
     stream_features,
+    time_means,
 )
+from ..compare.rss import seconds
 from ..flight.data import FlightData, RankSeries, rank_positions
+from ..flight.replay import attitude_rotation
 from ..flight.settings import Settings
 from ..propagation.arrays import Link, Poses
 from ..propagation.geometries import Geometry, every_geometry, singular_values_of
-from .replay import attitude_rotation
 
 FORMAT = "aerpaw-cmp receiver 1"
 """First key of a receiver file."""
@@ -60,11 +65,19 @@ class RankFitSettings(Settings):
     """Of the geometries that cannot be told apart, how many the forecast averages."""
     thin: Annotated[int, Field(ge=1)] = 4
     """Every n-th sample chooses the geometry; all fit."""
+    shift_s: list[Annotated[float, Field(ge=-30, le=30)]] = Field(
+        default_factory=lambda: [0.0, 2.0, 4.0, 6.0], min_length=1
+    )
+    """Seconds to try by which a report belongs to a later position than the log says."""
+    average_s: list[Annotated[float, Field(ge=0, le=120)]] = Field(
+        default_factory=lambda: [0.0, 8.0, 16.0, 24.0], min_length=1
+    )
+    """Seconds to try over which the modelled channel is averaged."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RankSamples:
-    """Reports of one flight at one tower, at known positions: ``rank`` (n,), NaN without CSI."""
+    """Reports of one flight at one tower, at known positions: ``rank`` (n,), NaN without CSI; ``time_s`` (n,)."""
 
     flight: str
     tower: str
@@ -72,11 +85,24 @@ class RankSamples:
     poses: Poses
     rank: FloatArray
     link: Link
+    time_s: FloatArray
 
     def part(self, rows: Any) -> RankSamples:
         """Some of the samples."""
         poses = Poses(self.poses.position_m[rows], self.poses.rotation[rows])
-        return dataclasses.replace(self, poses=poses, rank=self.rank[rows])
+        return dataclasses.replace(self, poses=poses, rank=self.rank[rows], time_s=self.time_s[rows])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Timing:
+    """How reports follow the positions of a log: see :func:`~aerpaw_cmp.compare.receiver.time_means`.
+
+    ``log_score`` is that of the choice on sectors of the training flights left out [nat]; NaN where nothing was chosen.
+    """
+
+    shift_s: float = 0.0
+    average_s: float = 0.0
+    log_score: float = math.nan
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -89,10 +115,11 @@ class FittedReceiver:
     flights: tuple[str, ...]
     """It was fitted on: no score there is worth anything."""
     mixture: ReceiverMixture
+    timing: Timing = Timing()
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
         """Probability (n, 4) of each rank, and the one that is said."""
-        p = self.mixture.probabilities(features_of(self.geometries, samples))
+        p = self.mixture.probabilities(features_of(self.geometries, samples, self.timing))
         return p, self.mixture.decide(p)
 
     def as_dict(self) -> dict[str, Any]:
@@ -103,7 +130,24 @@ class FittedReceiver:
             "flights": list(self.flights),
             "members": [one.as_dict() for one in self.mixture.members],
             "decision_weight": self.mixture.decision_weight.tolist(),
+            "shift_s": self.timing.shift_s,
+            "average_s": self.timing.average_s,
         }
+
+    @classmethod
+    def from_dict(cls, tower: str, one: Mapping[str, Any]) -> FittedReceiver:
+        """From :meth:`as_dict`; files of 0.3.0 have no timing."""
+        return cls(
+            tower=tower,
+            geometries=tuple(_geometry(g) for g in one["geometries"]),
+            tied=int(one["tied"]),
+            flights=tuple(str(name) for name in one["flights"]),
+            mixture=ReceiverMixture(
+                members=tuple(Receiver.from_dict(m) for m in one["members"]),
+                decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
+            ),
+            timing=Timing(shift_s=float(one.get("shift_s", 0.0)), average_s=float(one.get("average_s", 0.0))),
+        )
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -139,19 +183,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
         content = json.loads(path.read_text(encoding="utf-8"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
-        return {
-            tower: FittedReceiver(
-                tower=tower,
-                geometries=tuple(_geometry(g) for g in one["geometries"]),
-                tied=int(one["tied"]),
-                flights=tuple(str(name) for name in one["flights"]),
-                mixture=ReceiverMixture(
-                    members=tuple(Receiver.from_dict(m) for m in one["members"]),
-                    decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
-                ),
-            )
-            for tower, one in content["towers"].items()
-        }
+        return {tower: FittedReceiver.from_dict(tower, one) for tower, one in content["towers"].items()}
     except OSError as error:
         raise InputError(f"cannot be read: {error.strerror}", expected="a receiver file", path=path) from None
     except (ValueError, KeyError, TypeError, AttributeError, UnicodeDecodeError) as error:
@@ -194,16 +226,26 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         poses=Poses(position[keep], np.ascontiguousarray(rotation[keep])),
         rank=series.rank[keep],
         link=link,
+        time_s=seconds(series.time[keep]),
     )
 
 
-def features_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
-    """Features (geometries, n, 4) of the modelled channels."""
+def powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
+    """Squares (geometries, n, 4) of the singular values of the modelled channels."""
     found = singular_values_of(
         geometries, samples.link.tower_arrays[samples.tower], samples.tower_m, samples.link.uav_array, samples.poses,
         samples.link.carrier_hz,
     )  # fmt: skip
-    return np.stack([stream_features(sigma) for sigma in found])
+    return np.stack([sigma**2 for sigma in found])
+
+
+def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
+    """Features (geometries, n, 4) of the modelled channels."""
+    return _features(powers_of(geometries, samples), samples, timing or Timing())
+
+
+def _features(power: FloatArray, samples: RankSamples, timing: Timing) -> FloatArray:
+    return stream_features(np.sqrt(time_means(power, samples.time_s, timing.shift_s, timing.average_s)))
 
 
 def candidates(settings: RankFitSettings, samples: RankSamples) -> tuple[Geometry, ...]:
@@ -236,7 +278,7 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
     receivers, warnings = {}, []
     scores: dict[str, list[tuple[str, str, ForecastScore]]] = {"flight_left_out": [], "sector_left_out": []}
     for tower, samples in towers.items():
-        tried = _Tried.of(samples, settings)
+        tried = Tried.of(samples, settings)
         receivers[tower] = tried.fit(range(len(samples)))
         if len(samples) < 2:
             warnings.append(f"rank at {tower}: one flight alone, no flight can be left out and nothing is scored")
@@ -262,38 +304,42 @@ def _sectors(one: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> 
     good = one.part(one.rank >= 1)
     groups = sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
-    found = out_of_group(features_of(fitted.geometries[:1], good)[0], good.rank.astype(np.int64), groups, penalty)
+    found = out_of_group(
+        features_of(fitted.geometries[:1], good, fitted.timing)[0], good.rank.astype(np.int64), groups, penalty
+    )
     return score_forecast(good.rank, found, found.argmax(axis=1) + 1, constant)
 
 
 @dataclass(frozen=True, slots=True)
-class _Tried:
-    """All candidates at thinned samples of each flight, evaluated once."""
+class Tried:
+    """All candidates at thinned samples of each flight, evaluated once: ``power`` (geometries, n, 4) per flight."""
 
     settings: RankFitSettings
     samples: Sequence[RankSamples]
     geometries: tuple[Geometry, ...]
     thin: Sequence[RankSamples]
-    features: Sequence[FloatArray]
+    power: Sequence[FloatArray]
 
     @classmethod
-    def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> _Tried:
+    def of(cls, samples: Sequence[RankSamples], settings: RankFitSettings) -> Tried:
+        """All candidates of the settings, for flights at one tower."""
         geometries = candidates(settings, samples[0])
         thin = [one.part(slice(None, None, settings.thin)) for one in samples]
-        return cls(settings, samples, geometries, thin, [features_of(geometries, one) for one in thin])
+        return cls(settings, samples, geometries, thin, [powers_of(geometries, one) for one in thin])
 
     def fit(self, flights: Sequence[int] | range) -> FittedReceiver:
-        """Choose geometries and fit on some of the flights."""
-        thin = [self.thin[i] for i in flights]
-        choice = choose_features(
-            np.concatenate([self.features[i] for i in flights], axis=1),
-            np.concatenate([one.rank for one in thin]),
-            _groups(thin),
-        )
+        """Choose geometries and timing, and fit, on some of the flights.
+
+        The geometries are chosen without timing first; the best of them choose the timing, with which all geometries
+        are then compared again.
+        """
+        first = self.choose(flights, Timing())
+        timing = self.choose_timing(flights, first.order[: self.settings.members])
+        choice = first if timing.shift_s == timing.average_s == 0.0 else self.choose(flights, timing)
         kept = tuple(self.geometries[i] for i in choice.tied[: self.settings.members])
         whole = [self.samples[i] for i in flights]
         mixture = fit_mixture(
-            np.concatenate([features_of(kept, one) for one in whole], axis=1),
+            np.concatenate([features_of(kept, one, timing) for one in whole], axis=1),
             np.concatenate([one.rank for one in whole]),
             _groups(whole),
             penalties=(3.0, 10.0, 30.0),
@@ -304,7 +350,38 @@ class _Tried:
             tied=len(choice.tied),
             flights=tuple(one.flight for one in whole),
             mixture=mixture,
+            timing=timing,
         )
+
+    def choose(self, flights: Sequence[int] | range, timing: Timing) -> FeatureChoice:
+        """Compare all geometries on sectors left out within the flights."""
+        thin = [self.thin[i] for i in flights]
+        return choose_features(
+            self.features(flights, timing), np.concatenate([one.rank for one in thin]), _groups(thin)
+        )
+
+    def choose_timing(self, flights: Sequence[int] | range, which: IntArray) -> Timing:
+        """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
+        thin = [self.thin[i] for i in flights]
+        rank, groups = np.concatenate([one.rank for one in thin]), _groups(thin)
+        found = [
+            Timing(
+                shift_s=shift_s,
+                average_s=average_s,
+                log_score=mixture_loss(
+                    self.features(flights, Timing(shift_s=shift_s, average_s=average_s), which), rank, groups
+                ),
+            )
+            for shift_s in self.settings.shift_s
+            for average_s in self.settings.average_s
+        ]
+        return min(found, key=lambda one: one.log_score)
+
+    def features(
+        self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)
+    ) -> FloatArray:
+        """Features (geometries, n, 4) at the thinned samples of some flights."""
+        return np.concatenate([_features(self.power[i][which], self.thin[i], timing) for i in flights], axis=1)
 
 
 def _groups(samples: Sequence[RankSamples]) -> IntArray:

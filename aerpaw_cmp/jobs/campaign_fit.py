@@ -19,10 +19,10 @@ from ..compare.offset import grid_offset
 from ..compare.result import APPLIED
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
+from ..flight.replay import Clock, estimate_clocks, replay_rss
 from ..flight.settings import FlightFile, RssSettings
 from ..report.campaign_data import HeldOutFold, HeldOutRow
 from .levels import levels_of
-from .replay import Clock, estimate_clocks, replay_rss
 
 Point = Mapping[str, float]
 

@@ -19,9 +19,9 @@ from ..compare.forecast import constant_forecast, log_losses
 from ..compare.statistics import paired_difference
 from ..flight.data import FlightData, choose_site
 from ..flight.overrides import overridden
+from ..flight.replay import replay_rank
 from ..report.campaign_data import RankHeldOutFold, RankHeldOutRow
 from .campaign_fit import LARGEST_PRODUCT, training_sets
-from .replay import replay_rank
 
 Criterion = Literal["kappa", "log_score", "total_variation"]
 Point = Mapping[str, Any]

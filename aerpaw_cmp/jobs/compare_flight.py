@@ -39,12 +39,13 @@ from ..compare.result import (
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.losses import direct_foliage_m
+from ..flight.replay import FlightReplay, Replayed, may_share
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, gain_sd_db, levels_of
-from .replay import FlightReplay, Replayed, direct_foliage_m, processes_for
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -75,7 +76,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
     found = []
-    for one in in_order(calls, processes_for(data), fewest=FEWEST_SERIES):
+    for one in in_order(calls, None if may_share(data) else 1, fewest=FEWEST_SERIES):
         found.append(one)
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(

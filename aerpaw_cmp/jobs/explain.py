@@ -16,6 +16,8 @@ from ..common.errors import UsageError
 from ..common.stages import Progress, silent
 from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries, Times, load_data, rank_positions
+from ..flight.losses import path_loss, roughness_loss
+from ..flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
 from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
 from ..propagation.explained import (
@@ -31,15 +33,6 @@ from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.tracer import Replay
 from ..site.site import Site
-from .replay import (
-    attitude_rotation,
-    estimate_clocks,
-    path_loss,
-    replay_poses,
-    roughness_loss,
-    telemetry_time,
-    valid_poses,
-)
 
 MORE_SAMPLES = 10
 """Times the samples with which Sionna is asked again for paths that it lacks."""

@@ -7,7 +7,7 @@ field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResul
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
 from functools import partial
@@ -17,10 +17,10 @@ from ..common.stages import Stages
 from ..compare.ladder import LadderRow, series_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
+from ..flight.replay import FlightReplay, may_share, replay_flight
 from .audit_flight import audit_replays
 from .compare_flight import FEWEST_SERIES, compare_flight
 from .ladder import FlightLadder, flight_ladder
-from .replay import Clock, FlightReplay, estimate_clocks, processes_for, replay_rank, replay_rss
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -45,43 +45,11 @@ class FlightRun:
     ladder: FlightLadder | None = None
 
 
-def replay_flight(
-    data: FlightData,
-    stages: Stages | None = None,
-    *,
-    clocks: Sequence[Clock | None] | None = None,
-    meanwhile: Callable[[], object] | None = None,
-) -> FlightReplay:
-    """Clocks and replay alone.
-
-    Parameters
-    ----------
-    data : FlightData
-    stages : Stages, optional
-        Times "clocks" and "replay".
-    clocks : sequence of Clock or None, optional
-        One per RSS series, in place of what ``rss.lag`` asks for.
-    meanwhile : callable, optional
-        As for :func:`~aerpaw_cmp.jobs.replay.estimate_clocks`.
-
-    Returns
-    -------
-    FlightReplay
-        Of every RSS and rank series.
-    """
-    stages = stages or Stages()
-    with stages("clocks"):
-        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
-    with stages("replay"):
-        return FlightReplay(
-            rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
-        )
-
-
 def run_flight(
     data: FlightData,
     stages: Stages | None = None,
     *,
+    replays: FlightReplay | None = None,
     audit: bool = True,
     ladder: bool = False,
     meanwhile: Callable[[], object] | None = None,
@@ -93,12 +61,14 @@ def run_flight(
     data : FlightData
     stages : Stages, optional
         Times "clocks", "replay", "compare", "audit" and "ladder".
+    replays : FlightReplay, optional
+        Of this flight, where they were made before (:func:`~aerpaw_cmp.flight.replay.replay_flight`).
     audit : bool
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
     meanwhile : callable, optional
-        What this process may do while others estimate clocks.
+        As for :func:`~aerpaw_cmp.flight.replay.estimate_clocks`.
 
     Returns
     -------
@@ -106,13 +76,13 @@ def run_flight(
         Replays, numbers of the comparison, and the ladder where it was asked for.
     """
     stages = stages or Stages()
-    replays = replay_flight(data, stages, meanwhile=meanwhile)
+    replays = replays or replay_flight(data, stages, meanwhile=meanwhile)
     with ExitStack() as running:
         # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
         climb: Callable[[], FlightLadder | None] | None = None
         if ladder:
             climb = partial(flight_ladder, data, replays)
-            climb = running.enter_context(beside(climb)) if processes_for(data) is None else climb
+            climb = running.enter_context(beside(climb)) if may_share(data) else climb
         with stages("compare"):
             result = compare_flight(data, replays)
         if audit:

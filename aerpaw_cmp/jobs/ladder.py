@@ -20,6 +20,8 @@ from ..common.units import FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
 from ..flight.data import FlightData
+from ..flight.losses import path_loss
+from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ..flight.settings import FlightFile
 from ..propagation.arrays import Link, Poses
 from ..propagation.channel import mean_pair_power, rss_dbm
@@ -30,7 +32,6 @@ from ..site.installed import InstalledPattern
 from ..site.site import Site
 from ..site.sphere_pattern import SpherePattern
 from .levels import Levels, levels_of
-from .replay import FlightReplay, Replayed, attitude_rotation, fields_from, path_loss
 
 WEAK_GROUND_DB = 10.0
 """Loss of the weakened ground reflection: a smooth half-space reflects more than any field."""

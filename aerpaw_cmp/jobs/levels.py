@@ -9,9 +9,9 @@ import numpy as np
 from ..common.units import BoolArray, FloatArray
 from ..compare import rss
 from ..flight.data import RssSeries
+from ..flight.replay import Replayed
 from ..flight.settings import RssSettings
 from ..site.site import Site
-from .replay import Replayed
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -16,12 +16,11 @@ from ..common.units import ComplexArray, FloatArray
 from ..compare.result import FlightResult
 from ..flight.data import FlightData, gather, load_data, rank_positions
 from ..flight.overrides import overridden
+from ..flight.replay import FlightReplay, Replayed, replay_flight
 from ..flight.settings import FlightFile, load_flight
 from ..propagation.paths import PathSet
 from ..site.site import Site
 from .compare_flight import compare_flight
-from .flight_run import replay_flight
-from .replay import FlightReplay, Replayed
 
 Series = tuple[str, str]
 """Tower and channel of an RSS series; tower and ``"rank"`` of a rank series."""

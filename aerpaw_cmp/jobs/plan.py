@@ -200,7 +200,7 @@ def report_plan(
 def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedStage]]:
     """A stage per replayed RSS link and per rank series, timed on a few of their poses."""
     from ..flight.data import rank_positions
-    from .replay import attitude_rotation
+    from ..flight.replay import attitude_rotation
 
     groups: dict[tuple[str, str], list[Any]] = {}
     for series in data.rss:
@@ -222,7 +222,7 @@ def _tried_replays(data: FlightData) -> tuple[list[PlannedStage], list[PlannedSt
 
 def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> PlannedStage:
     """The stage of one replay; a Sionna replay is not tried, since it compiles first."""
-    from .replay import replay_poses
+    from ..flight.replay import replay_poses
 
     work, n = f"{len(poses)} poses, engine {rt.engine}", len(poses)
     if rt.engine != "image" or n == 0:

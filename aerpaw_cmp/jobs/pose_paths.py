@@ -8,8 +8,8 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.replay import FlightReplay, Replayed
 from ..report.data import PosePaths
-from .replay import FlightReplay, Replayed
 
 POSES = 300
 """Poses per tower whose paths are drawn."""

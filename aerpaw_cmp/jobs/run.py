@@ -215,6 +215,7 @@ def run_report(
         With what was found, expected, and the likely cause.
     """
     from ..flight.data import load_data
+    from ..flight.replay import replay_flight
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
@@ -231,7 +232,6 @@ def run_report(
     if recommend is not None:
         _beside(recommend, flight, logs_root)
     settings = _overridden(load_flight(flight), engine, audit)
-    formats = chosen_formats(settings.report.export, export)
     inputs = input_files(settings, flight, logs_root)
     folder = out or Path("reports") / settings.flight.name
     with ExitStack() as outputs:
@@ -239,10 +239,12 @@ def run_report(
         target = None
         if recommend is not None:
             target = outputs.enter_context(OutputFile(recommend, own=is_sealed, inputs=inputs, force=force))
+        formats = chosen_formats(settings.report.export, export)
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
-        found = run_flight(data, stages, ladder=True, meanwhile=partial(prepare_report, figures))
+        replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
+        found = run_flight(data, stages, replays=replays, ladder=True)
         record = report_record(found, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
@@ -581,10 +583,10 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     """Propagation paths of all towers to one point of the track, as polylines."""
     import numpy as np
 
+    from ..flight.losses import path_loss, reflecting_crowns
     from ..propagation.arrays import Link, Poses, single_element
     from ..propagation.tracer import replay
     from ..report.site_view import PathLine
-    from .replay import path_loss, reflecting_crowns
 
     if track is None or not 0 <= pose < len(track.time):
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
@@ -617,11 +619,11 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
 
     from ..compare.rank import channel_rank
     from ..flight.data import choose_site
+    from ..flight.replay import replay_poses
     from ..flight.settings import load_flight
     from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
     from ..logs.readers import by_name
     from ..propagation.arrays import Poses, rotation_from_aircraft
-    from .replay import replay_poses
 
     settings = load_flight(flight)
     site = choose_site(settings.site, flight.parent)

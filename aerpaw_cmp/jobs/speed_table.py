@@ -20,11 +20,11 @@ from ..common.files import write_whole
 from ..common.stages import Progress, silent
 from ..common.versions import versions
 from ..flight.data import FlightData
+from ..flight.replay import Replayed
 from ..machine import llvm
 from ..propagation.arrays import Isotropic, Poses
 from ..propagation.bench import Row, speed_against_error
 from ..report.data import SpeedRow
-from .replay import Replayed
 
 POSES = 40
 """Evenly spread poses of the flight that the table is made on."""

@@ -14,6 +14,8 @@ from ..compare.offset import expected_offset_db, read_reference_powers, referenc
 from ..compare.rank import rank_from_singular_values, singular_values
 from ..compare.result import FoliageLoss, FoliageRankChange
 from ..flight.data import RssSeries
+from ..flight.losses import path_loss
+from ..flight.replay import Replayed, attitude_rotation, fields_from
 from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
 from ..propagation.channel import Fields, mean_pair_power, rss_dbm
@@ -22,7 +24,6 @@ from ..propagation.tracer import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
-from .replay import Replayed, attitude_rotation, fields_from, path_loss
 
 LEAVES = ("in", "out")
 
@@ -43,7 +44,7 @@ def evaluate(
     replayed : Replayed
         Its paths are taken as they are.
     loss : callable or None
-        Loss per path [dB], as :func:`aerpaw_cmp.jobs.replay.path_loss` gives it.
+        Loss per path [dB], as :func:`aerpaw_cmp.flight.losses.path_loss` gives it.
     link, poses : optional
         In place of those of the replay; as many poses.
 

@@ -9,6 +9,8 @@ from aerpaw_cmp.compare.rank import channel_rank, cohen_kappa
 from aerpaw_cmp.compare.receiver import (
     Receiver,
     choose_features,
+    decide,
+    decision_weights,
     fit_mixture,
     fit_ordered,
     fit_receiver,
@@ -17,6 +19,7 @@ from aerpaw_cmp.compare.receiver import (
     rank_by_thresholds,
     sector_groups,
     stream_features,
+    time_means,
 )
 
 
@@ -153,3 +156,35 @@ def test_sectors_are_contiguous_directions_of_equal_share():
     group = sector_groups(at, np.zeros(3))
     assert np.bincount(group).tolist() == [100] * 8
     assert (np.diff(group[np.argsort(azimuth)]) != 0).sum() == 7
+
+
+def test_weights_of_the_decision_must_earn_their_kappa() -> None:
+    rng = np.random.default_rng(3)
+    groups = np.repeat(np.arange(4), 200)
+    rare = rng.random(800) < 0.25
+    rank = np.where(rare, 3, 2)
+    # a forecast that knows but is too timid: the rare rank is never the most probable one
+    p3 = np.where(rng.random(800) < 0.9, np.where(rare, 0.4, 0.1), 0.2)
+    timid = np.stack([np.full(800, 0.01), 0.98 - p3, p3, np.full(800, 0.01)], axis=1)
+    weight = decision_weights(timid, rank, groups)
+    assert weight[2] > weight[1]
+    assert cohen_kappa(rank, decide(timid, weight)) > 0.8
+    # a forecast of nothing: what suits seven groups suits the eighth no better
+    p3 = rng.uniform(0.1, 0.45, 800)
+    empty = np.stack([np.full(800, 0.01), 0.98 - p3, p3, np.full(800, 0.01)], axis=1)
+    left = [decision_weights(empty, rng.permutation(rank), groups) for _ in range(4)]
+    assert any(np.ptp(w) == 0 for w in left)
+
+
+def test_means_in_time_are_those_of_a_loop() -> None:
+    rng = np.random.default_rng(4)
+    time = np.sort(rng.uniform(0, 60, 80))
+    time[40:] += 30.0  # a gap
+    order = rng.permutation(80)
+    power = rng.exponential(size=(2, 80, 3))
+    for shift, average in ((0.0, 0.0), (3.0, 8.0), (-4.0, 5.0)):
+        found = time_means(power[:, order], time[order], shift, average)
+        for row, i in enumerate(order):
+            near = np.abs(time - time[i] - shift) <= average / 2
+            near = near if near.any() else np.arange(80) == np.abs(time - time[i] - shift).argmin()
+            np.testing.assert_allclose(found[:, row], power[:, near].mean(axis=1))

@@ -11,10 +11,12 @@ import pytest
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.receiver import rank_by_thresholds
 from aerpaw_cmp.jobs.calibrate_rank import (
+    FittedReceiver,
     RankCalibration,
     RankFitSettings,
     RankSamples,
-    _Tried,
+    Timing,
+    Tried,
     features_of,
     read_receiver,
 )
@@ -33,24 +35,30 @@ def flight(seed: int) -> RankSamples:
     link = Link(3.4e9, {"T": tower_comparison_array()}, uav_comparison_array(0.0882), uav_transmits=False)
     poses = Poses(at, np.tile(np.eye(3), (400, 1, 1)))
     return RankSamples(
-        flight=f"f{seed}", tower="T", tower_m=np.array([0.0, 0.0, 12.0]), poses=poses, rank=np.zeros(400), link=link
+        flight=f"f{seed}",
+        tower="T",
+        tower_m=np.array([0.0, 0.0, 12.0]),
+        poses=poses,
+        rank=np.zeros(400),
+        link=link,
+        time_s=np.arange(400.0),
     )
 
 
 @pytest.fixture(scope="module")
-def tried() -> _Tried:
+def tried() -> Tried:
     flights = [flight(1), flight(2)]
-    truth = _Tried.of(flights, SETTINGS).geometries[5]
+    truth = Tried.of(flights, SETTINGS).geometries[5]
     planted = []
     for one in flights:
         ratio = features_of([truth], one)[0][:, :3]
         rank = rank_by_thresholds(ratio, tuple(np.median(ratio, axis=0))).astype(float)
         flip = np.random.default_rng(7).random(400) < 0.05
         planted.append(dataclasses.replace(one, rank=np.where(flip, 1.0 + (rank % 4), rank)))
-    return _Tried.of(planted, SETTINGS)
+    return Tried.of(planted, SETTINGS)
 
 
-def test_the_planted_geometry_is_found_and_forecasts_the_other_flight(tried: _Tried) -> None:
+def test_the_planted_geometry_is_found_and_forecasts_the_other_flight(tried: Tried) -> None:
     fitted = tried.fit([0])
     assert tried.geometries[5] in fitted.geometries
     other = tried.samples[1]
@@ -59,7 +67,7 @@ def test_the_planted_geometry_is_found_and_forecasts_the_other_flight(tried: _Tr
     assert np.mean(said == other.rank) > 0.7
 
 
-def test_a_receiver_survives_its_file(tried: _Tried, tmp_path: Path) -> None:
+def test_a_receiver_survives_its_file(tried: Tried, tmp_path: Path) -> None:
     fitted = tried.fit([0, 1])
     path = tmp_path / "receiver.json"
     path.write_text(RankCalibration(receivers={"T": fitted}, scores={}, warnings=()).text(), encoding="utf-8")
@@ -67,6 +75,35 @@ def test_a_receiver_survives_its_file(tried: _Tried, tmp_path: Path) -> None:
     assert again.geometries == fitted.geometries
     assert again.flights == ("f1", "f2")
     np.testing.assert_array_equal(again.forecast(tried.samples[0])[0], fitted.forecast(tried.samples[0])[0])
+
+
+def legs() -> RankSamples:
+    """Straight legs at 10 m/s past the tower, twice a second, so that neighbours in time are neighbours in place."""
+    at = np.arange(0.0, 4000.0, 5.0)
+    leg, along = np.divmod(at, 500.0)
+    east, north = -60.0 - 40.0 * leg, np.where(leg % 2 == 0, along - 250.0, 250.0 - along)
+    position = np.column_stack([east, north, np.full(len(at), 30.0)])
+    start = flight(1)
+    poses = Poses(position, np.tile(np.eye(3), (len(at), 1, 1)))
+    return dataclasses.replace(start, poses=poses, rank=np.zeros(len(at)), time_s=0.1 * at)
+
+
+@pytest.mark.parametrize(("shift_s", "average_s"), [(4.0, 0.0), (2.0, 12.0)])
+def test_planted_delay_and_mean_of_the_reports_are_found(shift_s: float, average_s: float) -> None:
+    settings = RankFitSettings(
+        yaw_step_deg=90, uav_slant_deg=[[45, -45, -45, 45]], ground=[0.2], thin=1, members=1,
+        shift_s=[0, 2, 4], average_s=[0, 12],
+    )  # fmt: skip
+    bare = legs()
+    truth = Tried.of([bare], settings).geometries[1]
+    planted = Timing(shift_s=shift_s, average_s=average_s)
+    ratio = features_of([truth], bare, planted)[0][:, :3]
+    rank = rank_by_thresholds(ratio, tuple(np.median(ratio, axis=0))).astype(float)
+    fitted = Tried.of([dataclasses.replace(bare, rank=rank)], settings).fit([0])
+    assert (fitted.timing.shift_s, fitted.timing.average_s) == (shift_s, average_s)
+    again = FittedReceiver.from_dict("T", fitted.as_dict())
+    assert again.timing.shift_s == shift_s
+    assert again.timing.average_s == average_s
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"format": "other"}', '{"format": "aerpaw-cmp receiver 1"}'])

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.flight.clock import ClockEstimate
-from aerpaw_cmp.jobs.replay import _clock_of, telemetry_time
+from aerpaw_cmp.flight.replay import _clock_of, telemetry_time
 from aerpaw_cmp.report.build import clock_warnings, clocks_of, metrics_beyond_panels
 
 TIME = np.datetime64("2024-07-15T15:48:16", "ns") + (np.arange(100) * 1e9).astype("timedelta64[ns]")

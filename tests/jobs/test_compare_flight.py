@@ -16,12 +16,12 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.compare.result import FlightResult, RssResult
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.replay import replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import body_rotation
 from aerpaw_cmp.jobs.audit_flight import audit_replays
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series, pairs_of
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.replay import replay_rank, replay_rss
 from aerpaw_cmp.jobs.run import _paths_of_pose
 from aerpaw_cmp.jobs.what_if import foliage_notes
 from aerpaw_cmp.report.build import (

@@ -6,10 +6,11 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
+from aerpaw_cmp.flight.losses import path_loss, roughness_loss
+from aerpaw_cmp.flight.replay import replay_poses
 from aerpaw_cmp.flight.settings import RtSettings
 from aerpaw_cmp.jobs.calibrate import GroundFit
 from aerpaw_cmp.jobs.ladder import Model, recommended_settings
-from aerpaw_cmp.jobs.replay import path_loss, replay_poses, roughness_loss
 from aerpaw_cmp.propagation import reference
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
 from aerpaw_cmp.propagation.baselines import two_ray_dbm

@@ -8,10 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.flight import replay as replay_job
 from aerpaw_cmp.flight import track as track_room
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
-from aerpaw_cmp.jobs import replay as replay_job
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs" / "flight.yaml"
 

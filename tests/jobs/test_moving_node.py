@@ -8,12 +8,12 @@ import pytest
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
+from aerpaw_cmp.flight.replay import FlightReplay, replay_rank, replay_rss
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.audit_flight import standing
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.jobs.ladder import flight_ladder
-from aerpaw_cmp.jobs.replay import FlightReplay, replay_rank, replay_rss
 from aerpaw_cmp.propagation.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.report.build import rank_panel, rss_panel

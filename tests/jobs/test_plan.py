@@ -73,7 +73,7 @@ def test_the_time_of_a_replay_follows_its_poses(monkeypatch: pytest.MonkeyPatch,
     settings = load_flight(file)
     data = gather(settings, SAMPLE, read_logs(settings, SAMPLE, None), None)
     calls: list[int] = []
-    monkeypatch.setattr("aerpaw_cmp.jobs.replay.replay_poses", lambda _s, _r, _l, poses: calls.append(len(poses)))
+    monkeypatch.setattr("aerpaw_cmp.flight.replay.replay_poses", lambda _s, _r, _l, poses: calls.append(len(poses)))
 
     def charged(work: Any) -> float:
         work()

@@ -9,8 +9,8 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
+from aerpaw_cmp.flight.replay import check_interactions
 from aerpaw_cmp.flight.settings import RtSettings
-from aerpaw_cmp.jobs.replay import check_interactions
 from aerpaw_cmp.propagation import interactions
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,

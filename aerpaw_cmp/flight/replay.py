@@ -13,23 +13,22 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.forked import ahead
-from ..common.stages import Progress, share_of, silent
-from ..common.units import BoolArray, FloatArray, wavelength_m
+from ..common.stages import Progress, Stages, share_of, silent
+from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
-from ..flight.clock import ClockChannel, ClockEstimate, judge_clock
-from ..flight.data import FlightData, RssSeries, Times, rank_positions
-from ..flight.lag import DIRECTION_TERMS, terms_from
-from ..flight.settings import RtSettings
-from ..flight.track import TrackPoses
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.channel import Fields, channel_matrices
-from ..propagation.crowns import Crowns
 from ..propagation.effort import Estimate
-from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
 from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
-from ..site.site import Site, Trees
+from ..site.site import Site
+from .clock import ClockChannel, ClockEstimate, judge_clock
+from .data import FlightData, RssSeries, Times, rank_positions
+from .lag import DIRECTION_TERMS, terms_from
+from .losses import crowns_reflect, path_loss, reflecting_crowns
+from .settings import RtSettings
+from .track import TrackPoses
 
 COHERENT_STEP_S = 0.02
 """Sampling of the coherent prediction: two-ray ripples near a tower pass within 0.05 s at 10 m/s."""
@@ -88,6 +87,39 @@ class FlightReplay:
     def all(self) -> tuple[Replayed, ...]:
         """RSS first, then rank."""
         return (*self.rss, *self.rank)
+
+
+def replay_flight(
+    data: FlightData,
+    stages: Stages | None = None,
+    *,
+    clocks: Sequence[Clock | None] | None = None,
+    meanwhile: Callable[[], object] | None = None,
+) -> FlightReplay:
+    """Clocks and replay alone.
+
+    Parameters
+    ----------
+    data : FlightData
+    stages : Stages, optional
+        Times "clocks" and "replay".
+    clocks : sequence of Clock or None, optional
+        One per RSS series, in place of what ``rss.lag`` asks for.
+    meanwhile : callable, optional
+        As for :func:`estimate_clocks`.
+
+    Returns
+    -------
+    FlightReplay
+        Of every RSS and rank series.
+    """
+    stages = stages or Stages()
+    with stages("clocks"):
+        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
+    with stages("replay"):
+        return FlightReplay(
+            rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
+        )
 
 
 def replay_rss(
@@ -167,7 +199,7 @@ def estimate_clocks(
     predict, found = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
-    with ahead(calls, processes_for(data)) as estimates:
+    with ahead(calls) if may_share(data) else ahead(calls, 1) as estimates:
         if meanwhile is not None:
             meanwhile()
         for tower in towers:
@@ -194,9 +226,9 @@ SHARED_UP_TO = 200_000
 """RSS samples of a flight up to which its series are shared by several processes."""
 
 
-def processes_for(data: FlightData) -> int | None:
-    """Processes for the series of a flight: as many as are safe; one on a long flight, where each holds much memory."""
-    return None if sum(len(series.time) for series in data.rss) <= SHARED_UP_TO else 1
+def may_share(data: FlightData) -> bool:
+    """Whether processes may share the series of a flight: not of a long one, where each would hold much memory."""
+    return sum(len(series.time) for series in data.rss) <= SHARED_UP_TO
 
 
 BLOCK = 100_000
@@ -425,7 +457,6 @@ def replay_poses(
     check_interactions(rt)
     others = engine is None if others is None else others
     engine = engine or rt.engine
-    crowns = reflecting_crowns(site.trees, rt)
     if towers_m is not None:
         name = "+".join(link.tower_arrays)
         _check_moving(rt, engine, name)
@@ -436,7 +467,7 @@ def replay_poses(
             towers_m,
             max_depth=rt.max_depth,
             loss=path_loss(site, rt, link.carrier_hz),
-            crowns=crowns,
+            crowns=reflecting_crowns(site.trees, rt),
             power_cut_db=rt.power_cut_db,
             visibility=rt.visibility,
             threads=rt.threads,
@@ -444,7 +475,8 @@ def replay_poses(
             progress=share_of(progress, f"replay {name}, which moves"),
         )
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    if len(poses) > BLOCK and engine == "image" and crowns is None and rt.relevance_db is None:
+    whole = rt.relevance_db is not None or crowns_reflect(site.trees, rt)
+    if len(poses) > BLOCK and engine == "image" and not whole:
         parts: list[Replay] = []
         for rows in _in_blocks(np.arange(len(poses))):
             progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
@@ -463,7 +495,7 @@ def replay_poses(
         samples=rt.samples,
         batch=rt.batch,
         loss=path_loss(site, rt, link.carrier_hz),
-        crowns=crowns,
+        crowns=reflecting_crowns(site.trees, rt),
         cache_dir=None if rt.cache else "",
         relevance_db=rt.relevance_db,
         power_cut_db=rt.power_cut_db,
@@ -573,132 +605,3 @@ def _joined_replays(parts: list[Replay]) -> Replay:
         search_seconds=search,
         left_out=left_out,
     )
-
-
-def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
-    """Crowns that reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
-    return Crowns(trees) if rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0 else None
-
-
-def path_loss(
-    site: Site, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
-) -> Loss | None:
-    """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
-
-    Parameters
-    ----------
-    site : Site
-        Its crowns and trunks, and how high its ground lies.
-    rt : RtSettings
-        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
-        ``ground_roughness_m``.
-    carrier_hz : float
-    foliage, leaves : str, optional
-        In place of those of ``rt``.
-
-    Returns
-    -------
-    callable or None
-        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
-        through; None where no path loses anything.
-
-    Raises
-    ------
-    UsageError
-        ``rt.ground_roughness_m`` with a scene of triangles.
-    """
-    through = _foliage_loss(site.trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
-    per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
-    if per_reflection == 0.0 and rough is None:
-        return through
-
-    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
-        ground_db = 0.0 if rough is None else rough(paths, sources_m, targets_m)
-        return np.asarray(trees_db + ground_db + per_reflection * paths.depth, dtype=np.float64)
-
-    return loss
-
-
-ON_GROUND_M = 1e-6
-"""A reflection this near to a ground plane of the site is one off the ground."""
-
-
-def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
-    """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
-
-    Parameters
-    ----------
-    site : Site
-        Its ground planes: that of the origin and those of its towers.
-    rt : RtSettings
-    carrier_hz : float
-
-    Returns
-    -------
-    callable or None
-        As :func:`path_loss` gives it.
-
-    Raises
-    ------
-    UsageError
-        A site that is a scene of triangles.
-
-    Notes
-    -----
-    Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
-    centres (:func:`aerpaw_cmp.propagation.baselines.specular_factor`, here as a loss, which does not underflow); what
-    leaves the specular direction is not followed.
-    """
-    sigma = rt.ground_roughness_m
-    if sigma == 0.0:
-        return None
-    if site.scene is not None:
-        raise UsageError(
-            "rt.ground_roughness_m on a site that is a scene of triangles",
-            expected="a site with a ground plane, or reflection_loss_db",
-            cause="no face of the scene is known to be its ground",
-        )
-    heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
-    wavelength = wavelength_m(carrier_hz)
-
-    def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
-        total, here = np.zeros(len(paths)), sources_m[paths.tower]
-        for step in range(paths.vertices_m.shape[1]):
-            corner = paths.vertices_m[:, step]
-            on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
-            on &= paths.tree[:, step] < 0
-            ray = corner[on] - here[on]
-            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)
-            total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
-            here = np.where(np.isfinite(corner), corner, here)
-        return total
-
-    return loss
-
-
-def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
-    if len(trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
-        return None  # where opaque crowns reflect, a run without trees has to lose those paths
-    name = rt.foliage_model if foliage == "attenuating" else foliage
-    own = leaves == rt.leaves  # numbers of the flight file belong to its own season
-    model = foliage_model(
-        name,
-        carrier_hz,
-        in_leaf=leaves == "in",
-        gamma_db_per_m=rt.gamma_db_per_m if own else None,
-        maximum_db=rt.maximum_loss_db if own else None,
-    )
-    index = crown_index(trees)
-
-    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
-        source, target = sources_m[paths.tower], targets_m[paths.pose]
-        return foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
-
-    return loss
-
-
-def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, trees: Trees) -> FloatArray:
-    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
-    source = np.broadcast_to(tower_m, poses_m.shape)
-    return foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, trees)

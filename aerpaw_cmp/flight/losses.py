@@ -1,0 +1,148 @@
+"""What a path of a flight loses besides its own field: foliage, reflections, rough ground; and which crowns reflect."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import FloatArray, wavelength_m
+from ..propagation.crowns import Crowns
+from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.paths import PathSet
+from ..propagation.tracer import Loss
+from ..site.site import Site, Trees
+from .settings import RtSettings
+
+
+def crowns_reflect(trees: Trees, rt: RtSettings) -> bool:
+    """Whether crowns reflect: those of ``foliage: opaque``, unless ``rt.crown_reflections`` is off."""
+    return rt.foliage == "opaque" and rt.crown_reflections and len(trees) > 0
+
+
+def reflecting_crowns(trees: Trees, rt: RtSettings) -> Crowns | None:
+    """Crowns that reflect, or None."""
+    return Crowns(trees) if crowns_reflect(trees, rt) else None
+
+
+def path_loss(
+    site: Site, rt: RtSettings, carrier_hz: float, *, foliage: str | None = None, leaves: str | None = None
+) -> Loss | None:
+    """Loss per path besides the field's own: foliage and reflections, a function of paths and their ends.
+
+    Parameters
+    ----------
+    site : Site
+        Its crowns and trunks, and how high its ground lies.
+    rt : RtSettings
+        ``foliage``, ``foliage_model``, ``gamma_db_per_m``, ``maximum_loss_db``, ``leaves``, ``reflection_loss_db``,
+        ``ground_roughness_m``.
+    carrier_hz : float
+    foliage, leaves : str, optional
+        In place of those of ``rt``.
+
+    Returns
+    -------
+    callable or None
+        ``loss(paths, sources_m (towers, 3), targets_m (poses, 3)) -> (paths,)`` [dB], infinite where nothing gets
+        through; None where no path loses anything.
+
+    Raises
+    ------
+    UsageError
+        ``rt.ground_roughness_m`` with a scene of triangles.
+    """
+    through = _foliage_loss(site.trees, rt, carrier_hz, foliage or rt.foliage, leaves or rt.leaves)
+    per_reflection, rough = rt.reflection_loss_db, roughness_loss(site, rt, carrier_hz)
+    if per_reflection == 0.0 and rough is None:
+        return through
+
+    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+        trees_db = 0.0 if through is None else through(paths, sources_m, targets_m)
+        ground_db = 0.0 if rough is None else rough(paths, sources_m, targets_m)
+        return np.asarray(trees_db + ground_db + per_reflection * paths.depth, dtype=np.float64)
+
+    return loss
+
+
+ON_GROUND_M = 1e-6
+"""A reflection this near to a ground plane of the site is one off the ground."""
+
+
+def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None:
+    """Loss [dB] of ground reflections by ``rt.ground_roughness_m``; None where the ground is smooth.
+
+    Parameters
+    ----------
+    site : Site
+        Its ground planes: that of the origin and those of its towers.
+    rt : RtSettings
+    carrier_hz : float
+
+    Returns
+    -------
+    callable or None
+        As :func:`path_loss` gives it.
+
+    Raises
+    ------
+    UsageError
+        A site that is a scene of triangles.
+
+    Notes
+    -----
+    Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
+    centres (:func:`aerpaw_cmp.propagation.baselines.specular_factor`, here as a loss, which does not underflow); what
+    leaves the specular direction is not followed.
+    """
+    sigma = rt.ground_roughness_m
+    if sigma == 0.0:
+        return None
+    if site.scene is not None:
+        raise UsageError(
+            "rt.ground_roughness_m on a site that is a scene of triangles",
+            expected="a site with a ground plane, or reflection_loss_db",
+            cause="no face of the scene is known to be its ground",
+        )
+    heights = np.array(sorted({0.0, *(tower.ground_m for tower in site.towers.values())}))
+    wavelength = wavelength_m(carrier_hz)
+
+    def loss(paths: PathSet, sources_m: FloatArray, _targets_m: FloatArray) -> FloatArray:
+        total, here = np.zeros(len(paths)), sources_m[paths.tower]
+        for step in range(paths.vertices_m.shape[1]):
+            corner = paths.vertices_m[:, step]
+            on = np.abs(corner[:, 2:] - heights).min(axis=1) < ON_GROUND_M  # NaN where the path has no such corner
+            on &= paths.tree[:, step] < 0
+            ray = corner[on] - here[on]
+            sine = np.abs(ray[:, 2]) / np.maximum(np.linalg.norm(ray, axis=1), ON_GROUND_M)
+            total[on] += 40.0 * np.log10(np.e) * (2.0 * np.pi / wavelength * sigma * sine) ** 2
+            here = np.where(np.isfinite(corner), corner, here)
+        return total
+
+    return loss
+
+
+def _foliage_loss(trees: Trees, rt: RtSettings, carrier_hz: float, foliage: str, leaves: str) -> Loss | None:
+    if len(trees) == 0 or (foliage == "none" and rt.foliage != "opaque"):
+        return None  # where opaque crowns reflect, a run without trees has to lose those paths
+    name = rt.foliage_model if foliage == "attenuating" else foliage
+    own = leaves == rt.leaves  # numbers of the flight file belong to its own season
+    model = foliage_model(
+        name,
+        carrier_hz,
+        in_leaf=leaves == "in",
+        gamma_db_per_m=rt.gamma_db_per_m if own else None,
+        maximum_db=rt.maximum_loss_db if own else None,
+    )
+    index = crown_index(trees)
+
+    def loss(paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray:
+        source, target = sources_m[paths.tower], targets_m[paths.pose]
+        return foliage_loss_db(source, paths.vertices_m, target, index, model, paths.tree)
+
+    return loss
+
+
+def direct_foliage_m(tower_m: FloatArray, poses_m: FloatArray, trees: Trees) -> FloatArray:
+    """Length (n,) [m] inside tree crowns of the direct lines from a tower (3,), or (n, 3), to poses (n, 3) [m]."""
+    source = np.broadcast_to(tower_m, poses_m.shape)
+    return foliage_depth_m(source, np.zeros((len(poses_m), 0, 3)), poses_m, trees)

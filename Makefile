@@ -12,6 +12,8 @@ REPORT := reports/sample
 
 # a PYTHONPATH from another project must not reach into our environment
 unexport PYTHONPATH PYTHONHOME PIP_USER
+# without bytecode kept, every worker and every child of a test compiles the package and rewrites the tests anew
+unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
 .PHONY: help setup report test bench bench-all docs clean
@@ -45,14 +47,17 @@ report: $(READY) $(LLVM)
 	$(BIN)/aerpaw-cmp report sample_logs/flight.yaml -o $(REPORT) --force
 	@echo "The report: $(CURDIR)/$(REPORT)/report.html"
 
+# the order of files is that of tests/conftest.py: the dearest first
+WORKERS := -q -n auto --dist loadfile --no-loadscope-reorder
+
 # mypy uses one core, so it runs beside pytest; what it says comes last
 test: setup
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
 	@said=$$(mktemp); $(BIN)/mypy >"$$said" 2>&1 & types=$$!; \
-	echo "$(BIN)/python -m pytest -q -n auto --dist loadfile"; \
-	$(BIN)/python -m pytest -q -n auto --dist loadfile; tested=$$?; \
+	echo "$(BIN)/python -m pytest $(WORKERS)"; \
+	$(BIN)/python -m pytest $(WORKERS); tested=$$?; \
 	echo "$(BIN)/mypy"; wait $$types; typed=$$?; cat "$$said"; rm -f "$$said"; \
 	[ $$tested -eq 0 ] && [ $$typed -eq 0 ]
 

@@ -2,15 +2,17 @@
 
 from __future__ import annotations
 
+import gc
 import os
 import random
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import pytest
+from _pytest.doctest import DoctestModule
 from hypothesis import settings
 
 # In CI the same examples run every time, so that a red run can be repeated; elsewhere every run looks further.
@@ -19,8 +21,38 @@ settings.register_profile("further", deadline=None)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed" if os.environ.get("CI") else "further")
 
-# Nothing kept on this machine decides a test, and no test leaves anything in the user's cache.
+# Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
+# have a folder each; that this machine's LLVM works is found out once for all of them.
+_OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
 os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
+if _OF_ALL:
+    Path(_OF_ALL, "llvm").mkdir(exist_ok=True)
+    Path(os.environ["AERPAW_CMP_CACHE"], "llvm").symlink_to(Path(_OF_ALL, "llvm"))
+
+
+DEAREST = (
+    "propagation/test_growth.py",  # the first two compile different kernels, where none are kept yet
+    "propagation/test_compiled.py",
+    "test_field.py",
+    "jobs/test_campaign.py",
+    "parsers/test_law.py",
+    "report/test_figures.py",
+    "report/test_browser.py",
+    "propagation/test_sionna.py",
+    "test_cli_commands.py",
+    "jobs/test_coverage_map.py",
+    "jobs/test_compare_flight.py",
+    "live/test_tap.py",
+    "report/test_browser_campaign.py",
+    "jobs/test_workers.py",
+    "machine/test_llvm.py",
+    "live/test_log.py",
+    "live/test_bad_input.py",
+    "flight/test_lag.py",
+    "report/test_diff.py",
+    "live/test_benchmarks.py",
+)
+"""Files that take 5 s and more, the longest first."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
@@ -30,9 +62,14 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """Files in an order drawn with the seed, and in each its tests; the same in every process."""
+    """Files in an order drawn with the seed, and in each its tests, the same in every process; else the dearest first.
+
+    A worker that begins its last file late would leave the others without work.
+    """
     seed = config.getoption("--shuffle")
     if seed is None:
+        place = {name: number for number, name in enumerate(DEAREST)}
+        items.sort(key=lambda item: place.get(item.nodeid.partition("::")[0].removeprefix("tests/"), len(DEAREST)))
         return
     files: dict[Path, list[pytest.Item]] = {}
     for item in items:
@@ -43,6 +80,19 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     for tests in order:
         draw.shuffle(tests)
     items[:] = [item for tests in order for item in tests]
+
+
+def pytest_collection_finish() -> None:
+    """What was imported and collected stays to the end: the collector need not look through it again."""
+    gc.collect()
+    gc.freeze()
+
+
+@pytest.hookimpl(wrapper=True)
+def pytest_collect_file() -> Generator[None, list[pytest.Collector], list[pytest.Collector]]:
+    """No doctests here: their collector would import what tests run in processes of their own, dask's clusters too."""
+    found = yield
+    return [one for one in found if not isinstance(one, DoctestModule)]
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +127,7 @@ def blank_pictures() -> Iterator[None]:
     real = canvas.save_as
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canvas, "save_as", save_as)
+        patch.setattr(canvas, "smaller", cache(canvas.smaller))
         patch.setattr(canvas, "FEWEST_FIGURES", 10_000)  # in this process: a further one costs more than it saves
         yield
 

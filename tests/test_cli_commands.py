@@ -8,6 +8,7 @@ from pathlib import Path
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.machine import llvm
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
@@ -53,7 +54,10 @@ def test_formats_shows_every_reader(capsys: pytest.CaptureFixture[str]) -> None:
     assert len(logs) >= 30
 
 
-def test_doctor_json(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctor_json(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    """What this machine's LLVM did in its trial is remembered; tests/machine/test_llvm.py tries it anew."""
+    trials = list(llvm._trials())
+    monkeypatch.setattr(llvm, "first_that_works", lambda _: trials)
     capsys.readouterr()
     code = main(["doctor", "--json"])
     checks = json.loads(capsys.readouterr().out)["checks"]

@@ -23,6 +23,7 @@ pytestmark = [
     pytest.mark.skipif(not ROOT or not Path(ROOT).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"),
 ]
 FLIGHTS = {path.stem: path for path in sorted((Path(__file__).parent / "field").glob("*.yaml"))}
+OPTIONS = ReadOptions(timezone="America/New_York")
 RANK = ("nr_rank_flight1", "nr_rank_flight3")
 
 Metrics = dict[str, Any]
@@ -58,7 +59,7 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
 
 @pytest.fixture(scope="module")
 def everything() -> Ingested:
-    return ingest(ROOT, options=ReadOptions(timezone="America/New_York"))
+    return ingest(ROOT, options=OPTIONS)
 
 
 @pytest.mark.parametrize("name", FLIGHTS)
@@ -152,8 +153,15 @@ def test_what_no_reader_takes_is_named_with_a_reason(everything: Ingested) -> No
 
 
 def test_ingest_of_the_whole_folder_through_the_command_line(
-    capsys: pytest.CaptureFixture[str], tmp_path: Path
+    everything: Ingested, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str], tmp_path: Path
 ) -> None:
+    """What is read was read above; here it is asked for as there, told and written."""
+
+    def read_above(paths: list[Path], *, options: ReadOptions, reader: str | None) -> Ingested:
+        assert (paths, options, reader) == ([Path(ROOT)], OPTIONS, None)
+        return everything
+
+    monkeypatch.setattr("aerpaw_cmp.logs.ingest.ingest", read_above)
     assert main(["ingest", ROOT, "--timezone", "America/New_York", "-o", str(tmp_path / "all.h5"), "--json"]) == 0
     files = json.loads(capsys.readouterr().out)["files"]
     assert len(files) > 15

@@ -17,6 +17,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from itertools import product
 
 import numpy as np
 
@@ -177,6 +178,9 @@ def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
     return RELATIVE_TOLERANCE * max(1.0, *(float(s) for s in sizes))
 
 
+_CORNERS_OF_A_BOX = np.array(list(product((False, True), repeat=3)))
+
+
 @dataclass(frozen=True, slots=True)
 class _Ends:
     """What the growth of sequences asks of the targets, of most towers at once: no path is lost by one too many.
@@ -203,7 +207,7 @@ class _Ends:
             height -= faces.offset_m[:, None]
             np.maximum(highest, height.max(axis=1), out=highest)
         low, high = targets.min(axis=0), targets.max(axis=0)
-        hull = np.stack(np.meshgrid(*zip(low, high, strict=True), indexing="ij"), axis=-1).reshape(8, 3)
+        hull = np.where(_CORNERS_OF_A_BOX, high, low)
         return cls(highest >= -tolerance_m, hull)
 
 
@@ -589,5 +593,6 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
 def planes_of(faces: Faces) -> IntArray:
     """Number (faces,) of the plane each face lies in; coplanar faces that look the same way share it."""
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
-    _, plane = np.unique(key + 0.0, axis=0, return_inverse=True)
+    rows = np.ascontiguousarray(key + 0.0).view(np.dtype((np.void, key.shape[1] * key.itemsize)))
+    _, plane = np.unique(rows, return_inverse=True)  # bytes: -0 became 0
     return np.asarray(plane.reshape(-1), dtype=np.int64)

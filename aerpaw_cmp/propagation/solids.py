@@ -8,12 +8,13 @@ is one: a segment that runs in the seam between them, outside both, is cut too.
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 import shapely
 from shapely.geometry import Polygon
-from shapely.geometry.polygon import orient
 
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .faces import corners
 from .paths import Faces
 
@@ -22,6 +23,9 @@ CELLS_PER_CHUNK = 1_000_000
 
 NEIGHBOURHOOD = 1e4
 """Radius, in tolerances, within which a point of a seam must be surrounded by buildings; shorter seams hide nothing."""
+
+ROUNDING = 1e-13
+"""Share of its area by which a convex footprint may fall short of its hull."""
 
 _ROUND = np.pi / 8 * (np.arange(16) + 0.37)  # no direction of a map is favoured
 _AROUND = np.column_stack([np.cos(_ROUND), np.sin(_ROUND), np.zeros(16)])
@@ -46,14 +50,18 @@ class Occlusion:
 
     def __init__(self, faces: Faces, tolerance_m: float) -> None:
         self.tolerance_m = tolerance_m
-        solids = [np.flatnonzero(faces.solid == solid) for solid in np.unique(faces.solid[faces.solid >= 0])]
-        box = corners(faces, 0.0) if not solids else corners(faces, 1e9)
-        self.low = np.array([box[m].min(axis=(0, 1)) for m in solids]).reshape(-1, 3) - tolerance_m
-        self.high = np.array([box[m].max(axis=(0, 1)) for m in solids]).reshape(-1, 3) + tolerance_m
-        prisms = [_prisms(faces, members) for members in solids]
-        self.pieces = [[_planes(*piece) for piece in pieces] for pieces in prisms]
+        rows, starts = _by_solid(faces)
+        box = corners(faces, 1e9 if len(rows) else 0.0)[rows]
+        self.low, self.high = np.zeros((0, 3)), np.zeros((0, 3))
+        if len(rows):
+            self.low = np.minimum.reduceat(box.min(axis=1), starts) - tolerance_m
+            self.high = np.maximum.reduceat(box.max(axis=1), starts) + tolerance_m
+        solid, footprint, planes = _prisms(faces, rows, starts)
+        cuts = np.searchsorted(solid, np.arange(len(starts) + 1)).tolist()
+        touched = _abutting(footprint, tolerance_m).tolist()
+        self.pieces = [planes[start:stop] for start, stop in pairwise(cuts)]
         """Per solid and convex piece: outward normals (planes, 3) and offsets (planes,); top and bottom come first."""
-        self.abutting = _abutting([[piece[0] for piece in pieces] for pieces in prisms], tolerance_m)
+        self.abutting = [touched[start:stop] for start, stop in pairwise(cuts)]
         """Per solid and convex piece: whether another piece, of any solid, touches it."""
 
     def any_segment(self, sources_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> BoolArray:
@@ -178,28 +186,55 @@ def _within(before: FloatArray, after: FloatArray, level: float) -> tuple[FloatA
     return np.maximum(enter, 0.0), np.minimum(leave, 1.0)
 
 
-def _prisms(faces: Faces, members: IntArray) -> list[tuple[Polygon, float, float]]:
-    """Convex pieces of a solid: footprint, foot and top [m]."""
-    level = faces.normal[members, 2] == 1.0
-    roofs, walls = members[level], members[~level]
-    if not len(roofs):
-        raise ValueError(f"the solid of '{faces.label[members[0]]}' has no roof")
-    foot = float(faces.lower[walls, 1].min()) if len(walls) else -np.inf
-    found = []
-    for roof in roofs:
-        top = float(faces.offset_m[roof])
-        found += [(piece, foot, top) for piece in convex_pieces(_footprint(faces, int(roof)))]
-    return found
+def _by_solid(faces: Faces) -> tuple[IntArray, IntArray]:
+    """Faces of solids, one solid after another, and where each solid starts among them."""
+    order = np.argsort(faces.solid, kind="stable")
+    rows = order[faces.solid[order] >= 0]
+    solid = faces.solid[rows]
+    return rows, np.flatnonzero(np.diff(solid, prepend=-1))
 
 
-def _footprint(faces: Faces, roof: int) -> Polygon:
-    """The roof seen from above, in site coordinates."""
-    polygon = faces.polygon[roof]
-    if polygon is None:
-        (low_a, low_b), (high_a, high_b) = faces.lower[roof], faces.upper[roof]
-        polygon = shapely.box(low_a, low_b, high_a, high_b)
-    axes = np.stack([faces.along[roof, :2], faces.across[roof, :2]])
-    return shapely.transform(polygon, lambda p: p @ axes)
+def _prisms(
+    faces: Faces, rows: IntArray, starts: IntArray
+) -> tuple[IntArray, list[Polygon], list[tuple[FloatArray, FloatArray]]]:
+    """Convex pieces of all solids: the number of the solid, the footprint, and the planes of each.
+
+    ``rows`` are the faces of solids, one solid after another from ``starts`` on.
+    """
+    if not len(rows):
+        return np.zeros(0, np.int64), [], []
+    number = np.repeat(np.arange(len(starts)), np.diff(starts, append=len(rows)))
+    level = faces.normal[rows, 2] == 1.0
+    lacking = np.bincount(number[level], minlength=len(starts)) == 0
+    if lacking.any():
+        raise ValueError(f"the solid of '{faces.label[rows[starts[lacking.argmax()]]]}' has no roof")
+    foot = np.minimum.reduceat(np.where(level, np.inf, faces.lower[rows, 1]), starts)
+    foot[np.isposinf(foot)] = -np.inf  # no walls
+    roofs = rows[level]
+    pieces = _convex(_footprints(faces, roofs))
+    times = [len(some) for some in pieces]
+    solid = np.repeat(number[level], times)
+    flat = [piece for some in pieces for piece in some]
+    return solid, flat, _planes(flat, foot[solid], np.repeat(faces.offset_m[roofs], times))
+
+
+def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
+    """The roofs (roofs,) seen from above, as polygons in site coordinates."""
+    low, high = faces.lower[roofs], faces.upper[roofs]
+    found = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    for place, roof in enumerate(roofs.tolist()):
+        if faces.polygon[roof] is not None:
+            found[place] = faces.polygon[roof]
+    point, owner = shapely.get_coordinates(found, return_index=True)
+    axes = np.stack([faces.along[roofs, :2], faces.across[roofs, :2]], axis=1)
+    return np.asarray(shapely.set_coordinates(found, np.einsum("ni,nij->nj", point, axes[owner])))
+
+
+def _convex(footprints: AnyArray) -> list[list[Polygon]]:
+    """The convex pieces of each footprint."""
+    hull, area = shapely.area(shapely.convex_hull(footprints)), shapely.area(footprints)
+    whole = (hull - area <= ROUNDING * hull) & (shapely.get_num_interior_rings(footprints) == 0)
+    return [[one] if convex else convex_pieces(one) for one, convex in zip(footprints, whole.tolist(), strict=True)]
 
 
 def convex_pieces(footprint: Polygon) -> list[Polygon]:
@@ -225,30 +260,38 @@ def convex_pieces(footprint: Polygon) -> list[Polygon]:
 
 def _is_convex(polygon: Polygon) -> bool:
     hull = polygon.convex_hull.area
-    return not polygon.interiors and bool(hull - polygon.area <= 1e-13 * hull)
+    return not polygon.interiors and bool(hull - polygon.area <= ROUNDING * hull)
 
 
-def _planes(footprint: Polygon, foot: float, top: float) -> tuple[FloatArray, FloatArray]:
-    """Outward normals and offsets of a convex prism: top, bottom, sides."""
-    points = np.asarray(orient(footprint, 1.0).exterior.coords, dtype=np.float64)[:, :2]
-    edge = np.diff(points, axis=0)
-    edge, points = edge[(edge != 0.0).any(axis=1)], points[:-1][(edge != 0.0).any(axis=1)]
+def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Outward normals and offsets of each convex prism: top, bottom, sides."""
+    ring = shapely.get_exterior_ring(np.array(footprints, dtype=object))
+    point, owner = shapely.get_coordinates(ring, return_index=True)
+    count = np.bincount(owner, minlength=len(ring))
+    first = np.cumsum(count) - count
+    turned = np.arange(len(point))
+    backwards = ~shapely.is_ccw(ring)[owner]
+    turned[backwards] = (2 * first + count - 1)[owner[backwards]] - turned[backwards]
+    point = point[turned]
+    edge, start, side_of = np.diff(point, axis=0), point[:-1], owner[:-1]
+    real = (owner[1:] == side_of) & (edge != 0.0).any(axis=1)
+    edge, start, side_of = edge[real], start[real], side_of[real]
     outward = np.column_stack([edge[:, 1], -edge[:, 0]]) / np.hypot(edge[:, 0], edge[:, 1])[:, None]
-    normal = np.zeros((len(edge) + 2, 3))
-    normal[:2, 2] = 1.0, -1.0
-    normal[2:, :2] = outward
-    return normal, np.concatenate([[top, -foot], (outward * points).sum(axis=1)])
+    planes = np.bincount(side_of, minlength=len(ring)) + 2
+    cuts = np.cumsum(np.append(0, planes))
+    normal, offset = np.zeros((cuts[-1], 3)), np.empty(cuts[-1])
+    normal[cuts[:-1], 2], normal[cuts[:-1] + 1, 2] = 1.0, -1.0
+    offset[cuts[:-1]], offset[cuts[:-1] + 1] = top, -foot
+    sides = np.arange(len(edge)) + 2 * (side_of + 1)
+    normal[sides, :2] = outward
+    offset[sides] = (outward * start).sum(axis=1)
+    return [(normal[start:stop], offset[start:stop]) for start, stop in pairwise(cuts.tolist())]
 
 
-def _abutting(footprints: list[list[Polygon]], tolerance_m: float) -> list[list[bool]]:
-    """For each piece of each solid, whether another piece comes within the tolerance."""
-    flat = [piece for pieces in footprints for piece in pieces]
-    touched = np.zeros(len(flat), dtype=np.bool_)
-    if len(flat) > 1:
-        one, two = shapely.STRtree(flat).query(flat, predicate="dwithin", distance=tolerance_m)
+def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
+    """For each piece, whether another piece comes within the tolerance."""
+    touched = np.zeros(len(footprints), dtype=np.bool_)
+    if len(footprints) > 1:
+        one, two = shapely.STRtree(footprints).query(footprints, predicate="dwithin", distance=tolerance_m)
         touched[one[one != two]] = True
-    result, done = [], 0
-    for pieces in footprints:
-        result.append(touched[done : done + len(pieces)].tolist())
-        done += len(pieces)
-    return result
+    return touched

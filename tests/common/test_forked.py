@@ -104,15 +104,17 @@ def test_what_cannot_be_carried_and_what_is_large_arrive() -> None:
 def test_this_process_is_free_meanwhile_and_nothing_is_left_running(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(forked, "usable_processes", lambda: 2)
 
-    def slow() -> int:
-        time.sleep(0.2)
-        return os.getpid()
+    def slow() -> tuple[int, float]:
+        begun = time.monotonic()
+        time.sleep(0.3)
+        return os.getpid(), begun
 
-    begun = time.monotonic()
     with forked.beside(slow) as there:
-        time.sleep(0.2)
-        assert there() != os.getpid()
-    assert time.monotonic() - begun < 0.38
+        time.sleep(0.3)
+        ended = time.monotonic()
+        process, begun = there()
+    assert process != os.getpid()
+    assert begun < ended, "the other began while this one was at work"
     with pytest.raises(KeyError), forked.ahead([partial(time.sleep, 60)] * 2, 2):
         raise KeyError
     assert not multiprocessing.active_children()

@@ -138,3 +138,28 @@ def test_solid_without_a_roof_is_refused(scenes):
     walls = dataclasses.replace(faces, normal=np.where(faces.solid[:, None] >= 0, [1.0, 0.0, 0.0], faces.normal))
     with pytest.raises(ValueError, match="no roof"):
         Occlusion(walls, 1e-9)
+
+
+@pytest.mark.parametrize("turn", [False, True])
+def test_points_inside_the_planes_are_those_inside_a_building(scenes, turn):
+    """Against shapely: convex and not, with a court, with a corner named twice, either way round, one beside another."""
+    shapes = [
+        box(0, 0, 12, 7),
+        Polygon([(20, 0), (31, 2), (31, 2), (25, 9)]),
+        Polygon([(40, 0), (60, 0), (60, 5), (45, 5), (45, 15), (40, 15)]),
+        box(70, 0, 90, 20).difference(box(75, 5, 85, 15)),
+    ]
+    shapes = [shapely.reverse(shape) if turn else shape for shape in shapes]
+    site = scenes.site(buildings=[Building(f"b{i}", shape, 4.0 + i) for i, shape in enumerate(shapes)])
+    hiding = Occlusion(site_faces(site), 1e-9)
+    rng = np.random.default_rng(2)
+    points = np.column_stack([rng.uniform(-3, 95, 4000), rng.uniform(-3, 23, 4000), rng.uniform(0.1, 9, 4000)])
+    found = np.zeros((len(points), len(shapes)), dtype=bool)
+    for number, pieces in enumerate(hiding.pieces):
+        for normal, offset in pieces:
+            assert np.allclose(np.linalg.norm(normal, axis=1), 1.0)
+            found[:, number] |= (points @ normal.T < offset).all(axis=1)
+    for number, shape in enumerate(shapes):
+        under = shapely.contains_xy(shape, points[:, 0], points[:, 1]) & (points[:, 2] < 4.0 + number)
+        assert (found[:, number] == under).all()
+        assert under.sum() > 20

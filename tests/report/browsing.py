@@ -29,9 +29,19 @@ def start(*arguments: str, scripts: bool = True):
 
 def open_page(driver, path, ready: str) -> None:
     """Open a page and wait until its script says so: ``ready`` is an expression."""
+    driver.get(path.as_uri())
+    _wait(driver, ready)
+
+
+def reload_page(driver, ready: str) -> None:
+    """As :func:`open_page`, the page that is shown."""
+    driver.refresh()
+    _wait(driver, ready)
+
+
+def _wait(driver, ready: str) -> None:
     from selenium.webdriver.support.ui import WebDriverWait
 
-    driver.get(path.as_uri())
     WebDriverWait(driver, 20, 0.02).until(lambda d: d.execute_script(f"return Boolean({ready})"))
 
 
@@ -46,7 +56,9 @@ def frame(driver) -> None:
 
 
 def complaints(driver) -> list[dict]:
-    return [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    """What the console says; but not that pixels are read often: tests do, no page does."""
+    said = [entry for entry in driver.get_log("browser") if entry["level"] in ("SEVERE", "WARNING")]
+    return [entry for entry in said if "using getImageData" not in entry["message"]]
 
 
 def asked_outside(driver) -> list[str]:

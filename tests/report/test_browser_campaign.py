@@ -19,6 +19,7 @@ from tests.report.browsing import (
     needs_browser,
     open_page,
     papers,
+    reload_page,
     serious_findings,
     start,
 )
@@ -26,6 +27,7 @@ from tests.report.browsing import (
 pytest.importorskip("selenium", reason="selenium is not installed")
 pytestmark = needs_browser
 
+READY = "window.campaignExplorer && campaignExplorer.ready"
 HALF_STEP = 0.0051
 
 
@@ -46,7 +48,7 @@ def driver(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("campaign") / "campaign.html"
     path.write_text(campaign_html.campaign_page(data, [], ["campaign.csv"]), encoding="utf-8")
     found = start("--window-size=1440,1300")
-    open_page(found, path, "window.campaignExplorer && campaignExplorer.ready")
+    open_page(found, path, READY)
     yield found
     found.quit()
 
@@ -160,10 +162,10 @@ def test_pointing_at_a_flight_marks_it_everywhere(driver, data):
 
     rows = driver.find_elements("css selector", "#flights tbody tr")
     driver.execute_script("arguments[0].scrollIntoView({block: 'center', behavior: 'instant'})", rows[2])
-    ActionChains(driver).move_to_element(rows[2]).perform()
     name = rows[2].find_element("tag name", "th").text
     number = data.flights.index(name)
-    for _ in range(100):  # the pointer crosses other rows, and the page scrolls under it
+    for _ in range(100):  # the pointer crosses other rows, and the page moves under it as they are marked
+        ActionChains(driver).move_to_element(rows[2]).perform()
         frame(driver)
         if driver.execute_script("return campaignExplorer.state.flight") == number:
             break
@@ -285,3 +287,4 @@ def test_with_scripts_off_the_tables_stand(driver):
         assert driver.find_element("id", "failures-table").is_displayed()
     finally:
         driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+        reload_page(driver, READY)

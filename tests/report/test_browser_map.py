@@ -18,6 +18,7 @@ from tests.report.browsing import (
     needs_browser,
     open_page,
     papers,
+    reload_page,
     serious_findings,
     start,
 )
@@ -25,6 +26,7 @@ from tests.report.browsing import (
 pytest.importorskip("selenium", reason="selenium is not installed")
 pytestmark = needs_browser
 
+READY = "window.mapExplorer && mapExplorer.ready"
 SHOWN = "const v = mapExplorer.shown(); return v && Array.from(v, x => Number.isFinite(x) ? x : null)"
 
 
@@ -45,7 +47,7 @@ def driver(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("map") / "map.html"
     path.write_text(maps_html.maps_page(data, [], ["metrics.json"]), encoding="utf-8")
     found = start("--window-size=1440,1300")
-    open_page(found, path, "window.mapExplorer && mapExplorer.ready")
+    open_page(found, path, READY)
     yield found
     found.quit()
 
@@ -270,3 +272,4 @@ def test_with_scripts_off_the_tables_and_figures_stand(driver):
         assert driver.find_element("css selector", "#rss summary").is_displayed()
     finally:
         driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+        reload_page(driver, READY)

@@ -170,6 +170,12 @@ def still(track: Track) -> Track:
     )
 
 
+@pytest.fixture(scope="module")
+def drawn_before():
+    """Pictures of the flight and of pairs, by all that they are made of: the same one again would show nothing."""
+    return set()
+
+
 @pytest.mark.parametrize(
     "change",
     [
@@ -186,11 +192,17 @@ def still(track: Track) -> Track:
     ],
     ids=["one sample", "all out of coverage", "edge", "no CSI at all", "rank without simulation", "one K", "hovering", "one pose", "no height", "bare site"],
 )  # fmt: skip
-def test_odd_flights_are_drawn_without_a_warning(report_data, change):
+def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, change):
     data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
-    for _, fig in drawn(data):
+    left_alone = data.track is report_data.track and data.site is report_data.site
+    for plate in figures.figure_specs(data):
+        if left_alone and plate.section.startswith(("flight", "pair/")):  # these have of the panels only what is named:
+            what = (plate.name, canvas.start_of(data), *canvas.used_towers(data))
+            if what in drawn_before:
+                continue
+            drawn_before.add(what)
         with canvas.style():
-            fig.draw_without_rendering()  # lays out and draws every part; warnings are errors
+            plate.draw().draw_without_rendering()  # lays out and draws every part; warnings are errors
 
 
 @given(arrays(bool, st.integers(0, 60)))

@@ -387,11 +387,11 @@ class _Sum:
 
     gram: FloatArray
     right: FloatArray
-    square: float
-    log_det: float
-    total: dict[str, FloatArray]
-    count: dict[str, int]
-    members: dict[bytes, _Member]
+    square: float = 0.0
+    log_det: float = 0.0
+    total: dict[str, FloatArray] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+    members: dict[bytes, _Member] = field(default_factory=dict)
 
     def add(self, member: _Member, sign: int) -> None:
         """Add a series, or take it away again."""
@@ -441,7 +441,7 @@ def _summed(
     new = [i for i, key in enumerate(keys) if last is None or key not in last.members]
     steps = len(gone) + len(new)
     if last is None or len(set(keys)) < len(keys) or steps >= len(keys) or _chain[0] + steps > LONGEST_CHAIN:
-        last = _Sum(np.zeros((width, width)), np.zeros(width), 0.0, 0.0, {}, {}, {})
+        last = _Sum(gram=np.zeros((width, width)), right=np.zeros(width))
         gone, new, _chain[0] = [], list(range(len(keys))), 0
     else:
         _chain[0] += steps

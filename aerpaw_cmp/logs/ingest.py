@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line
-from . import archives, blocks
+from . import archives, blocks, packed
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
 from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
@@ -57,16 +57,23 @@ class Ingested(list[IngestedFile]):
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Content of a log, gunzipped where needed, and the sha256 of the file.
+    """Content of a log, unpacked where it is a gzip, bzip2 or xz file, and the sha256 of the file.
 
     Raises
     ------
     InputError
-        If the file is missing, not readable, no file, too large, or a damaged gzip file.
+        If the file is missing, not readable, no file, too large, or a damaged packed file.
     """
     raw = _raw(Path(path))
     digest = hashlib.sha256(raw).hexdigest()
-    return (_gunzip(raw, path) if raw.startswith(_GZIP) else raw), digest
+    return _unpacked(raw, path), digest
+
+
+def _unpacked(raw: bytes, path: str | Path) -> bytes:
+    """What a packed file holds, other content as it is."""
+    if packed.form(raw) is not None:
+        return packed.unpacked(raw, path, MAX_BYTES)
+    return _gunzip(raw, path) if raw.startswith(_GZIP) else raw
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:
@@ -210,7 +217,9 @@ def _sniffed(path: Path) -> bytes:
         content = dict(archives.members(read_bytes(part[0])[0], part[0]))
         return head_of(as_utf8(content[part[1]]())) if part[1] in content else b""
     head = _raw(path, HEAD_BYTES)
-    if head.startswith(_GZIP) and path.stat().st_size > blocks.FROM_BYTES // 16:
+    if packed.form(head) is not None:
+        head = packed.head_of(path, HEAD_BYTES)
+    elif head.startswith(_GZIP) and path.stat().st_size > blocks.FROM_BYTES // 16:
         head = _unpacked_head(head)
     head = as_utf8(head)
     if head.startswith(_GZIP) or hides_its_content(head):
@@ -290,6 +299,8 @@ def _head(place: Path) -> bytes:
 
 def _is_archive(place: Path) -> bool:
     head = _head(place)
+    if packed.form(head) is not None:
+        head = packed.head_of(place, 1024)
     if head.startswith(_GZIP):
         try:
             head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1024)
@@ -324,7 +335,7 @@ def _member(
 ) -> IngestedFile:
     """One file of an archive."""
     digest = hashlib.sha256(raw).hexdigest()
-    data = as_utf8(_gunzip(raw, path) if raw.startswith(_GZIP) else raw)
+    data = as_utf8(_unpacked(raw, path))
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
@@ -366,10 +377,13 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
             expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
             path=path,
         )
-    packed = head.startswith(_GZIP)
-    if packed and place.stat().st_size > blocks.FROM_BYTES // 16:
-        head, packed = as_utf8(_unpacked_head(head)), False
-    if reader is None and not packed and not hides_its_content(head):
+    hidden = head.startswith(_GZIP)
+    if packed.form(head) is not None:
+        head, hidden = as_utf8(packed.head_of(place, HEAD_BYTES)), False
+        hidden = not head  # damaged, or empty
+    elif hidden and place.stat().st_size > blocks.FROM_BYTES // 16:
+        head, hidden = as_utf8(_unpacked_head(head)), False
+    if reader is None and not hidden and not hides_its_content(head):
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     if (large := _in_blocks(place, reader, options)) is not None:
         return large
@@ -391,14 +405,20 @@ def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -
     """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
     from . import limits
 
-    least = blocks.FROM_BYTES // 16 if _raw(place, 2) == _GZIP else blocks.FROM_BYTES
+    begin = _raw(place, HEAD_BYTES)
+    other = packed.form(begin) is not None
+    least = blocks.FROM_BYTES // 16 if other or begin.startswith(_GZIP) else blocks.FROM_BYTES
     if place.stat().st_size < least or reader is None or reader.in_blocks is None:
         return None
-    if _raw(place, 2) in _UTF_16:
+    if begin[:2] in _UTF_16:
         return None
     given = _options(place, options, _beside(place))
     try:
-        result, digest = blocks.read(place, reader, given)
+        if other:
+            made = hashlib.sha256()
+            result, digest = reader.in_blocks(packed.stream(place, made), given), made.hexdigest()
+        else:
+            result, digest = blocks.read(place, reader, given)
     except blocks.Whole:
         return None
     return IngestedFile(str(place), digest, limits.check(result)) if result.accepted else None

@@ -2,7 +2,8 @@
 
 Table (through ``ts``): ``UE_ID CL RNTI C cqi ri mcs retx txok brate ...``, one row per UE and cell; its title line
 says which columns there are. JSON: one answer of ``ue_get`` (``"stats": true``) per line, ``ue_list[].cells[]``
-with ``cqi``, ``ri``, ``dl_mcs``, and its time in ``utc`` (epoch in s), else in ``time`` (seconds of the program).
+with ``cqi``, ``ri``, ``dl_mcs``, and its time in ``utc`` (epoch in s), or, where no answer of the log has that, in
+``time`` (seconds of the program).
 
 RI counts from one and is a mean over the period: a value between two ranks is kept as ``rank_mean`` and gives no
 rank.
@@ -11,6 +12,7 @@ rank.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -89,11 +91,26 @@ def sniff_json(head: bytes) -> bool:
 
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
-    """Rank stream ``gnb``: a record per UE, cell and answer."""
+    """Rank stream ``gnb``: a record per UE, cell and answer; one without the time that the others have is rejected."""
+    return _read_answers(data, options, set())
+
+
+def _json_in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+    """The same, where all blocks have the one kind of time, or the other."""
+    kinds: set[bool] = set()
+    read_block = blocks.by_lines(lambda data, given: _read_answers(data, given, kinds), apart=_json.WHOLE)
+    return read_block(chunks, options)
+
+
+def _read_answers(data: bytes, options: ReadOptions, kinds: set[bool]) -> ReadResult:
+    """Answers of a block; ``kinds`` gathers whether they have ``utc``, which no log may change half way."""
     lines = _lines.split(data)
     answers = _json.objects(lines)
     found = answers.found
-    has_utc = bool(found) and all("utc" in one for one in found)
+    has_utc = any("utc" in one for one in found)
+    kinds |= {has_utc} if found else set()
+    if len(kinds) > 1:
+        raise blocks.Whole
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
@@ -132,5 +149,5 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=blocks.by_lines(read_json, apart=_json.WHOLE),
+    in_blocks=_json_in_blocks,
 )

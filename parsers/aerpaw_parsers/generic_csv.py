@@ -21,7 +21,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
-from . import _frames, _lines, _table, _time
+from . import _by_eights, _frames, _lines, _table, _time
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
@@ -32,6 +32,7 @@ _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": (
 
 _TEXT = re.compile(_time.TIME + _time.ZONE)
 _PLAIN = re.compile(_lines.NUMBER)
+_INK = re.compile(rb"\S")
 _FORM = re.compile(rb"%s|%s" % (_TEXT.pattern, _PLAIN.pattern))
 
 
@@ -53,10 +54,18 @@ def _separator(header: bytes) -> str:
     return max(SEPARATORS, key=lambda sign: header.count(sign.encode()))
 
 
-def _header(lines: _lines.Lines, first: int) -> list[str]:
-    line = lines.raw(first).removeprefix(b"\xef\xbb\xbf")
+def _header(data: bytes) -> tuple[int, str, list[str]] | None:
+    """Number (from 0), separator and names of the first line that is not blank; None where all are."""
+    begun = _INK.search(data)
+    if begun is None:
+        return None
+    first = data.count(b"\n", 0, begun.start())
+    end = data.find(b"\n", begun.start())
+    line = data[data.rfind(b"\n", 0, begun.start()) + 1 : end if end >= 0 else len(data)].removesuffix(b"\r")
+    line = line.removeprefix(b"\xef\xbb\xbf")
+    separator = _separator(line)
     try:
-        return [name.strip() for name in _fields(line, _separator(line))]
+        return first, separator, [name.strip() for name in _fields(line, separator)]
     except csv.Error as error:
         raise InputError(f"the header is no CSV ({error})", expected="column names", line=first + 1) from error
 
@@ -164,7 +173,8 @@ def _settled(result: ReadResult) -> ReadResult:
         return result
     frame = result.streams[0].frame
     flag = frame["flag"].to_numpy(dtype=object)
-    odd = [i for i, text in enumerate(flag.tolist()) if text and "no_number" in text.split(";")]
+    marked = np.flatnonzero(flag != "").tolist()
+    odd = [i for i in marked if "no_number" in flag[i].split(";")]
     if not odd:
         return result
     words = "1 row is" if len(odd) == 1 else f"{len(odd)} rows are"
@@ -196,14 +206,14 @@ def _head(data: bytes, options: ReadOptions) -> int:
 
 def _read(data: bytes, options: ReadOptions) -> ReadResult:
     """What each row says by itself."""
-    lines = _lines.split(data)
-    blank = lines.blank
-    first = int(np.argmin(blank)) if len(lines) and not blank.all() else -1
-    if first < 0:
-        return ReadResult("generic_csv", (), len(lines), 0, len(lines))
-    header = _header(lines, first)
+    top = _header(data)
+    if top is None:
+        count = len(_lines.split(data))
+        return ReadResult("generic_csv", (), count, 0, count)
+    first, separator, header = top
     kind, where = _checked(options, header)
-    table = _at_once(lines, first, len(header), where, options) or _one_by_one(lines, first, where, header, options)
+    lines, found = _by_eights.table(data, len(header), ord(separator))
+    table = _at_once(lines, found, first, where, options) or _one_by_one(lines, first, where, header, options)
     rows, rejected, instants, valid, numbers = table
     rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
     flag = _lines.flags(len(rows))
@@ -226,7 +236,7 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
         streams=(stream, *_track(kind, frame, options)) if len(frame) else (),
         lines=len(lines),
         accepted=len(frame),
-        blank=int(blank.sum()) + 1,
+        blank=int(lines.blank.sum()) + 1,
         rejected=tuple(sorted(rejected, key=lambda line: line.number)),
         warnings=tuple(warnings),
     )
@@ -248,13 +258,12 @@ def _one_by_one(
 
 
 def _at_once(
-    lines: _lines.Lines, first: int, width: int, where: Mapping[str, int], options: ReadOptions
+    lines: _lines.Lines, found: _table.Fields, first: int, where: Mapping[str, int], options: ReadOptions
 ) -> _Table | None:
     """The table column by column, or None where quotes or a cell beyond any number stand in the way."""
-    separator = _separator(lines.raw(first))
+    separator, width = _separator(lines.raw(first)), found.ends.shape[1]
     if b'"' in lines.data or b"\0" in lines.data:
         return None
-    found = _table.fields(lines, width, ord(separator))
     found = found.take(~lines.blank[found.rows] & (found.rows != first))
     if not len(found.rows):
         return None
@@ -265,23 +274,47 @@ def _at_once(
         count = lines.raw(i).count(separator.encode()) + 1
         rejected.append(lines.reject(i, f"{count} fields where the header has {width} (torn line?)"))
 
-    def texts(column: int) -> AnyArray:
-        return _table.texts(lines, found.start(column), found.ends[:, column])
-
     numbers = dict(where)
-    clock = texts(numbers.pop("time"))
-    names, columns = list(numbers), sorted(set(numbers.values()))
-    also = (b" :TZ/" + separator.encode()) if separator != "," else b" :TZ/"
-    plain = _table.numbers(lines, found.rows, width, columns, also=also, separator=separator) if _EXACT else None
-    if plain is not None:
-        value = {name: plain[columns.index(numbers[name])] for name in names}
-    else:
-        read = {name: _column(texts(numbers[name]), comma=separator != ",") for name in names}
-        value = {name: column for name, column in read.items() if column is not None}
-    times = _clock(clock, options)
-    if times is None or len(value) < len(names):
+    clock = numbers.pop("time")
+    columns = sorted(set(numbers.values()))
+    plain = _by_eights.decimals(lines, found, columns, comma=separator != ",")
+    read: dict[int, FloatArray] = {}
+    for column, value, odd in zip(columns, plain.value, plain.odd, strict=True):
+        made = _mended(lines, found, column, value, odd, comma=separator != ",")
+        if made is None:
+            return None
+        read[column] = made
+    times = _clock(_texts(lines, found, clock), options)
+    if times is None:
         return None
-    return found.rows, rejected, *times, value
+    return found.rows, rejected, *times, {name: read[column] for name, column in numbers.items()}
+
+
+def _texts(lines: _lines.Lines, found: _table.Fields, column: int) -> AnyArray:
+    return _table.texts(lines, found.start(column), found.ends[:, column])
+
+
+def _mended(
+    lines: _lines.Lines, found: _table.Fields, column: int, value: FloatArray, odd: BoolArray, *, comma: bool
+) -> FloatArray | None:
+    """Numbers of a column with the odd cells as :func:`_number` reads them, each text once; None if one is long."""
+    rows = np.flatnonzero(odd)
+    if 8 * len(rows) > len(odd):
+        separator = chr(lines.data[int(found.ends[0, 0])]) if found.ends.shape[1] > 1 else ","
+        also = b" :TZ/" + (separator.encode() if comma else b"")
+        width = found.ends.shape[1]
+        read = _table.numbers(lines, found.rows, width, [column], also=also, separator=separator) if _EXACT else None
+        return read[0] if read is not None else _column(_texts(lines, found, column), comma=comma)
+    known: dict[bytes, float] = {}
+    places = zip(rows.tolist(), found.start(column)[rows].tolist(), found.ends[rows, column].tolist(), strict=True)
+    for i, begin, end in places:
+        if end - begin > _MOST_BYTES:
+            return None
+        text = lines.data[begin:end]
+        if text not in known:
+            known[text] = float(_numbers([text.decode("utf-8", "replace")], comma)[0])
+        value[i] = known[text]
+    return value
 
 
 _EXACT = int(pd.__version__.split(".")[0]) >= 3

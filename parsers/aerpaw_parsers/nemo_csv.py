@@ -15,7 +15,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, _nemo, _rows, _table
+from . import _by_eights, _lines, _nemo, _rows, _table
 
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
@@ -32,20 +32,39 @@ def _reason(line: bytes) -> str | None:
     return "a field is no number"
 
 
-def _plain(lines: _lines.Lines) -> tuple[IntArray, list[FloatArray]]:
+def _plain(lines: _lines.Lines, found: _table.Fields) -> tuple[IntArray, list[FloatArray]]:
     """Rows of plain numbers and their nine columns, at once."""
-    rows = _table.rows_of(lines, 9)
-    rows = rows[rows > 0]  # the header
+    found = found.take(found.rows > 0)  # the header
+    rows = found.rows
+    if not len(rows):
+        return rows, [np.empty(0)] * 9
+    made = _by_eights.decimals(lines, found, range(9))
+    value, odd = made.value, np.any(made.odd, axis=0)
+    some = int(np.count_nonzero(odd))
+    if 16 * some > len(rows) or (some and (made.odd[0].any() or not _counted(lines, found.take(~odd)))):
+        return _at_once(lines, rows)
+    valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1]) & ~odd
+    return (rows, value) if valid.all() else (rows[valid], [column[valid] for column in value])
+
+
+def _counted(lines: _lines.Lines, found: _table.Fields) -> bool:
+    """Whether rows have an index as the pattern wants it."""
+    index = _table.texts(lines, found.begin, found.ends[:, 0])
+    return index.dtype.itemsize <= 12 and bool(np.char.isdigit(index).all())
+
+
+def _at_once(lines: _lines.Lines, rows: IntArray) -> tuple[IntArray, list[FloatArray]]:
+    """Rows of numbers of any form and their nine columns, none where one is no number."""
     value = _table.numbers(lines, rows, 9)
     if value is None:
         return rows[:0], [np.empty(0)] * 9
     valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1])
-    return (rows, value) if valid.all() else (rows[valid], [column[valid] for column in value])
+    return rows[valid], [column[valid] for column in value]
 
 
-def _columns(lines: _lines.Lines) -> tuple[IntArray, list[FloatArray]]:
+def _columns(lines: _lines.Lines, found: _table.Fields) -> tuple[IntArray, list[FloatArray]]:
     """Rows and their nine columns: the plain ones at once, the rest by the pattern."""
-    rows, value = _plain(lines)
+    rows, value = _plain(lines, found)
     odd, groups = _lines.match_rest(lines, _ROW, rows)
     if not len(odd):
         return rows, value
@@ -63,8 +82,8 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``time_origin`` is no time, or is local and no time zone is given.
     """
-    lines = _lines.split(data)
-    number, column = _columns(lines)
+    lines, found = _by_eights.table(data, 9)
+    number, column = _columns(lines, found)
     content = {"time": column[1], **dict(zip(_COLUMNS, column[2:], strict=True))}
     rows = _rows.built(lines, number, content, options, reader="nemo_csv", reason=_reason, clock="relative_ms")
     return rows.result([_nemo.pdsch_rank(rows, dict(rows.columns))])

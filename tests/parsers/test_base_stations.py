@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -10,6 +11,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from tests.parsers import samples
@@ -41,6 +43,37 @@ def test_a_mean_of_ranks_is_no_rank(
     assert [None if np.isnan(v) else v for v in stream.frame["rank"]] == ranks
     assert [None if np.isnan(v) else v for v in stream.frame["rank_mean"]] == means
     assert stream.frame["time"][0].floor("s") == pd.Timestamp("2025-03-02T15:00:00")
+
+
+@pytest.mark.parametrize("utc", [b'"UTC"', b'"time"'])
+def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(
+    utc: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """All were rejected; cut into blocks, a block without ``utc`` counted from another origin."""
+    line = samples.AMARISOFT_JSON.splitlines(keepends=True)[0]
+    data = line * 3 + line.replace(b'"utc"', utc) * 5
+    whole = read("amarisoft_json", data)
+    assert (whole.lines, whole.accepted, [one.number for one in whole.rejected]) == (8, 3, [4, 5, 6, 7, 8])
+    in_blocks = by_name("amarisoft_json").in_blocks
+    assert in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
+    with pytest.raises(blocks.Whole):
+        in_blocks(iter([data]), PLAIN)
+    assert read("amarisoft_json", line.replace(b'"utc"', b'"time"') * 2).accepted == 2, "seconds of the program"
+
+
+def test_reports_whose_times_are_of_two_forms_are_read_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The form of the most is that of all; in blocks each had decided for itself."""
+    line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
+    (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
+    data = line * 5 + line.replace(epoch, b'"no time"') * 4
+    assert read("srsran_json", data).accepted == 5
+    in_blocks = by_name("srsran_json").in_blocks
+    assert in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
+    with pytest.raises(blocks.Whole):
+        in_blocks(iter([data]), PLAIN)
+    assert in_blocks(iter([line * 9]), PLAIN).accepted == 9
 
 
 def test_oai_layouts() -> None:

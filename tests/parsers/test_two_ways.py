@@ -67,11 +67,11 @@ def test_what_is_wrong_is_rejected_by_both(reader: str, sample: str, old: bytes,
 
 
 def test_the_fast_way_is_taken() -> None:
-    from aerpaw_parsers import _lines, nemo_csv, quectel_csv
+    from aerpaw_parsers import _by_eights, _lines, nemo_csv, quectel_csv
 
     for name, rows in (("ten_fields", 3), ("nine_fields", 2), ("eight_fields", 2)):
         assert len(vehicle_out._at_once(_lines.split(SAMPLES["vehicle_out"][name][0])).line) == rows
-    assert len(nemo_csv._plain(_lines.split(SAMPLES["nemo_csv"]["table"][0]))[0]) == 3
+    assert len(nemo_csv._plain(*_by_eights.table(SAMPLES["nemo_csv"]["table"][0], 9))[0]) == 3
     whole = b"".join(
         line for line in SAMPLES["quectel_csv"]["csi"][0].splitlines(keepends=True) if not line.endswith(b",\r\n")
     )

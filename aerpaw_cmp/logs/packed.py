@@ -1,0 +1,135 @@
+"""Logs packed by bzip2 or xz, unpacked piece by piece and bounded; gzip is at home in ``ingest`` and ``blocks``.
+
+A file may hold several streams, as parallel packers write them. Python may have been built without either library:
+then the message says so.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Iterator
+from pathlib import Path
+from typing import Any
+
+from ..common.errors import InputError
+
+_MAGIC = {b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
+_PIECE = 2 << 20
+_MOST_RATIO = 1100
+"""What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth."""
+_MOST_MEMORY = 1 << 28
+"""Of the xz library; its strongest setting takes 65 MiB."""
+
+
+def form(head: bytes) -> str | None:
+    """``bzip2`` or ``xz``, None for any other content."""
+    for magic, name in _MAGIC.items():
+        if head.startswith(magic) and (name == "xz" or head[3:10] in _BLOCKS):
+            return name
+    return None
+
+
+_BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
+
+
+def _machine(name: str, path: str | Path) -> Callable[[], Any]:
+    try:
+        if name == "bzip2":
+            import bz2
+
+            return bz2.BZ2Decompressor
+        import lzma
+
+        return lambda: lzma.LZMADecompressor(format=lzma.FORMAT_XZ, memlimit=_MOST_MEMORY)
+    except ImportError as error:
+        raise InputError(
+            f"a {name} file, and this Python was built without {name}", expected="the log unpacked", path=path
+        ) from error
+
+
+def pieces(chunks: Iterable[bytes], path: str | Path) -> Iterator[bytes]:
+    """Content of a packed file, some MiB at a time.
+
+    Parameters
+    ----------
+    chunks : iterable of bytes
+        Of the file; the first one shows its form.
+    path : str or Path
+        What messages name.
+
+    Raises
+    ------
+    InputError
+        If it is damaged or cut, or unpacks to more than a log can.
+    """
+    name, make, machine = None, None, None
+    taken = given = 0
+    for chunk in chunks:
+        if name is None:
+            name = form(chunk)
+            make = _machine(name or "bzip2", path)
+        taken += len(chunk)
+        rest = chunk
+        while True:
+            if machine is None:
+                rest = rest.lstrip(b"\0")  # padding between streams
+                if not rest:
+                    break
+                assert make is not None
+                machine = make()
+            try:
+                piece = machine.decompress(rest, _PIECE)
+            except MemoryError:
+                raise
+            except Exception as error:  # bz2 raises OSError and ValueError, lzma an exception of its own
+                raise InputError(f"a damaged {name} file ({error})", cause="a cut download", path=path) from error
+            given += len(piece)
+            if given > _MOST_RATIO * taken + _PIECE:
+                raise InputError(f"the {name} file unpacks to more than {_MOST_RATIO} times its size", cause="no log",
+                                 path=path)  # fmt: skip
+            if piece:
+                yield piece
+            if machine.eof:
+                rest, machine = machine.unused_data, None
+            elif machine.needs_input:
+                break
+            else:
+                rest = b""
+    if machine is not None:
+        raise InputError(f"the {name} file ends too early", cause="a cut download", path=path)
+
+
+def unpacked(raw: bytes, path: str | Path, most: int) -> bytes:
+    """All of a packed file, never more than ``most`` bytes; see :func:`pieces`."""
+    made, size = [], 0
+    for piece in pieces([raw], path):
+        made.append(piece)
+        size += len(piece)
+        if size > most:
+            raise InputError(f"the {form(raw)} file unpacks to more than {most} bytes", cause="no log", path=path)
+    return b"".join(made)
+
+
+def head_of(place: Path, count: int) -> bytes:
+    """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
+    made = b""
+    try:
+        for piece in pieces(_chunks(place, None), place):
+            made += piece
+            if len(made) >= count:
+                break
+    except InputError:
+        return b""
+    return made[:count]
+
+
+def stream(place: Path, digest: Any) -> Iterator[bytes]:
+    """Content of a packed file on disk, some MiB at a time; ``digest`` takes the bytes on disk."""
+    return pieces(_chunks(place, digest), place)
+
+
+def _chunks(place: Path, digest: Any) -> Iterator[bytes]:
+    with place.open("rb") as file:
+        while chunk := file.read(_PIECE):
+            if digest is not None:
+                digest.update(chunk)
+            yield chunk

@@ -1,0 +1,88 @@
+"""Logs packed by bzip2 or xz are what they are unpacked, large or small, or one message."""
+
+from __future__ import annotations
+
+import bz2
+import hashlib
+import io
+import lzma
+import tarfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import AerpawCmpError, InputError
+from aerpaw_cmp.logs import blocks, packed
+from aerpaw_cmp.logs.ingest import ingest, sniffers_of
+from aerpaw_cmp.logs.readers import ReadOptions
+from tests.logs.test_blocks import same, sounder
+
+OPTIONS = ReadOptions(timezone="America/New_York")
+LOG = sounder(odd=True)
+Pack = Callable[[bytes], bytes]
+PACKERS = pytest.mark.parametrize("pack", [bz2.compress, lzma.compress], ids=["bzip2", "xz"])
+
+
+def in_streams(pack: Pack, data: bytes) -> bytes:
+    """Several streams behind each other, as parallel packers write them."""
+    return b"".join(pack(data[i : i + 5000]) for i in range(0, len(data), 5000))
+
+
+@PACKERS
+@pytest.mark.parametrize("in_blocks", [False, True])
+def test_a_packed_log_is_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, pack: Pack, in_blocks: bool) -> None:
+    (tmp_path / "a_power_log.txt").write_bytes(LOG)
+    (plain,) = ingest(tmp_path, options=OPTIONS)
+    if in_blocks:
+        for name, value in (("FROM_BYTES", 1000), ("BLOCK_BYTES", 3000)):
+            monkeypatch.setattr(blocks, name, value)
+        monkeypatch.setattr(packed, "_PIECE", 700)
+    for i, content in enumerate((pack(LOG), in_streams(pack, LOG))):
+        place = tmp_path / f"b{i}_power_log.txt.packed"
+        place.write_bytes(content)
+        (file,) = ingest(place, options=OPTIONS)
+        same(file.result, plain.result)
+        assert file.sha256 == hashlib.sha256(content).hexdigest()
+        assert sniffers_of(place) == ["sounder_log"]
+
+
+@PACKERS
+def test_a_packed_tar_is_a_folder(tmp_path: Path, pack: Pack) -> None:
+    out = io.BytesIO()
+    with tarfile.open(fileobj=out, mode="w") as book:
+        for name, data in (("LW1/a_power_log.txt", LOG), ("LW2/b_power_log.txt.x", pack(LOG))):
+            one = tarfile.TarInfo(name)
+            one.size = len(data)
+            book.addfile(one, io.BytesIO(data))
+    (tmp_path / "set.tar.packed").write_bytes(pack(out.getvalue()))
+    found = ingest(tmp_path / "set.tar.packed", options=OPTIONS)
+    assert [file.result.reader for file in found] == ["sounder_log"] * 2
+    same(found[0].result, found[1].result)
+
+
+@PACKERS
+def test_what_is_cut_damaged_or_a_bomb_is_one_message(tmp_path: Path, pack: Pack) -> None:
+    whole = pack(LOG)
+    place = tmp_path / "a_power_log.txt.packed"
+    rng = np.random.default_rng(2)
+    damaged = []
+    for at in rng.integers(12, len(whole), 12).tolist():
+        damaged.append(whole[:at] + bytes([whole[at] ^ 0x55]) + whole[at + 1 :])
+    for content in (whole[:-9], whole[: len(whole) // 2], whole[:20], pack(b""), pack(b"0" * 4_000_000), *damaged):
+        place.write_bytes(content)
+        with pytest.raises(AerpawCmpError):
+            ingest(place, options=OPTIONS)
+    place.write_bytes(pack(b"0" * 4_000_000))
+    with pytest.raises(InputError, match="times its size"):
+        ingest(place, options=OPTIONS, reader="sounder_log")
+    place.write_bytes(whole[:-9])
+    with pytest.raises(InputError, match="ends too early"):
+        ingest(place, options=OPTIONS, reader="sounder_log")
+
+
+def test_words_that_begin_as_a_packed_file_does_are_text() -> None:
+    assert packed.form(b"BZh, a word\n") is None
+    assert packed.form(bz2.compress(b"a")) == "bzip2"
+    assert packed.form(lzma.compress(b"a")) == "xz"

@@ -22,6 +22,10 @@ settings.register_profile("further", deadline=None)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed" if os.environ.get("CI") else "further")
 
+# One worker per core: the threads of a linear algebra library would only wait for each other. Before numpy is loaded.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
 # have a folder each; that this machine's LLVM works is found out once for all of them.
 _OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
@@ -101,6 +105,7 @@ def pytest_collection_finish() -> None:
     """What was imported and collected stays to the end: the collector need not look through it again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -36,25 +36,29 @@ if _OF_ALL:
 
 
 DEAREST = (
-    "propagation/test_growth.py",  # the first two compile different kernels, where none are kept yet
-    "propagation/test_compiled.py",
-    "test_field.py",
+    "propagation/test_growth.py",  # compiles for half a minute where nothing is kept yet; the other worker needs it later
     "jobs/test_campaign.py",
-    "parsers/test_law.py",
+    "test_field.py",  # the first that needs Sionna: by now one worker knows whether this machine's LLVM works
     "report/test_figures.py",
-    "report/test_browser.py",
-    "propagation/test_sionna.py",
-    "test_cli_commands.py",
+    "propagation/test_compiled.py",
+    "parsers/test_law.py",
     "jobs/test_coverage_map.py",
-    "jobs/test_compare_flight.py",
-    "live/test_tap.py",
-    "report/test_browser_campaign.py",
     "jobs/test_workers.py",
+    "propagation/test_sionna.py",
+    "report/test_browser.py",
+    "jobs/test_calibrate_rank.py",
+    "flight/test_lag.py",
+    "live/test_tap.py",
+    "report/test_diff.py",
+    "jobs/test_compare_flight.py",
+    "report/test_browser_campaign.py",
+    "report/test_browser_map.py",
     "machine/test_llvm.py",
     "live/test_log.py",
     "live/test_bad_input.py",
-    "flight/test_lag.py",
-    "report/test_diff.py",
+    "test_docs.py",
+    "jobs/test_calibrate.py",
+    "test_cli_commands.py",
     "live/test_benchmarks.py",
 )
 """Files that take 5 s and more, the longest first."""

@@ -274,6 +274,8 @@ def test_antennas_without_a_shared_term_are_fits_of_their_own(terms):
     model = dataclasses.replace(MODEL, terms=terms)
     both = fit_gain(TRAIN, model)
     alone = [fit_gain([s for s in TRAIN if s.channel == channel], model) for channel in "AB"]
+    shared = dataclasses.replace(model, terms=(*terms, Term("body", "all", 0.9, 1e-5)))  # solved as one
+    np.testing.assert_allclose(fit_gain(TRAIN, shared).predict(TEST[0]), both.predict(TEST[0]), rtol=0, atol=1e-4)
     assert both.log_evidence == pytest.approx(sum(one.log_evidence for one in alone), rel=1e-9)
     for one, samples in zip(alone, TEST, strict=True):
         some = samples.part(np.arange(0, len(samples), 9))

@@ -213,6 +213,7 @@ class Runs:
         try:
             sys.stdout = sys.stderr = os.fdopen(os.dup(said), "w", encoding="utf-8")
             if limit is not None:
+                sys.dont_write_bytecode = True  # cut by the limit it would stay in the tree
                 resource.setrlimit(resource.RLIMIT_FSIZE, (limit, limit))
             at, kind, error, sticky, command = fault
             self.shim.fault_arm(os.fsencode(self.root), at, kind, error, sticky, command.encode())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gc
 import os
 import random
@@ -60,6 +61,20 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     parser.addoption("--shuffle", type=int, default=None, metavar="SEED", help="files, and tests in them, in any order")
 
 
+@pytest.hookimpl(optionalhook=True)
+def pytest_xdist_auto_num_workers() -> int | None:
+    """``-n auto`` starts a worker per core: one for two threads of a core, and as many as the host has in a container."""
+    if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS") or not hasattr(os, "sched_getaffinity"):
+        return None
+    threads = len(os.sched_getaffinity(0))
+    try:
+        quota, period = Path("/sys/fs/cgroup/cpu.max").read_text().split()
+        granted = max(1, int(quota) // int(period))
+    except (OSError, ValueError):  # no control group, or no limit
+        granted = threads
+    return granted if granted < threads else 2 if threads in (2, 3) else None
+
+
 @pytest.hookimpl(trylast=True)
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Files in an order drawn with the seed, and in each its tests, the same in every process; else the dearest first.
@@ -106,6 +121,8 @@ def sionna() -> Any:
         sionna.load_variant()
     except (CheckError, UsageError) as error:
         pytest.skip(f"no device for Dr.Jit: {error}")
+    gc.collect()
+    gc.freeze()  # each scene that is freed ends with a collection
     return sionna
 
 
@@ -129,6 +146,32 @@ def blank_pictures() -> Iterator[None]:
         patch.setattr(canvas, "save_as", save_as)
         patch.setattr(canvas, "smaller", cache(canvas.smaller))
         patch.setattr(canvas, "FEWEST_FIGURES", 10_000)  # in this process: a further one costs more than it saves
+        yield
+
+
+@pytest.fixture(scope="module")
+def few_pictures(blank_pictures: None) -> Iterator[None]:
+    """Also, a figure is made from its data once per module: for usual flights that many tests of a module report."""
+    from aerpaw_cmp.report import canvas
+
+    def render(plate: Any, *how: Any) -> Any:
+        if plate.name in made:
+            plate = dataclasses.replace(plate, draw=canvas.figure)
+        made.add(plate.name)
+        return real(plate, *how)
+
+    real, made = canvas.render, set[str]()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(canvas, "render", render)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="module")
+def no_wait_for_the_disk(request: pytest.FixtureRequest) -> Iterator[None]:
+    """Where outputs are only looked at, the disk need not have them yet: only a descriptor that is none is told."""
+    with pytest.MonkeyPatch.context() as patch:
+        if request.path.parent.name in ("jobs", "maps", "report", "site", "tests"):
+            patch.setattr(os, "fsync", lambda descriptor: os.fstat(descriptor) and None)
         yield
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from aerpaw_cmp.__main__ import main
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 GOOD_TELEMETRY = "".join(
     f'{i},{-78.6963 + i * 1e-5:.7f},35.7274,{10 + i * 0.1:.3f},"(0.01,1.57,0.0)","(0.0,0.9,0.0)",48.2,'
     f"2025-06-01 10:00:{i:02d}.000000,3,15\r\n"

@@ -193,6 +193,17 @@ def test_an_interrupted_campaign_says_where_its_outcomes_are(
         assert f"{tmp_path / 'out'} was not written" in err
 
 
+def test_a_file_that_ends_too_early_is_no_interrupt(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def ends(*_: Any, **__: Any) -> None:
+        raise EOFError("marshal data too short")
+
+    monkeypatch.setattr("aerpaw_cmp.jobs.run.run_ingest", ends)
+    assert main(["ingest", str(SAMPLE)]) == 70
+    assert "EOFError: marshal data too short" in capsys.readouterr().err
+
+
 def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
     before = tmp_path / "r" / "note.txt"
     before.parent.mkdir()

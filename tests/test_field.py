@@ -18,7 +18,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 pytestmark = [
-    pytest.mark.usefixtures("blank_pictures"),
+    pytest.mark.usefixtures("few_pictures"),
     pytest.mark.field,
     pytest.mark.skipif(not ROOT or not Path(ROOT).is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set: no real logs"),
 ]

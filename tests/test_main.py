@@ -15,7 +15,7 @@ from aerpaw_cmp import __main__ as program
 from aerpaw_cmp.common.commands import COMMANDS
 from aerpaw_cmp.common.errors import CheckError, InputError, UsageError
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 ROOT = Path(__file__).resolve().parents[1]
 HEAVY = (

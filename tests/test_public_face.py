@@ -13,7 +13,7 @@ import pytest
 
 import aerpaw_cmp as ac
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"

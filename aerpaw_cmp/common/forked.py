@@ -114,7 +114,9 @@ class _Shared(Generic[_Item]):
         self._found: dict[int, _Item] = {}
         self._ways: list[Connection] = []
         self._children: list[Any] = []
-        gc.freeze()  # a collection in a child would touch, and so copy, all that it shares with this process
+        froze = not gc.get_freeze_count()  # what somebody else has frozen is to stay so
+        if froze:
+            gc.freeze()  # a collection in a child would touch, and so copy, all that it shares with this process
         with warnings.catch_warnings():
             # Python 3.12 warns of any thread, also the sleeping ones of BLAS, which know about forks
             warnings.simplefilter("ignore", DeprecationWarning)
@@ -131,7 +133,8 @@ class _Shared(Generic[_Item]):
                 _widen(here)
                 self._ways.append(here)
                 self._children.append(child)
-        gc.unfreeze()
+        if froze:
+            gc.unfreeze()
         os.close(tickets)
 
     def __iter__(self) -> Iterator[_Item]:

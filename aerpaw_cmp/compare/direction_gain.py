@@ -153,6 +153,16 @@ class GainModel:
     bin_s: float = 4.0
 
 
+def scaled_model(model: GainModel, factor: float) -> GainModel:
+    """All standard deviations times a factor."""
+    return dataclasses.replace(
+        model,
+        terms=tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in model.terms),
+        own_sd_db=model.own_sd_db * factor,
+        noise_sd_db=model.noise_sd_db * factor,
+    )
+
+
 @dataclass(frozen=True, slots=True)
 class _Block:
     """Columns of one term for one antenna (or all)."""
@@ -177,7 +187,8 @@ class _System:
     log_det: float
 
 
-def _argument(samples: LinkSamples, frame: Frame) -> FloatArray:
+def argument_of(samples: LinkSamples, frame: Frame) -> FloatArray:
+    """What a term of this frame is a function of (n, 3)."""
     if frame == "body":
         return samples.at_uav
     if frame == "mast":
@@ -191,15 +202,15 @@ def _knots(points_m: FloatArray, spacing_m: float) -> FloatArray:
     return points_m[np.sort(first)]
 
 
-def _features(block: _Block, argument: FloatArray) -> FloatArray:
-    """Unit-variance features (n, columns of the block)."""
+def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> FloatArray:
+    """Unit-variance features (n, columns of the block); ``keep`` those that the next fit asks for again."""
     if block.knots_m is None:
-        return _direction_features(argument, block.term.length)
+        return (_direction_features if keep else gaussian_features)(argument, block.term.length)
     from scipy.linalg import cholesky, solve_triangular
 
     knots, length = block.knots_m, block.term.length
-    lower = cholesky(_gaussian(knots, knots, length) + 1e-6 * np.eye(len(knots)), lower=True)
-    return np.asarray(solve_triangular(lower, _gaussian(knots, argument, length), lower=True).T)
+    lower = cholesky(kernel(knots, knots, length) + 1e-6 * np.eye(len(knots)), lower=True)
+    return np.asarray(solve_triangular(lower, kernel(knots, argument, length), lower=True).T)
 
 
 FEATURES_MIB = 320
@@ -221,7 +232,28 @@ def _direction_features(direction: FloatArray, length: float) -> FloatArray:
     return _kept_features[key]
 
 
-def _gaussian(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
+MEANS = 4096
+"""Mean features that are kept at most, some kilobytes each."""
+
+_kept_means: OrderedDict[bytes, FloatArray] = OrderedDict()
+
+
+def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
+    """Mean of :func:`_features` over the samples (columns of the block,), kept."""
+    digest = hashlib.blake2b(repr((block.term.length, argument.shape)).encode())
+    digest.update(np.ascontiguousarray(argument).tobytes())
+    digest.update(b"" if block.knots_m is None else np.ascontiguousarray(block.knots_m).tobytes())
+    key = digest.digest()
+    if key not in _kept_means:
+        _kept_means[key] = _features(block, argument).mean(axis=0)
+        while len(_kept_means) > MEANS:
+            _kept_means.popitem(last=False)
+    _kept_means.move_to_end(key)
+    return _kept_means[key]
+
+
+def kernel(one: FloatArray, other: FloatArray, length: float) -> FloatArray:
+    """Gaussian kernel of unit variance between points (n, 3) and (m, 3): (n, m)."""
     from scipy.spatial.distance import cdist
 
     return np.asarray(np.exp(-cdist(one, other, "sqeuclidean") / (2.0 * length**2)))
@@ -255,11 +287,11 @@ def _design(blocks: Sequence[_Block], samples: LinkSamples) -> FloatArray:
     out = np.zeros((len(samples), blocks[-1].stop if blocks else 0))
     for block in blocks:
         if block.antenna is None or block.antenna == samples.antenna:
-            out[:, block.start : block.stop] = _features(block, _argument(samples, block.term.frame))
+            out[:, block.start : block.stop] = _features(block, argument_of(samples, block.term.frame))
     return out
 
 
-def _whitener(model: GainModel, samples: LinkSamples) -> FloatArray:
+def whitener(model: GainModel, samples: LinkSamples) -> FloatArray:
     """Cholesky factor of a series' own covariance: offset, nuisance, noise."""
     from scipy.linalg import cholesky
     from scipy.spatial.distance import cdist
@@ -333,9 +365,9 @@ def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSample
     from scipy.linalg import solve_triangular
     from scipy.linalg.blas import dsyrk
 
-    parts = [_features(b, _argument(samples, b.term.frame)) for b in own]
+    parts = [_features(b, argument_of(samples, b.term.frame)) for b in own]
     design = np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
-    lower = _whitener(model, samples)
+    lower = whitener(model, samples)
     rows = np.asfortranarray(solve_triangular(lower, design, lower=True))
     target = solve_triangular(lower, samples.residual_db - samples.residual_db.mean(), lower=True)
     gram = dsyrk(1.0, rows, trans=1, lower=1) if rows.shape[1] else np.zeros((0, 0))
@@ -349,52 +381,82 @@ def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSample
     )
 
 
-def _assemble(
-    model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
-) -> tuple[_System, dict[str, FloatArray]]:
-    """Sum of the normal equations of all series, and the mean of the features (p,) per antenna."""
-    noise = model.noise_sd_db
-    one, centre = _summed(model, series, blocks)
-    rows = sum(map(len, series))
-    scaled = _System(
-        one.gram / noise**2, one.right / noise**2, one.square / noise**2, one.log_det + rows * math.log(noise)
-    )
-    return scaled, centre
+@dataclass(slots=True)
+class _Sum:
+    """Running sum of the equations of several series, with the noise as the unit; ``members`` by key."""
+
+    gram: FloatArray
+    right: FloatArray
+    square: float = 0.0
+    log_det: float = 0.0
+    total: dict[str, FloatArray] = field(default_factory=dict)
+    count: dict[str, int] = field(default_factory=dict)
+    members: dict[bytes, _Member] = field(default_factory=dict)
+
+    def add(self, member: _Member, sign: int) -> None:
+        """Add a series, or take it away again."""
+        one, runs = member.equations, member.runs
+        for rows, from_row in runs:
+            for columns, from_column in runs:
+                into = self.gram[rows, columns]
+                (np.add if sign > 0 else np.subtract)(into, one.gram[from_row, from_column], out=into)
+            self.right[rows] += sign * one.right[from_row]
+            self.total[member.antenna][rows] += sign * one.rows * one.mean[from_row]
+        self.square += sign * one.square
+        self.log_det += sign * one.log_det
+        self.count[member.antenna] += sign * one.rows
 
 
-_last_sum: dict[tuple[bytes, ...], tuple[_System, dict[str, FloatArray]]] = {}
-"""The last sum: a fit at another spread, or of another common scale, asks for it again."""
+@dataclass(frozen=True, slots=True)
+class _Member:
+    """Equations of one series, and where its columns stand in the whole."""
+
+    antenna: str
+    equations: _SeriesEquations
+    runs: list[tuple[slice, slice]]
+
+
+_last_sum: list[_Sum] = []
+"""The last sum: most fits have some series more or fewer than the one before, or only another scale."""
+
+LONGEST_CHAIN = 64
+"""Series that are added to and taken from one sum before it is made anew: rounding adds up."""
+
+_chain = [0]
 
 
 def _summed(
     model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
 ) -> tuple[_System, dict[str, FloatArray]]:
-    """What :func:`_assemble` gives, with the noise as the unit."""
+    """Sum of the equations of all series, with the noise as the unit, and the mean of the features (p,) per antenna."""
     width = blocks[-1].stop if blocks else 0
     own = [[b for b in blocks if b.antenna in (None, s.antenna)] for s in series]
-    keys = tuple(
-        _key(model, mine, s) + repr([b.start for b in mine]).encode() for mine, s in zip(own, series, strict=True)
-    )
-    if keys in _last_sum:
-        return _last_sum[keys]
-    gram, right, square, log_det = np.zeros((width, width)), np.zeros(width), 0.0, 0.0
-    total = {s.antenna: np.zeros(width) for s in series}
-    count = dict.fromkeys(total, 0)
-    for samples, mine in zip(series, own, strict=True):
-        one = _series_equations(model, mine, samples)
-        runs = _runs(mine)
-        for rows, from_row in runs:
-            for columns, from_column in runs:
-                gram[rows, columns] += one.gram[from_row, from_column]
-            right[rows] += one.right[from_row]
-            total[samples.antenna][rows] += one.rows * one.mean[from_row]
-        square += one.square
-        log_det += one.log_det
-        count[samples.antenna] += one.rows
-    centre = {antenna: total[antenna] / count[antenna] for antenna in total}
-    _last_sum.clear()
-    _last_sum[keys] = _System(gram, right, square, log_det), centre
-    return _last_sum[keys]
+    keys = [
+        _key(model, mine, s) + repr((width, s.antenna, [b.start for b in mine])).encode()
+        for mine, s in zip(own, series, strict=True)
+    ]
+    antennas = dict.fromkeys(s.antenna for s in series)
+    last = _last_sum[0] if _last_sum else None
+    gone = [] if last is None else [key for key in last.members if key not in set(keys)]
+    new = [i for i, key in enumerate(keys) if last is None or key not in last.members]
+    steps = len(gone) + len(new)
+    if last is None or len(set(keys)) < len(keys) or steps >= len(keys) or _chain[0] + steps > LONGEST_CHAIN:
+        last = _Sum(gram=np.zeros((width, width)), right=np.zeros(width))
+        gone, new, _chain[0] = [], list(range(len(keys))), 0
+    else:
+        _chain[0] += steps
+    for antenna in antennas:
+        last.total.setdefault(antenna, np.zeros(width))
+        last.count.setdefault(antenna, 0)
+    for key in gone:
+        last.add(last.members.pop(key), -1)
+    for i in new:
+        member = _Member(series[i].antenna, _series_equations(model, own[i], series[i]), _runs(own[i]))
+        last.add(member, 1)
+        last.members[keys[i]] = member
+    _last_sum[:] = [last]
+    centre = {antenna: last.total[antenna] / last.count[antenna] for antenna in antennas}
+    return _System(last.gram, last.right, last.square, last.log_det), centre
 
 
 def _scale(blocks: Sequence[_Block], model: GainModel) -> FloatArray:
@@ -403,25 +465,44 @@ def _scale(blocks: Sequence[_Block], model: GainModel) -> FloatArray:
     return np.concatenate([np.full(b.stop - b.start, each[b.term.frame, b.term.per, b.term.length]) for b in blocks])
 
 
-def _posterior(system: _System, scale: FloatArray) -> tuple[FloatArray, FloatArray, float]:
-    """Weights (p,), Cholesky factor of the posterior precision of the unit-variance weights, log evidence."""
-    from scipy.linalg import LinAlgError, cho_solve, cholesky
+def factor_of(matrix: FloatArray) -> FloatArray:
+    """Lower Cholesky factor of a symmetric matrix, in its place.
 
-    matrix = scale[:, None] * system.gram * scale
-    matrix[np.diag_indices(len(matrix))] += 1.0
+    Raises
+    ------
+    InputError
+        It is not positive definite, or not finite.
+    """
+    from scipy.linalg import LinAlgError, cholesky
+
     try:
-        lower = cholesky(matrix, lower=True)
+        if not np.isfinite(matrix.sum()):
+            raise ValueError("numbers that are not finite")
+        # the transpose is the same matrix in the order that LAPACK works on
+        return np.asarray(cholesky(matrix.T, lower=True, overwrite_a=True, check_finite=False))
     except (LinAlgError, ValueError) as error:
         raise InputError(
             f"the equations of the fit cannot be solved ({error})",
             expected="levels that are finite and vary",
             cause="a channel that never changes, or values that are no levels",
         ) from None
+
+
+def _posterior(system: _System, scale: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+    """Weights (p,), Cholesky factor of the posterior precision of the unit-variance weights, log evidence, misfit.
+
+    All with the noise as the unit.
+    """
+    from scipy.linalg import cho_solve
+
+    matrix = system.gram * scale[:, None]
+    matrix *= scale
+    matrix[np.diag_indices(len(matrix))] += 1.0
+    lower = factor_of(matrix)
     right = scale * system.right
-    weights = cho_solve((lower, True), right)
-    explained = float(right @ weights)
-    evidence = -0.5 * (system.square - explained) - float(np.log(np.diag(lower)).sum()) - system.log_det
-    return scale * weights, lower, evidence
+    weights = cho_solve((lower, True), right, check_finite=False)
+    misfit = system.square - float(right @ weights)
+    return scale * weights, lower, -0.5 * misfit - float(np.log(np.diag(lower)).sum()) - system.log_det, misfit
 
 
 @dataclass(frozen=True, slots=True)
@@ -438,18 +519,34 @@ class GainFit:
         Log marginal likelihood, but for a constant of the data.
     rows : int
         Bins.
+    common_scale : float
+        Factor on all standard deviations that makes them fit the data: ``s^2 = y' C^-1 y / rows``.
     """
 
     model: GainModel
     antennas: tuple[str, ...]
     log_evidence: float
     rows: int
+    common_scale: float
+    _series: int = field(repr=False)
     _blocks: tuple[_Block, ...] = field(repr=False)
     _weights: FloatArray = field(repr=False)
     _lower: FloatArray = field(repr=False)
     _scale: FloatArray = field(repr=False)
     _centre: Mapping[str, FloatArray] = field(repr=False)
     _seen: Mapping[str, FloatArray] = field(repr=False)
+
+    def scaled(self) -> GainFit:
+        """The fit with all standard deviations times :attr:`common_scale`: the same gains, other uncertainties."""
+        s = self.common_scale
+        misfit = s**2 * (self.rows - self._series)
+        return dataclasses.replace(
+            self,
+            model=scaled_model(self.model, s),
+            log_evidence=self.log_evidence + 0.5 * misfit * (1.0 - s**-2) - self.rows * math.log(s),
+            common_scale=1.0,
+            _scale=self._scale * s,
+        )
 
     def predict(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> tuple[FloatArray, FloatArray]:
         """Gain of all terms together along samples, about its mean over the samples it was learned from.
@@ -479,22 +576,49 @@ class GainFit:
     def mean(self, samples: LinkSamples, frames: Iterable[Frame] | None = None) -> FloatArray:
         """The gain of :meth:`predict` alone (n,) [dB]: the standard deviation costs a hundred times as much."""
         gain = np.full(len(samples), np.nan)
-        for rows, design in self._designs(samples, frames):
-            gain[rows] = design @ self._weights
+        blocks, rows = self._chosen(samples, frames), self._known_rows(samples)
+        known = samples if len(rows) == len(samples) else samples.part(rows)
+        centre = self._centre[samples.antenna]
+        total = np.zeros(len(rows))
+        for block in blocks:
+            columns = slice(block.start, block.stop)
+            values = _features(block, argument_of(known, block.term.frame), keep=True) @ self._weights[columns]
+            total += values - centre[columns] @ self._weights[columns]
+        gain[rows] = total
         return gain
 
-    def _designs(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> Iterator[tuple[IntArray, FloatArray]]:
-        """Rows that have every direction, some thousand at a time, and their features about the centre."""
+    def average(self, samples: LinkSamples) -> float:
+        """Mean of :meth:`mean` over the samples [dB]; their mean features are kept for other fits."""
+        blocks, rows = self._chosen(samples, None), self._known_rows(samples)
+        known = samples if len(rows) == len(samples) else samples.part(rows)
+        centre = self._centre[samples.antenna]
+        total = 0.0
+        for block in blocks:
+            columns = slice(block.start, block.stop)
+            mean = _mean_features(block, argument_of(known, block.term.frame))
+            total += float((mean - centre[columns]) @ self._weights[columns])
+        return total
+
+    def _chosen(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> list[_Block]:
+        """Blocks of some frames that an antenna has."""
         if samples.antenna not in self.antennas:
             raise UsageError(
                 f"tower and channel {samples.antenna!r} were not fitted", expected="one of " + ", ".join(self.antennas)
             )
         chosen = set(frames) if frames is not None else {"body", "mast", "world", "place"}
+        return [b for b in self._blocks if b.term.frame in chosen and b.antenna in (None, samples.antenna)]
+
+    @staticmethod
+    def _known_rows(samples: LinkSamples) -> IntArray:
         finite = np.isfinite(np.concatenate([samples.at_uav, samples.at_tower, samples.position_m], axis=1))
-        good = np.flatnonzero(finite.all(axis=1))
+        return np.flatnonzero(finite.all(axis=1))
+
+    def _designs(self, samples: LinkSamples, frames: Iterable[Frame] | None) -> Iterator[tuple[IntArray, FloatArray]]:
+        """Rows that have every direction, some thousand at a time, and their features about the centre."""
+        blocks, good = self._chosen(samples, frames), self._known_rows(samples)
         for start in range(0, len(good), 2000):
             rows = good[start : start + 2000]
-            yield rows, self._about_centre(samples.part(rows), chosen)
+            yield rows, self._about_centre(samples.part(rows), blocks)
 
     def gain(self, frame: Frame, antenna: str, direction: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Gain at one end over directions (n, 3): posterior mean and standard deviation (n,) [dB].
@@ -515,12 +639,11 @@ class GainFit:
             return np.concatenate([self._seen[f"body.{a}"] for a in self.antennas])
         return self._seen[f"mast.{antenna}"]
 
-    def _about_centre(self, samples: LinkSamples, frames: set[Frame] | set[str]) -> FloatArray:
+    def _about_centre(self, samples: LinkSamples, blocks: Sequence[_Block]) -> FloatArray:
         design = np.zeros((len(samples), len(self._weights)))
-        for block in self._blocks:
-            if block.term.frame in frames and block.antenna in (None, samples.antenna):
-                values = _features(block, _argument(samples, block.term.frame))
-                design[:, block.start : block.stop] = values - self._centre[samples.antenna][block.start : block.stop]
+        for block in blocks:
+            values = _features(block, argument_of(samples, block.term.frame))
+            design[:, block.start : block.stop] = values - self._centre[samples.antenna][block.start : block.stop]
         return design
 
     def _moments(self, design: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -557,16 +680,19 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     is exact but for the harmonics left out (:func:`.sphere.gaussian_spectrum`) and the average over ``bin_s``.
     """
     model = model or GainModel()
-    binned = _binned(series, model.bin_s)
+    binned = binned_series(series, model.bin_s)
     blocks = _layout(model, binned)
-    system, centre = _assemble(model, binned, blocks)
-    scale = _scale(blocks, model)
-    weights, lower, evidence = _posterior(system, scale)
+    system, centre = _summed(model, binned, blocks)
+    scale, noise = _scale(blocks, model), model.noise_sd_db
+    weights, lower, evidence, misfit = _posterior(system, scale / noise)
+    rows = sum(map(len, binned))
     return GainFit(
         model=model,
         antennas=tuple(dict.fromkeys(s.antenna for s in binned)),
-        log_evidence=evidence,
-        rows=sum(map(len, binned)),
+        log_evidence=evidence + 0.5 * misfit * (1.0 - noise**-2) - rows * math.log(noise),
+        rows=rows,
+        common_scale=math.sqrt(max(misfit / noise**2 / max(rows - len(binned), 1), 1e-6)),
+        _series=min(len(binned), rows - 1),
         _blocks=blocks,
         _weights=weights,
         _lower=lower,
@@ -576,7 +702,8 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     )
 
 
-def _binned(series: Sequence[LinkSamples], bin_s: float) -> list[LinkSamples]:
+def binned_series(series: Sequence[LinkSamples], bin_s: float) -> list[LinkSamples]:
+    """Means over bins of each series that has any; InputError if none has."""
     binned = [s.binned(bin_s) for s in series]
     binned = [s for s in binned if len(s)]
     if not binned:
@@ -591,100 +718,6 @@ def _seen(binned: Sequence[LinkSamples]) -> dict[str, FloatArray]:
         found[f"body.{antenna}"] = np.concatenate([s.at_uav for s in own])
         found[f"mast.{antenna}"] = np.concatenate([s.at_tower for s in own])
     return found
-
-
-SPREADS = (0.5, 1.0, 2.0, 4.0)
-"""Factors of nuisance and noise against the gains to choose from. Lengths stay as they are: a free marginal likelihood
-takes fading for direction and shrinks the length at the UAV to 0.04 (2 degrees); free standard deviations, too, fit the
-training flights at the cost of the next one (dataset 12: 3.83 dB in place of 3.65)."""
-
-MOST_ROWS = 1500
-"""Bins that the choice looks at; longer series are averaged over longer times for it."""
-
-FOLDS = 4
-
-
-@dataclass(frozen=True, slots=True)
-class Choice:
-    """A model and how it was chosen: error on left-out parts of the training flights [dB] per factor of spread."""
-
-    model: GainModel
-    spread: float
-    left_out_rmse_db: Mapping[float, float]
-    scale: float
-
-
-def choose_model(
-    series: Sequence[LinkSamples], model: GainModel | None = None, spreads: Sequence[float] = SPREADS
-) -> Choice:
-    """Strength of nuisance and noise against the gains, and the common scale of all.
-
-    The ratio is that of least error on flights left out in turn; of one flight nothing can be left out that tells
-    antenna from place (quarters of it were tried: 3.81 dB in place of 3.65 on dataset 12), so it stays 1. The scale,
-    which changes no mean, makes the standard deviations fit the data: ``s^2 = y' C^-1 y / rows``.
-
-    Parameters
-    ----------
-    series : sequence of LinkSamples
-        Of the flights to learn from, and no other.
-    model : GainModel, optional
-        Where to start; its lengths are kept.
-    spreads : sequence of float
-        Factors to choose from.
-    """
-    model = model or GainModel()
-    total = sum(map(len, _binned(series, model.bin_s)))
-    coarse = dataclasses.replace(model, bin_s=model.bin_s * max(1, math.ceil(total / MOST_ROWS)))
-    folds = _folds(series)
-    errors: dict[float, float] = {}
-    # one fold after the other: all factors share its equations
-    found = [[_left_out_squares(train, test, _with_spread(coarse, f)) for f in spreads] for train, test in folds]
-    for factor, squares in zip(spreads, zip(*found, strict=True), strict=False):
-        if rows := sum(n for _, n in squares):
-            errors[factor] = float(np.sqrt(sum(square for square, _ in squares) / rows))
-    best = min(errors, key=lambda f: errors[f]) if errors else 1.0
-    scale = _common_scale(series, _with_spread(coarse, best))
-    return Choice(_scaled(_with_spread(model, best), scale), best, errors, scale)
-
-
-def _with_spread(model: GainModel, factor: float) -> GainModel:
-    return dataclasses.replace(model, own_sd_db=model.own_sd_db * factor, noise_sd_db=model.noise_sd_db * factor)
-
-
-def _scaled(model: GainModel, factor: float) -> GainModel:
-    terms = tuple(dataclasses.replace(t, sd_db=t.sd_db * factor) for t in model.terms)
-    return dataclasses.replace(_with_spread(model, factor), terms=terms)
-
-
-def _folds(series: Sequence[LinkSamples]) -> list[tuple[list[LinkSamples], list[LinkSamples]]]:
-    """Training and left-out series; none of a single flight."""
-    flights = list(dict.fromkeys(s.flight for s in series))
-    if len(flights) < 2:
-        return []
-    groups = [set(flights[i::FOLDS]) for i in range(min(FOLDS, len(flights)))]
-    return [([s for s in series if s.flight not in g], [s for s in series if s.flight in g]) for g in groups]
-
-
-def _left_out_squares(train: Sequence[LinkSamples], test: Sequence[LinkSamples], model: GainModel) -> tuple[float, int]:
-    """Sum of squares about an offset per series, and how many bins."""
-    known = {s.antenna for s in train}
-    scored = [s for s in (t.binned(model.bin_s) for t in test) if s.antenna in known and len(s) > 1]
-    if not scored or not any(np.isfinite(s.residual_db).any() for s in train):
-        return 0.0, 0
-    fit = fit_gain(train, model)
-    left = [s.residual_db - fit.mean(s) for s in scored]
-    return float(sum(((r - r.mean()) ** 2).sum() for r in left)), sum(map(len, left))
-
-
-def _common_scale(series: Sequence[LinkSamples], model: GainModel) -> float:
-    binned = _binned(series, model.bin_s)
-    blocks = _layout(model, binned)
-    system, _ = _assemble(model, binned, blocks)
-    scale = _scale(blocks, model)
-    weights, _, _ = _posterior(system, scale)
-    rows = sum(map(len, binned)) - len(binned)
-    left = system.square - float(system.right @ weights)
-    return math.sqrt(max(left / max(rows, 1), 1e-6))
 
 
 def column_forms(
@@ -718,13 +751,13 @@ def column_forms(
     from scipy.linalg import cholesky, solve_triangular
 
     kept = [s for s in series if len(s.binned(model.bin_s))]
-    binned = _binned(kept, model.bin_s)
+    binned = binned_series(kept, model.bin_s)
     blocks = _layout(model, binned)
     scale = _scale(blocks, model)
     form, cross = np.zeros((width, width)), np.zeros((len(scale), width))
     gram = np.zeros((len(scale), len(scale)))
     for raw, samples in zip(kept, binned, strict=True):
-        lower = _whitener(model, samples)
+        lower = whitener(model, samples)
         rows = solve_triangular(lower, _design(blocks, samples) * scale, lower=True)
         values = solve_triangular(lower, columns(raw), lower=True)
         form += values.T @ values

@@ -9,6 +9,7 @@ import math
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import replace
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeVar
@@ -377,8 +378,14 @@ def _find(name_or_path: str | Path) -> tuple[str, SiteModel, LineOf]:
             expected=f"a site.yaml or one of {', '.join(PACKAGED)}",
             cause=f"did you mean '{near}'?" if near else None,
         )
+    return name, *_packaged(name)
+
+
+@cache
+def _packaged(name: str) -> tuple[SiteModel, LineOf]:
+    """The settings of a packaged site: no caller changes them, and a campaign asks for them at each of its flights."""
     with resources.as_file(resources.files("aerpaw_cmp.site") / "data" / f"{name}.yaml") as file:
-        return name, *load_yaml_and_lines(file, SiteModel)
+        return load_yaml_and_lines(file, SiteModel)
 
 
 def build_site(model: SiteModel, folder: Path | None = None) -> Site:

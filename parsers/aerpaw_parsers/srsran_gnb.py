@@ -80,12 +80,27 @@ def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
+    return _read_reports(data, options, set())
+
+
+def _json_in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+    """The same, where the times of all blocks are of one form."""
+    forms: set[tuple[str, ...]] = set()
+    read_block = blocks.by_lines(lambda data, given: _read_reports(data, given, forms), apart=_json.WHOLE)
+    return read_block(chunks, options)
+
+
+def _read_reports(data: bytes, options: ReadOptions, forms: set[tuple[str, ...]]) -> ReadResult:
+    """Reports of a block; ``forms`` gathers how times were understood, which all blocks must agree on."""
     lines = _lines.split(data)
     reports = _json.objects(lines)
     row, found = reports.row, reports.found
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
     clock, time, warnings = _stamps.read(texts, options)
+    forms |= {(clock, *warnings)} if texts else set()
+    if len(forms) > 1:
+        raise blocks.Whole
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines,
@@ -124,5 +139,5 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=blocks.by_lines(read_json, apart=_json.WHOLE),
+    in_blocks=_json_in_blocks,
 )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import multiprocessing
 import os
 import signal
@@ -118,6 +119,21 @@ def test_this_process_is_free_meanwhile_and_nothing_is_left_running(monkeypatch:
     with pytest.raises(KeyError), forked.ahead([partial(time.sleep, 60)] * 2, 2):
         raise KeyError
     assert not multiprocessing.active_children()
+
+
+@linux
+def test_what_was_frozen_stays_frozen_and_nothing_else_is() -> None:
+    before = gc.get_freeze_count()
+    gc.unfreeze()
+    try:
+        list(forked.in_order([os.getpid] * 2, 2))
+        assert gc.get_freeze_count() == 0
+        gc.freeze()
+        list(forked.in_order([os.getpid] * 2, 2))
+        assert gc.get_freeze_count() > 0
+    finally:
+        if not before:
+            gc.unfreeze()
 
 
 @linux

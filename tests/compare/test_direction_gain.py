@@ -15,9 +15,9 @@ from aerpaw_cmp.compare.direction_gain import (
     GainModel,
     LinkSamples,
     Term,
-    choose_model,
     fit_gain,
 )
+from aerpaw_cmp.compare.gain_choice import choose_model
 from aerpaw_cmp.compare.mount import fit_mounts
 from aerpaw_cmp.compare.sphere import even_directions, gaussian_features, gaussian_spectrum, harmonics_on_sphere
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
@@ -241,8 +241,9 @@ def test_what_is_kept_changes_nothing():
         found = []
         for series, tried in ((TRAIN, model), (TRAIN[:2], model), (TRAIN, MODEL), (TRAIN[2:], MODEL), (TRAIN, model)):
             if not kept:
-                for store in (direction_gain._kept, direction_gain._kept_features, direction_gain._last_sum):
+                for store in (direction_gain._kept, direction_gain._kept_features, direction_gain._kept_means):
                     store.clear()
+                direction_gain._last_sum.clear()
             for factor in (1.0, 1.9):
                 scaled = dataclasses.replace(tried, own_sd_db=factor, noise_sd_db=factor)
                 fit = fit_gain(series, scaled)

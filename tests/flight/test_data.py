@@ -13,6 +13,8 @@ from aerpaw_cmp.flight.data import FlightData, choose_site, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import FlightSimulator
 
+pytestmark = pytest.mark.usefixtures("blank_pictures")
+
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 
 

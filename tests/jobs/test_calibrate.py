@@ -17,7 +17,7 @@ from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
 from tests.jobs.sent_by_pickle import SentByPickle
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 ROUTES = {
     "first": [(-60, 10, 30), (-250, 60, 30), (-100, 260, 40), (160, 160, 40), (200, -150, 30), (-180, -160, 30)],

@@ -17,7 +17,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.campaign import load_campaign
 from aerpaw_cmp.jobs.campaign_rank_fit import RankBench, fit_rank_all, loss, search, shares_by_rank
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 PLANTED = {"link.rank.uav.yaw_deg": 90.0, "rank.k": 20.0}
 GRIDS = {"link.rank.uav.yaw_deg": [0.0, 45.0, 90.0, 135.0], "rank.k": [5.0, 10.0, 20.0, 40.0]}

@@ -20,7 +20,7 @@ from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.jobs.ladder import Model, recommended_settings
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 LW1 = (35.72750947, -78.69595819)
 ORIGIN = "2025-06-01T14:00:00Z"

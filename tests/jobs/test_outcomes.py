@@ -23,7 +23,7 @@ from aerpaw_cmp.jobs.outcomes import OutcomeStore, shapes_numbers, task_inputs, 
 from aerpaw_cmp.jobs.workers import Here, Processes
 from aerpaw_cmp.report.campaign_data import Failure, FlownTrack, RankRow, RssRow
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 TYPES = (Outcome, RssRow, RankRow, FlownTrack)
 

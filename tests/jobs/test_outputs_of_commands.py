@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import subprocess
 import sys
@@ -17,7 +18,7 @@ import yaml
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.outputs import SUMS, changed_files, read_sums
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = ["--timezone", "America/New_York"]
@@ -205,7 +206,10 @@ def test_a_limit_on_the_size_of_files_is_one_message(logs: Path) -> None:
     out.mkdir()
     script = 'ulimit -f 20; exec "$@"'
     command = [sys.executable, "-m", "aerpaw_cmp", "ingest", str(logs), *ZONE, "-o", str(out / "flight.h5")]
-    done = subprocess.run(["bash", "-c", script, "bash", *command], capture_output=True, text=True, check=False)
+    environ = {**os.environ, "PYTHONDONTWRITEBYTECODE": "1"}  # Python would keep the bytecode that it could not write
+    done = subprocess.run(
+        ["bash", "-c", script, "bash", *command], env=environ, capture_output=True, text=True, check=False
+    )
     assert done.returncode == 3, done
     assert [line for line in done.stderr.splitlines() if line.startswith("aerpaw-cmp: ")] == done.stderr.splitlines()[
         -1:

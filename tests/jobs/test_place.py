@@ -17,7 +17,7 @@ from aerpaw_cmp.jobs.campaign_tasks import Outcome, outcome_store
 from aerpaw_cmp.jobs.place import Folder, ObjectStore, Place, check_place, open_place
 from aerpaw_cmp.report.campaign_data import FlownTrack
 
-pytestmark = pytest.mark.usefixtures("blank_pictures")
+pytestmark = pytest.mark.usefixtures("few_pictures")
 
 BUCKET = "season"
 

@@ -20,6 +20,7 @@ from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_cmp.logs.writers import format_power_log
+from tests.frames import assert_same_frame
 from tests.parsers import samples
 
 OPTIONS = samples.OPTIONS
@@ -53,7 +54,7 @@ def same(one: ReadResult, other: ReadResult) -> None:
     assert len(by) == len(one.streams) == len(other.streams)
     for b in other.streams:
         a = by[b.kind, b.name]
-        pd.testing.assert_frame_equal(a.frame, b.frame, check_like=True)
+        assert_same_frame(a.frame, b.frame, check_like=True)
         assert dict(a.attributes) == dict(b.attributes)
 
 

@@ -18,6 +18,7 @@ from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
+from tests.frames import assert_same_frame
 from tests.parsers import samples
 from tests.parsers.samples import OPTIONS, SAMPLES
 
@@ -68,7 +69,7 @@ def assert_same(one: list[IngestedFile], other: list[IngestedFile]) -> None:
         assert len(a.result.streams) == len(b.result.streams)
         for s, t in zip(a.result.streams, b.result.streams, strict=True):
             assert (s.kind, s.name, dict(s.attributes)) == (t.kind, t.name, dict(t.attributes))
-            pd.testing.assert_frame_equal(s.frame, t.frame, check_exact=True)
+            assert_same_frame(s.frame, t.frame, check_exact=True)
 
 
 @given(st.lists(files(), max_size=3))
@@ -150,6 +151,14 @@ def all_samples_of_one(folder: Path) -> list[IngestedFile]:
     return list(ingest(folder / "log", options=OPTIONS))
 
 
+@pytest.fixture(scope="module")
+def sealed(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+    """A flight file as it is written."""
+    folder = tmp_path_factory.mktemp("sealed")
+    write_flight(folder / "flight.h5", all_samples_of_one(folder))
+    return (folder / "flight.h5").read_bytes()
+
+
 def test_the_file_has_ordinary_permissions(tmp_path: Path) -> None:
     old = os.umask(0o022)
     try:
@@ -197,15 +206,15 @@ def test_cut_at_many_bytes(tmp_path: Path) -> None:
 
 @given(st.data())
 @settings(max_examples=80, deadline=None)
-def test_damaged_bytes_are_told_from_the_content(tmp_path_factory: pytest.TempPathFactory, data: st.DataObject) -> None:
-    folder = tmp_path_factory.mktemp("damage")
-    path = folder / "flight.h5"
-    write_flight(path, all_samples_of_one(folder))
-    raw = bytearray(path.read_bytes())
+def test_damaged_bytes_are_told_from_the_content(
+    tmp_path_factory: pytest.TempPathFactory, sealed: bytes, data: st.DataObject
+) -> None:
+    path = tmp_path_factory.mktemp("damage") / "flight.h5"
+    raw = bytearray(sealed)
     end = len(raw) - 40  # the seal itself may be lost without loss of content
     for _ in range(data.draw(st.integers(1, 8))):
         raw[data.draw(st.integers(0, end - 1))] ^= data.draw(st.integers(1, 255))
-    if bytes(raw) == path.read_bytes():  # two changes of one byte that cancel
+    if bytes(raw) == sealed:  # two changes of one byte that cancel
         return
     path.write_bytes(bytes(raw))
     with pytest.raises(InputError):
@@ -215,12 +224,10 @@ def test_damaged_bytes_are_told_from_the_content(tmp_path_factory: pytest.TempPa
 @given(st.data())
 @settings(max_examples=40, deadline=None)
 def test_damage_without_a_seal_gives_a_clear_error_or_the_content(
-    tmp_path_factory: pytest.TempPathFactory, data: st.DataObject
+    tmp_path_factory: pytest.TempPathFactory, sealed: bytes, data: st.DataObject
 ) -> None:
-    folder = tmp_path_factory.mktemp("unsealed")
-    path = folder / "flight.h5"
-    write_flight(path, all_samples_of_one(folder))
-    raw = bytearray(path.read_bytes()[:-40])
+    path = tmp_path_factory.mktemp("unsealed") / "flight.h5"
+    raw = bytearray(sealed[:-40])
     raw[data.draw(st.integers(4096, len(raw) - 1))] = data.draw(st.integers(0, 255))
     path.write_bytes(bytes(raw))
     with contextlib.suppress(InputError):  # any other exception fails the test

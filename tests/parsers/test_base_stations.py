@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from dataclasses import replace
 
 import numpy as np
@@ -59,6 +60,20 @@ def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(
     with pytest.raises(blocks.Whole):
         in_blocks(iter([data]), PLAIN)
     assert read("amarisoft_json", line.replace(b'"utc"', b'"time"') * 2).accepted == 2, "seconds of the program"
+
+
+def test_reports_whose_times_are_of_two_forms_are_read_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """The form of the most is that of all; in blocks each had decided for itself."""
+    line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
+    (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
+    data = line * 5 + line.replace(epoch, b'"no time"') * 4
+    assert read("srsran_json", data).accepted == 5
+    in_blocks = by_name("srsran_json").in_blocks
+    assert in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
+    with pytest.raises(blocks.Whole):
+        in_blocks(iter([data]), PLAIN)
+    assert in_blocks(iter([line * 9]), PLAIN).accepted == 9
 
 
 def test_oai_layouts() -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-import pandas as pd
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -11,6 +10,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _table, generic_csv, vehicle_out
+from tests.frames import assert_same_frame
 from tests.parsers.samples import OPTIONS, SAMPLES
 
 CASES = [(reader, name) for reader in ("vehicle_out", "nemo_csv", "quectel_csv") for name in SAMPLES[reader]]
@@ -33,7 +33,7 @@ def assert_same(one: ReadResult, other: ReadResult) -> None:
     assert len(one.streams) == len(other.streams)
     for a, b in zip(one.streams, other.streams, strict=True):
         # pandas' parser before version 3 may differ from float() in the last place
-        pd.testing.assert_frame_equal(a.frame, b.frame, rtol=1e-14, atol=0)
+        assert_same_frame(a.frame, b.frame, rtol=1e-14, atol=0)
 
 
 @pytest.mark.parametrize(("reader", "sample"), CASES)
@@ -137,7 +137,7 @@ def test_mapped_tables_by_columns_and_by_cells(table: bytes, data: st.DataObject
         slow.lines, slow.accepted, slow.blank, slow.rejected, slow.warnings,
     )  # fmt: skip
     for a, b in zip(fast.streams, slow.streams, strict=True):
-        pd.testing.assert_frame_equal(a.frame, b.frame, check_exact=True)
+        assert_same_frame(a.frame, b.frame, check_exact=True)
 
 
 def test_mapped_tables_are_read_by_columns(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -489,6 +489,7 @@ def test_a_limit_of_the_disk_is_an_oserror_in_every_format(name, data, tmp_path,
     monkeypatch.setattr(kmz, "_legend", lambda _: b"")
     export = samples.of_report(data)
     write.write_exports(export, tmp_path, [name])  # what it loads is loaded now
+    monkeypatch.setattr(sys, "dont_write_bytecode", True)  # it would be cut, and kept
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     try:
         resource.setrlimit(resource.RLIMIT_FSIZE, (1000, hard))

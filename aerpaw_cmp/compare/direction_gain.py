@@ -206,11 +206,34 @@ def _features(block: _Block, argument: FloatArray, *, keep: bool = False) -> Flo
     """Unit-variance features (n, columns of the block); ``keep`` those that the next fit asks for again."""
     if block.knots_m is None:
         return (_direction_features if keep else gaussian_features)(argument, block.term.length)
-    from scipy.linalg import cholesky, solve_triangular
+    from scipy.linalg import solve_triangular
 
-    knots, length = block.knots_m, block.term.length
-    lower = cholesky(kernel(knots, knots, length) + 1e-6 * np.eye(len(knots)), lower=True)
-    return np.asarray(solve_triangular(lower, kernel(knots, argument, length), lower=True).T)
+    lower = _knot_factor(block.knots_m, block.term.length)
+    return np.asarray(solve_triangular(lower, kernel(block.knots_m, argument, block.term.length), lower=True).T)
+
+
+_kept_knots: OrderedDict[bytes, FloatArray] = OrderedDict()
+
+
+def _knot_factor(knots: FloatArray, length: float) -> FloatArray:
+    """Cholesky factor of the kernel between the knots of a place field; that of the last two fields is kept."""
+    key = repr(length).encode() + knots.tobytes()
+    if key not in _kept_knots:
+        _kept_knots[key] = factor_of(kernel(knots, knots, length) + 1e-6 * np.eye(len(knots)))
+        while len(_kept_knots) > 2:
+            _kept_knots.popitem(last=False)
+    return _kept_knots[key]
+
+
+def _block_values(block: _Block, argument: FloatArray, weights: FloatArray) -> FloatArray:
+    """:func:`_features` times weights (n,); of a place field the kernel at the knots is enough."""
+    if block.knots_m is None:
+        return np.asarray(_features(block, argument, keep=True) @ weights)
+    from scipy.linalg import solve_triangular
+
+    lower = _knot_factor(block.knots_m, block.term.length)
+    at_knots = solve_triangular(lower, weights, lower=True, trans="T")
+    return np.asarray(kernel(argument, block.knots_m, block.term.length) @ at_knots)
 
 
 FEATURES_MIB = 320
@@ -239,10 +262,14 @@ _kept_means: OrderedDict[bytes, FloatArray] = OrderedDict()
 
 
 def _mean_features(block: _Block, argument: FloatArray) -> FloatArray:
-    """Mean of :func:`_features` over the samples (columns of the block,), kept."""
+    """Mean of :func:`_features` over the samples (columns of the block,); of directions it is kept."""
+    if block.knots_m is not None:
+        from scipy.linalg import solve_triangular
+
+        at_knots = kernel(block.knots_m, argument, block.term.length).mean(axis=1)
+        return np.asarray(solve_triangular(_knot_factor(block.knots_m, block.term.length), at_knots, lower=True))
     digest = hashlib.blake2b(repr((block.term.length, argument.shape)).encode())
     digest.update(np.ascontiguousarray(argument).tobytes())
-    digest.update(b"" if block.knots_m is None else np.ascontiguousarray(block.knots_m).tobytes())
     key = digest.digest()
     if key not in _kept_means:
         _kept_means[key] = _features(block, argument).mean(axis=0)
@@ -365,7 +392,13 @@ def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSample
     from scipy.linalg import solve_triangular
     from scipy.linalg.blas import dsyrk
 
-    parts = [_features(b, argument_of(samples, b.term.frame)) for b in own]
+    made: dict[Any, FloatArray] = {}  # a length that two terms share is made once
+    parts = []
+    for block in own:
+        same = (block.term.frame, block.term.length, None if block.knots_m is None else block.start)
+        if same not in made:
+            made[same] = _features(block, argument_of(samples, block.term.frame))
+        parts.append(made[same])
     design = np.concatenate([np.zeros((len(samples), 0)), *parts], axis=1)
     lower = whitener(model, samples)
     rows = np.asfortranarray(solve_triangular(lower, design, lower=True))
@@ -488,17 +521,33 @@ def factor_of(matrix: FloatArray) -> FloatArray:
         ) from None
 
 
-def _posterior(system: _System, scale: FloatArray) -> tuple[FloatArray, FloatArray, float, float]:
+def _apart(blocks: Sequence[_Block]) -> list[IntArray]:
+    """Columns that no series couples: all in one, or those of each antenna where antennas share no term."""
+    if any(b.antenna is None for b in blocks):
+        return [np.arange(blocks[-1].stop)]
+    names = dict.fromkeys(b.antenna for b in blocks)
+    return [np.concatenate([np.arange(b.start, b.stop) for b in blocks if b.antenna == name]) for name in names]
+
+
+def _posterior(
+    system: _System, scale: FloatArray, groups: Sequence[IntArray]
+) -> tuple[FloatArray, FloatArray, float, float]:
     """Weights (p,), Cholesky factor of the posterior precision of the unit-variance weights, log evidence, misfit.
 
     All with the noise as the unit.
     """
     from scipy.linalg import cho_solve
 
-    matrix = system.gram * scale[:, None]
-    matrix *= scale
-    matrix[np.diag_indices(len(matrix))] += 1.0
-    lower = factor_of(matrix)
+    lower = np.zeros_like(system.gram) if len(groups) > 1 else np.zeros((0, 0))
+    for group in groups:
+        whole = len(groups) == 1
+        matrix = (system.gram if whole else system.gram[np.ix_(group, group)]) * scale[group, None]
+        matrix *= scale[group]
+        matrix[np.diag_indices(len(matrix))] += 1.0
+        if whole:
+            lower = factor_of(matrix)
+        else:
+            lower[np.ix_(group, group)] = factor_of(matrix)
     right = scale * system.right
     weights = cho_solve((lower, True), right, check_finite=False)
     misfit = system.square - float(right @ weights)
@@ -582,7 +631,7 @@ class GainFit:
         total = np.zeros(len(rows))
         for block in blocks:
             columns = slice(block.start, block.stop)
-            values = _features(block, argument_of(known, block.term.frame), keep=True) @ self._weights[columns]
+            values = _block_values(block, argument_of(known, block.term.frame), self._weights[columns])
             total += values - centre[columns] @ self._weights[columns]
         gain[rows] = total
         return gain
@@ -684,7 +733,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     blocks = _layout(model, binned)
     system, centre = _summed(model, binned, blocks)
     scale, noise = _scale(blocks, model), model.noise_sd_db
-    weights, lower, evidence, misfit = _posterior(system, scale / noise)
+    weights, lower, evidence, misfit = _posterior(system, scale / noise, _apart(blocks))
     rows = sum(map(len, binned))
     return GainFit(
         model=model,

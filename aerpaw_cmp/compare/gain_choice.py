@@ -141,10 +141,13 @@ def _kernels(model: GainModel, rows: Sequence[LinkSamples]) -> tuple[FloatArray,
 
 def _covariance(terms: Sequence[Term], rows: Sequence[LinkSamples], same: BoolArray) -> FloatArray:
     out = np.zeros(same.shape)
-    for term in terms:
-        at = np.concatenate([argument_of(s, term.frame) for s in rows])
-        values = term.sd_db**2 * kernel(at, at, term.length)
-        out += np.where(same, values, 0.0) if term.per == "antenna" else values
+    for frame, length in dict.fromkeys((t.frame, t.length) for t in terms):
+        at = np.concatenate([argument_of(s, frame) for s in rows])
+        weight = np.zeros(2)  # between any two bins, and between those of one antenna
+        for term in terms:
+            if (term.frame, term.length) == (frame, length):
+                weight[int(term.per == "antenna")] += term.sd_db**2
+        out += np.where(same, weight.sum(), weight[0]) * kernel(at, at, length)
     return out
 
 

@@ -384,6 +384,13 @@ class RankPanel:
     """Further columns (n,) of rank.csv, by name: numbers."""
 
 
+def tower_way(panel: RssPanel | RankPanel) -> dict[str, FloatArray]:
+    """Places (n,) of a tower that moves: east, north, up [m], NaN where unknown. Empty of one that stands."""
+    columns = panel.values if isinstance(panel, RankPanel) else panel.per_sample
+    named = {axis: columns.get(f"tower_{axis}_m") for axis in ("east", "north", "up")}
+    return {axis: np.asarray(values, dtype=np.float64) for axis, values in named.items() if values is not None}
+
+
 Audit: TypeAlias = AuditResult
 Engine: TypeAlias = EngineResult
 """The engine's record is numbers alone already."""

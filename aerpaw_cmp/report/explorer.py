@@ -19,7 +19,7 @@ from ..logs.records import has_wall_clock
 from ..site.scenes import drawn_buildings
 from ..site.site import Site
 from .canvas import seconds_since, spread_out, start_of
-from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel
+from .data import GEOMETRY, PosePaths, RankPanel, ReportData, RssPanel, tower_way
 from .names import k_key
 from .shapes import listed, outline, walls
 from .words import pretty
@@ -122,7 +122,9 @@ def as_json(content: Mapping[str, Any]) -> str:
 
 
 def _place(panel: RssPanel | RankPanel, pick: IntArray, arrays: Arrays) -> dict[str, int]:
+    """Places of the UAV, and those of a tower that moves."""
     names = {"east": panel.east_m, "north": panel.north_m, "up": panel.up_m}
+    names |= {f"tower_{axis}": values for axis, values in tower_way(panel).items()}
     return {name: arrays.add(values[pick]) for name, values in names.items() if values is not None}
 
 
@@ -175,7 +177,7 @@ def _rank(panel: RankPanel, start: np.datetime64, arrays: Arrays, limit: int) ->
         "models": [{"name": f"K = {k_key(at.k)}", "rank": arrays.add(at.rank[pick])} for at in panel.simulated],
         "probability": [
             {"name": name, "values": arrays.add(np.asarray(values, dtype=np.float64)[pick])}
-            for name, values in panel.per_sample.items()
+            for name, values in panel.values.items()
             if name.startswith("probability")
         ],
     }

@@ -39,7 +39,7 @@ from .canvas import (
     time_label,
     used_towers,
 )
-from .data import GEOMETRY, ChannelPair, ReportData, RssPanel, Track
+from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track, tower_way
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -61,7 +61,12 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
         draw_node(plan, panel)
         tower = data.site.towers.get(panel.tower)
         ends = ([], []) if tower is None else ([tower.east_m], [tower.north_m])
-        frame_around(plan, np.concatenate([panel.east_m, ends[0]]), np.concatenate([panel.north_m, ends[1]]))
+        way = tower_way(panel)
+        frame_around(
+            plan,
+            np.concatenate([panel.east_m, ends[0], way.get("east", [])]),
+            np.concatenate([panel.north_m, ends[1], way.get("north", [])]),
+        )
         colour_bar(fig, points, plan, "Residual [dB]", "both")
     start = start_of(data)
     seconds = seconds_since(panel.time, start)
@@ -79,11 +84,10 @@ def overview(data: ReportData, panel: RssPanel) -> Figure:
     return fig
 
 
-def draw_node(ax: Axes, panel: RssPanel) -> None:
+def draw_node(ax: Axes, panel: RssPanel | RankPanel) -> None:
     """The way of a tower that moves; its mark stands in the middle of it."""
-    east, north = (panel.per_sample.get(f"tower_{name}_m") for name in ("east", "north"))
-    if east is not None and north is not None:
-        ax.plot(*thinned_plan(east, north), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
+    if way := tower_way(panel):
+        ax.plot(*thinned_plan(way["east"], way["north"]), color=TOWER, linewidth=1.2, linestyle=(0, (4, 2)), zorder=4.5,
                 label=f"way of {panel.tower}")  # fmt: skip
 
 
@@ -93,7 +97,9 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     whole, close = fig.subplots(1, 2, width_ratios=(1.0, 1.35))
     draw_site(whole, data.site)
     draw_site(close, data.site)
-    for panel in {panel.tower: panel for panel in data.rss}.values():
+    panels: list[RssPanel | RankPanel] = [*data.rank, *data.rss]
+    nodes = {panel.tower: panel for panel in panels}.values()
+    for panel in nodes:
         draw_node(whole, panel)
         draw_node(close, panel)
     whole.plot(*thinned_plan(track.east_m, track.north_m), color="#0072B2", linewidth=1.0, label="flight", zorder=4)
@@ -108,11 +114,12 @@ def trajectory(data: ReportData, track: Track) -> Figure:
     near = [data.site.towers[name] for name in used_towers(data)]
     extent = float(np.nanmax([np.ptp(track.east_m), np.ptp(track.north_m), 100.0])) if len(track.east_m) else 100.0
     centre = np.array([np.nanmean(track.east_m), np.nanmean(track.north_m)])
+    ways = [way for way in map(tower_way, nodes) if way]
     near = [t for t in near if np.hypot(t.east_m - centre[0], t.north_m - centre[1]) < extent]
     frame_around(
         close,
-        np.concatenate([track.east_m, [t.east_m for t in near]]),
-        np.concatenate([track.north_m, [t.north_m for t in near]]),
+        np.concatenate([track.east_m, [t.east_m for t in near], *(way["east"] for way in ways)]),
+        np.concatenate([track.north_m, [t.north_m for t in near], *(way["north"] for way in ways)]),
     )
     for waypoint in data.waypoints:
         close.annotate(

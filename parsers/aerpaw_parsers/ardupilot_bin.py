@@ -59,7 +59,7 @@ class _Form:
         known = [_TYPES.get(letter, ("", 0.0)) for letter in form]
         self.scales = [scale for _, scale in known]
         self.layout = struct.Struct("<" + "".join(code for code, _ in known))
-        self.sound = self.layout.size == length - 3 and len(columns) == len(known)
+        self.sound = self.layout.size == length - 3 and len(columns) == len(known) and all(code for code, _ in known)
 
 
 def _form(body: bytes) -> tuple[int, _Form]:

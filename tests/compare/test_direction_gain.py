@@ -267,3 +267,18 @@ def test_the_evidence_is_that_of_the_dense_covariance_at_any_noise():
         dense.append(-0.5 * (y @ np.linalg.solve(whole, y) + np.linalg.slogdet(whole)[1]))
     assert found[1] - found[0] == pytest.approx(dense[1] - dense[0], abs=1.0)
     assert abs(dense[1] - dense[0]) > 20.0
+
+
+@pytest.mark.parametrize("terms", [(TERMS[1],), (TERMS[1], PLACE_TERM)])
+def test_antennas_without_a_shared_term_are_fits_of_their_own(terms):
+    model = dataclasses.replace(MODEL, terms=terms)
+    both = fit_gain(TRAIN, model)
+    alone = [fit_gain([s for s in TRAIN if s.channel == channel], model) for channel in "AB"]
+    shared = dataclasses.replace(model, terms=(*terms, Term("body", "all", 0.9, 1e-5)))  # solved as one
+    np.testing.assert_allclose(fit_gain(TRAIN, shared).predict(TEST[0]), both.predict(TEST[0]), rtol=0, atol=1e-4)
+    assert both.log_evidence == pytest.approx(sum(one.log_evidence for one in alone), rel=1e-9)
+    for one, samples in zip(alone, TEST, strict=True):
+        some = samples.part(np.arange(0, len(samples), 9))
+        np.testing.assert_allclose(both.predict(some), one.predict(some), rtol=0, atol=1e-6)
+        np.testing.assert_allclose(both.mean(some), both.predict(some)[0], rtol=0, atol=1e-6)
+        assert both.average(some) == pytest.approx(both.mean(some).mean(), abs=1e-6)

@@ -1,6 +1,8 @@
 """A flight against a rover that drives: from its log of positions to the report's numbers."""
 
+import dataclasses
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +18,9 @@ from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.jobs.ladder import flight_ladder
 from aerpaw_cmp.propagation.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.report import explorer
 from aerpaw_cmp.report.build import rank_panel, rss_panel
+from aerpaw_cmp.report.data import tower_way
 from aerpaw_cmp.report.export import rank_csv, rss_csv
 from aerpaw_cmp.site.siteyaml import load_site
 
@@ -148,6 +152,26 @@ def test_the_tables_carry_the_place(case):
         row = dict(zip(head.split(","), first.split(","), strict=True))
         place = [float(row[f"tower_{axis}_m"]) for axis in ("east", "north", "up")]
         assert place == pytest.approx([60, -40, 2], abs=0.01)
+
+
+def test_the_drawings_show_the_way(case):
+    """The page's plan and the figures: where it stood at each sample, not its middle alone."""
+    _, data, (one,), (rank,) = case
+    rss = rss_panel(compare_rss_series(data, data.rss[0], one))
+    assert tower_way(dataclasses.replace(rss, per_sample={})) == {}
+    ranks = rank_panel(compare_rank_series(data, data.rank[0], rank))
+    t = np.arange(0.0, SECONDS, 0.5)
+    known = (t <= 50) | (t >= 60)
+    kept: list[np.ndarray] = []
+    arrays = SimpleNamespace(add=lambda values, *_: kept.append(values) or len(kept) - 1)
+    drawn = explorer._place(rss, np.arange(0, len(t), 3), arrays)
+    found = np.stack([kept[drawn[f"tower_{axis}"]] for axis in ("east", "north", "up")], axis=1)
+    np.testing.assert_allclose(found[known[::3]], rover(t)[::3][known[::3]], atol=1e-3)
+    assert np.isnan(found[~known[::3]]).all()
+    for panel in (rss, ranks):
+        way = tower_way(panel)
+        assert np.nanmax(way["east"]) == pytest.approx(60.0, abs=1e-3)
+        assert np.nanmax(way["north"]) == pytest.approx(56.0, abs=0.5)
 
 
 def test_what_cannot_be_is_one_message(tmp_path, capsys):

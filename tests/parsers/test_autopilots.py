@@ -94,3 +94,14 @@ def test_a_message_described_anew_keeps_what_was_read_before(columns: str) -> No
     data = LOGS["ardupilot_bin"] + b"\xa3\x95\x80" + anew
     after = by_name("ardupilot_bin").read(data, ReadOptions()).streams[0].frame
     pd.testing.assert_frame_equal(after, before)
+
+
+def test_a_message_of_an_unknown_kind_of_value_is_left_unread() -> None:
+    """A letter that stands for nothing, beside letters that make up the whole length."""
+    names = b"TimeUS,Lat,More,Lng,Alt"
+    described = struct.pack("<BB4s16s64s", 129, 3 + struct.calcsize("<Qiif"), b"POS", b"QL?Lf", names)
+    row = b"\xa3\x95\x81" + struct.pack("<Qiif", 1_000_000, 357_275_000, -786_960_000, 30.0)
+    before = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"], ReadOptions())
+    after = by_name("ardupilot_bin").read(LOGS["ardupilot_bin"] + b"\xa3\x95\x80" + described + row, ReadOptions())
+    pd.testing.assert_frame_equal(after.streams[0].frame, before.streams[0].frame)
+    assert (after.lines, after.rejected) == (before.lines + 2, before.rejected)

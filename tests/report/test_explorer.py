@@ -83,3 +83,13 @@ def test_extremes_stay(values, limit):
     if np.isfinite(array).any():
         assert np.nanmax(array[pick]) == np.nanmax(array)
         assert np.nanmin(array[pick]) == np.nanmin(array)
+
+
+def test_a_pose_shows_the_probability_of_each_rank(report_data):
+    panel = report_data.rank[0]
+    share = np.linspace(0.0, 1.0, len(panel.time))
+    ranked = dataclasses.replace(panel, values={**panel.values, "probability_rank2": share})
+    found = explorer.payload(dataclasses.replace(report_data, rank=(ranked,)))
+    (one,) = found["rank"][0]["probability"]
+    assert one["name"] == "probability_rank2"
+    np.testing.assert_allclose(array(found, one["values"]), share, atol=1e-6)

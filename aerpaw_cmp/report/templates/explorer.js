@@ -232,11 +232,40 @@
     return s && get(s.east) ? { time: get(s.time), east: get(s.east), north: get(s.north), up: get(s.up) } : null;
   }
 
+  function way() { // of a tower that moves, sample by sample
+    const s = rss() || rank();
+    return s && s.tower_east !== undefined ? { tower: s.tower, time: get(s.time), east: get(s.tower_east), north: get(s.tower_north), up: get(s.tower_up) } : null;
+  }
+
+  function standing(t) { // foot and top of a tower: of one that moves, at the pose that is shown
+    const m = way();
+    if (m && m.tower === t.name && state.pose !== null) {
+      const i = nearest(m.time, state.pose);
+      if (Number.isFinite(m.east[i])) return [[m.east[i], m.north[i], t.at[2] + m.up[i] - t.top], [m.east[i], m.north[i], m.up[i]]];
+    }
+    return [t.at, [t.at[0], t.at[1], t.top]];
+  }
+
+  function drawWay() {
+    const m = way();
+    if (!m) return;
+    let line = [], last = null;
+    const end = () => { if (line.length > 1) polyline(line, css("--accent"), 1.5, [6, 4]); line = []; };
+    for (let i = 0; i < m.east.length; i++) {
+      if (!Number.isFinite(m.east[i])) { end(); continue; }
+      const p = project([m.east[i], m.north[i], m.up[i]]);
+      if (!line.length || Math.hypot(p[0] - last[0], p[1] - last[1]) > 1) { line.push(p); last = p; }
+    }
+    end();
+  }
+
   function box() {
     const lists = [[], [], []], f = data.track ? { east: get(data.track.east), north: get(data.track.north), up: get(data.track.up) } : flown();
     if (f) for (let i = 0; i < f.east.length; i += Math.ceil(f.east.length / 500)) if (Number.isFinite(f.east[i])) { lists[0].push(f.east[i]); lists[1].push(f.north[i]); lists[2].push(f.up[i]); }
     const tower = rss() ? rss().tower : rank() ? rank().tower : null;
     for (const t of data.site.towers) if (t.name === tower || !lists[0].length) { lists[0].push(t.at[0]); lists[1].push(t.at[1]); lists[2].push(t.top); }
+    const m = way();
+    if (m) for (let i = 0; i < m.east.length; i += Math.ceil(m.east.length / 500)) if (Number.isFinite(m.east[i])) { lists[0].push(m.east[i]); lists[1].push(m.north[i]); lists[2].push(m.up[i]); }
     return lists.map(l => l.length ? [Math.min(...l), Math.max(...l)] : [0, 1]);
   }
 
@@ -260,7 +289,7 @@
   function shade(v, low, high, diverging) {
     const x = Math.min(1, Math.max(0, (v - low) / (high - low)));
     if (diverging) {
-      const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [235, 235, 225];
+      const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [208, 208, 198];
       return `rgb(${to.map((t, i) => Math.round(mid[i] + (t - mid[i]) * Math.sqrt(k))).join(",")})`;
     }
     const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], i = Math.min(3, Math.floor(x * 4)), f = x * 4 - i;
@@ -329,15 +358,16 @@
       pen.globalAlpha = 1;
     }
     const tower = rss() ? rss().tower : rank() ? rank().tower : "";
+    drawWay();
     for (const t of data.site.towers) {
-      const foot = project(t.at), top = project([t.at[0], t.at[1], t.top]);
+      const [foot, top] = standing(t).map(project);
       if (Math.max(foot[1], top[1] + 4) > h - KEY) continue; // half a mark at the edge of the key says nothing
       polyline([foot, top], css("--accent"), 3);
       polygon([[top[0], top[1] - 6], [top[0] - 5, top[1] + 4], [top[0] + 5, top[1] + 4]], css("--accent"), null);
     }
     drawPaths(tower);
     const own = data.site.towers.filter(t => t.name === tower), others = data.site.towers.filter(t => t.name !== tower);
-    labels = common.names(pen, [0, 0, w, h - KEY], [...own, ...others].map(t => ({ text: t.name, at: project([t.at[0], t.at[1], t.top]), colour: css(t.name === tower ? "--accent" : "--soft"), halo: css("--paper") })));
+    labels = common.names(pen, [0, 0, w, h - KEY], [...own, ...others].map(t => ({ text: t.name, at: project(standing(t)[1]), colour: css(t.name === tower ? "--accent" : "--soft"), halo: css("--paper") })));
     pen.restore();
     drawKey(c, w, h);
   }

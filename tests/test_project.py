@@ -250,5 +250,7 @@ def test_no_module_takes_a_private_name_of_another() -> None:
 
 def test_the_files_that_run_first_are_there() -> None:
     tree = parsed(ROOT / "tests" / "conftest.py")
-    (named,) = [node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "DEAREST"]
+    (named,) = [
+        node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "DEAREST"
+    ]
     assert all((ROOT / "tests" / name).is_file() for name in ast.literal_eval(named.value))

@@ -22,6 +22,10 @@ settings.register_profile("further", deadline=None)
 settings.register_profile("fixed", derandomize=True, deadline=None)
 settings.load_profile("fixed" if os.environ.get("CI") else "further")
 
+# One worker per core: the threads of a linear algebra library would only wait for each other. Before numpy is loaded.
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ.setdefault(_name, "1")
+
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
 # have a folder each; that this machine's LLVM works is found out once for all of them.
 _OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
@@ -32,25 +36,29 @@ if _OF_ALL:
 
 
 DEAREST = (
-    "propagation/test_growth.py",  # the first two compile different kernels, where none are kept yet
-    "propagation/test_compiled.py",
-    "test_field.py",
+    "propagation/test_growth.py",  # compiles for half a minute where nothing is kept yet; the other worker needs it later
     "jobs/test_campaign.py",
-    "parsers/test_law.py",
+    "test_field.py",  # the first that needs Sionna: by now one worker knows whether this machine's LLVM works
     "report/test_figures.py",
-    "report/test_browser.py",
-    "propagation/test_sionna.py",
-    "test_cli_commands.py",
+    "propagation/test_compiled.py",
+    "parsers/test_law.py",
     "jobs/test_coverage_map.py",
-    "jobs/test_compare_flight.py",
-    "live/test_tap.py",
-    "report/test_browser_campaign.py",
     "jobs/test_workers.py",
+    "propagation/test_sionna.py",
+    "report/test_browser.py",
+    "jobs/test_calibrate_rank.py",
+    "flight/test_lag.py",
+    "live/test_tap.py",
+    "report/test_diff.py",
+    "jobs/test_compare_flight.py",
+    "report/test_browser_campaign.py",
+    "report/test_browser_map.py",
     "machine/test_llvm.py",
     "live/test_log.py",
     "live/test_bad_input.py",
-    "flight/test_lag.py",
-    "report/test_diff.py",
+    "test_docs.py",
+    "jobs/test_calibrate.py",
+    "test_cli_commands.py",
     "live/test_benchmarks.py",
 )
 """Files that take 5 s and more, the longest first."""
@@ -101,6 +109,7 @@ def pytest_collection_finish() -> None:
     """What was imported and collected stays to the end: the collector need not look through it again."""
     gc.collect()
     gc.freeze()
+    gc.set_threshold(20_000, 20, 50)
 
 
 @pytest.hookimpl(wrapper=True)

@@ -246,3 +246,11 @@ def test_no_module_takes_a_private_name_of_another() -> None:
     own = {path.stem for path in (ROOT / "parsers" / "aerpaw_parsers").glob("_*.py")}
     assert {name: left for name, names in found.items() if (left := set(names) - own)} == {}
     assert private_imports(ast.parse("from .replay import Replay, _poses\nfrom . import __version__")) == ["_poses"]
+
+
+def test_the_files_that_run_first_are_there() -> None:
+    tree = parsed(ROOT / "tests" / "conftest.py")
+    (named,) = [
+        node for node in tree.body if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "DEAREST"
+    ]
+    assert all((ROOT / "tests" / name).is_file() for name in ast.literal_eval(named.value))

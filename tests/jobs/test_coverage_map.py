@@ -367,10 +367,10 @@ def test_kriging_bridges_blocks_of_a_real_flight():
         found = script["held_out"](one, 100.0, 25.0, every=4)
         rmse = {name: row["rmse"] for name, row in found.items() if isinstance(row, dict)}
         assert found["n"] > 100
-        assert rmse["Kriging"] < 0.9 * rmse["nearest"]
-        assert rmse["Kriging"] < 0.6 * rmse["mean"]
+        assert rmse["Kriging"] < 0.8 * rmse["nearest"]
+        assert rmse["Kriging"] < 0.45 * rmse["mean"]
         assert rmse["replay + Kriging"] < rmse["Kriging"]
-        assert rmse["replay + Kriging"] < 0.7 * rmse["replay + mean"]
+        assert rmse["replay + Kriging"] < 0.6 * rmse["replay + mean"]
 
 
 def test_the_notes_say_where_p833_is_continued():

@@ -16,6 +16,7 @@ from tests.report.browsing import (
     extents,
     frame,
     needs_browser,
+    reload_page,
     serious_findings,
     set_scheme,
     start,
@@ -157,15 +158,16 @@ def test_dark_and_light(driver):
     assert seen == ["rgb(255, 255, 255)", "rgb(23, 23, 23)"]
 
 
-def test_with_scripts_off_the_static_figures_stand(page):
-    found = start(scripts=False)
+def test_with_scripts_off_the_static_figures_stand(driver):
+    driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": True})
     try:
-        found.get(page.as_uri())
-        assert not found.find_element("id", "explorer").is_displayed()
-        assert found.find_element("id", "overview").is_displayed()
-        assert found.find_element("css selector", ".numbers").is_displayed()
+        driver.refresh()
+        assert not driver.find_element("id", "explorer").is_displayed()
+        assert driver.find_element("id", "overview").is_displayed()
+        assert driver.find_element("css selector", ".numbers").is_displayed()
     finally:
-        found.quit()
+        driver.execute_cdp_cmd("Emulation.setScriptExecutionDisabled", {"value": False})
+        reload_page(driver, "window.explorer")
 
 
 def test_a_broken_formula_would_be_seen(driver, small_report):

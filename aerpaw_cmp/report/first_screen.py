@@ -81,8 +81,9 @@ def _rss_sentence(panels: Sequence[RssPanel]) -> str:
             f"Ray tracing is WORSE than {pretty(name)}: it misses the measured level by {total:.1f} dB RMSE, "
             f"{pretty(name)} by {other:.1f} dB{tail}."
         )
+    gain = min(total - other, 0.0) + 0.0
     return (
-        f"Ray tracing misses the measured level by {total:.1f} dB RMSE, {min(total - other, 0.0) + 0.0:.1f} dB against {pretty(name)} "
+        f"Ray tracing misses the measured level by {total:.1f} dB RMSE, {gain:.1f} dB against {pretty(name)} "
         f"({other:.1f} dB){tail}.".replace("-", "−", 1)
     )
 

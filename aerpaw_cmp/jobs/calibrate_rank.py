@@ -289,6 +289,12 @@ def fit_rank(flights: Sequence[FlightData], settings: RankFitSettings) -> RankCa
             p, said = fitted.forecast(one)
             scores["flight_left_out"].append((one.flight, tower, score_forecast(one.rank, p, said, constant)))
             scores["sector_left_out"].append((one.flight, tower, _sectors(one, fitted, constant)))
+        timing = receivers[tower].timing
+        if timing.shift_s or timing.average_s:
+            warnings.append(
+                f"rank at {tower}: reports go best with positions {timing.shift_s:g} s later than logged and a channel "
+                f"averaged over {timing.average_s:g} s, as sectors left out within the flights say"
+            )
         if receivers[tower].tied > 1:
             warnings.append(
                 f"rank at {tower}: {receivers[tower].tied} geometries cannot be told apart, among them "

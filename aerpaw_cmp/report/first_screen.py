@@ -76,13 +76,14 @@ def _rss_sentence(panels: Sequence[RssPanel]) -> str:
         tail = f", {shown.get(words[0], 'no difference is shown')}" if words else ""
     else:
         tail = f"; it is shown to be better on {better} and worse on {worse} of {len(panels)} channels" if words else ""
-    if total > other:
+    if total - other >= 0.05:  # less than that is no difference at the digits of the sentence
         return (
             f"Ray tracing is WORSE than {pretty(name)}: it misses the measured level by {total:.1f} dB RMSE, "
             f"{pretty(name)} by {other:.1f} dB{tail}."
         )
+    gain = min(total - other, 0.0) + 0.0
     return (
-        f"Ray tracing misses the measured level by {total:.1f} dB RMSE, {total - other:.1f} dB against {pretty(name)} "
+        f"Ray tracing misses the measured level by {total:.1f} dB RMSE, {gain:.1f} dB against {pretty(name)} "
         f"({other:.1f} dB){tail}.".replace("-", "−", 1)
     )
 

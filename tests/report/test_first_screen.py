@@ -39,6 +39,9 @@ def test_worse_than_the_best_baseline_is_the_first_thing_said(report_data):
     assert "8.5 dB" in first
     assert "7.9 dB" in first
     assert "WORSE" not in verdict(with_errors(report_data, 3.0, 7.9))[0]
+    alike = verdict(with_errors(report_data, 3.01, 3.0))[0]  # both print as 3.0
+    assert "WORSE" not in alike
+    assert ", 0.0 dB against" in alike
 
 
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import gc
 import os
+import pickle
 import random
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
@@ -182,6 +183,22 @@ def no_wait_for_the_disk(request: pytest.FixtureRequest) -> Iterator[None]:
         if request.path.parent.name in ("jobs", "maps", "report", "site", "tests"):
             patch.setattr(os, "fsync", lambda descriptor: os.fstat(descriptor) and None)
         yield
+
+
+@pytest.fixture(scope="session")
+def field_logs() -> Any:
+    """Every log of AERPAW_CMP_FIELD_DATA, to be looked at only: read by the first worker that asks."""
+    from aerpaw_cmp.logs.ingest import ingest
+    from aerpaw_cmp.logs.readers import ReadOptions
+
+    kept = Path(_OF_ALL or os.environ["AERPAW_CMP_CACHE"]) / "field_logs.pickle"
+    if kept.exists():
+        return pickle.loads(kept.read_bytes())
+    found = ingest(os.environ["AERPAW_CMP_FIELD_DATA"], options=ReadOptions(timezone="America/New_York"))
+    part = kept.with_suffix(f".{os.getpid()}")
+    part.write_bytes(pickle.dumps(found))
+    part.replace(kept)
+    return found
 
 
 @pytest.fixture

@@ -5,7 +5,9 @@ from __future__ import annotations
 import dataclasses
 import gc
 import os
+import pickle
 import random
+import shutil
 import tempfile
 from collections.abc import Callable, Generator, Iterator, Sequence
 from functools import cache
@@ -29,7 +31,7 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 # Nothing kept on this machine decides a test, and no test leaves anything in the user's cache. Workers of pytest-xdist
 # have a folder each; that this machine's LLVM works is found out once for all of them.
 _OF_ALL = os.environ.get("AERPAW_CMP_CACHE", "") if "PYTEST_XDIST_WORKER" in os.environ else ""
-os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
+_OWN = os.environ["AERPAW_CMP_CACHE"] = tempfile.mkdtemp(prefix="aerpaw-cmp-tests-")
 if _OF_ALL:
     Path(_OF_ALL, "llvm").mkdir(exist_ok=True)
     Path(os.environ["AERPAW_CMP_CACHE"], "llvm").symlink_to(Path(_OF_ALL, "llvm"))
@@ -67,6 +69,11 @@ DEAREST = (
 def pytest_addoption(parser: pytest.Parser) -> None:
     """``--shuffle SEED``: no test may need another to have run before it."""
     parser.addoption("--shuffle", type=int, default=None, metavar="SEED", help="files, and tests in them, in any order")
+
+
+def pytest_unconfigure() -> None:
+    """Field logs and paths are some ten megabytes; that of the first process goes last."""
+    shutil.rmtree(_OWN, ignore_errors=True)
 
 
 @pytest.hookimpl(optionalhook=True)
@@ -182,6 +189,22 @@ def no_wait_for_the_disk(request: pytest.FixtureRequest) -> Iterator[None]:
         if request.path.parent.name in ("jobs", "maps", "report", "site", "tests"):
             patch.setattr(os, "fsync", lambda descriptor: os.fstat(descriptor) and None)
         yield
+
+
+@pytest.fixture(scope="session")
+def field_logs() -> Any:
+    """Every log of AERPAW_CMP_FIELD_DATA, to be looked at only: read by the first worker that asks."""
+    from aerpaw_cmp.logs.ingest import ingest
+    from aerpaw_cmp.logs.readers import ReadOptions
+
+    kept = Path(_OF_ALL or os.environ["AERPAW_CMP_CACHE"]) / "field_logs.pickle"
+    if kept.exists():
+        return pickle.loads(kept.read_bytes())
+    found = ingest(os.environ["AERPAW_CMP_FIELD_DATA"], options=ReadOptions(timezone="America/New_York"))
+    part = kept.with_suffix(f".{os.getpid()}")
+    part.write_bytes(pickle.dumps(found))
+    part.replace(kept)
+    return found
 
 
 @pytest.fixture

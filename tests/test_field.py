@@ -13,7 +13,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.logs.ingest import Ingested, ingest
+from aerpaw_cmp.logs.ingest import Ingested
 from aerpaw_cmp.logs.readers import ReadOptions
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
@@ -57,9 +57,9 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
     return run
 
 
-@pytest.fixture(scope="module")
-def everything() -> Ingested:
-    return ingest(ROOT, options=OPTIONS)
+@pytest.fixture
+def everything(field_logs: Ingested) -> Ingested:
+    return field_logs
 
 
 @pytest.mark.parametrize("name", FLIGHTS)

@@ -13,8 +13,7 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.logs.ingest import Ingested, ingest
-from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.logs.ingest import Ingested
 
 ROOT = os.environ.get("AERPAW_CMP_FIELD_DATA", "")
 pytestmark = [
@@ -37,8 +36,8 @@ def rows_of(found: Ingested) -> dict[str, list[str]]:
 
 
 @pytest.fixture(scope="module")
-def found() -> dict[str, list[str]]:
-    return rows_of(ingest(ROOT, options=ReadOptions(timezone="America/New_York")))
+def found(field_logs: Ingested) -> dict[str, list[str]]:
+    return rows_of(field_logs)
 
 
 def test_no_file_is_left_without_a_word(found: dict[str, list[str]]) -> None:

@@ -22,9 +22,9 @@ OPTIONS = ReadOptions(timezone="America/New_York")
 FIELD = Path(ROOT)
 
 
-@pytest.fixture(scope="module")
-def everything() -> Ingested:
-    return ingest(FIELD, options=OPTIONS)
+@pytest.fixture
+def everything(field_logs: Ingested) -> Ingested:
+    return field_logs
 
 
 def test_every_known_log_is_read_to_the_last_line(everything: Ingested) -> None:

@@ -137,6 +137,9 @@ def test_where_the_arrays_of_the_paper_face_unless_told_otherwise():
     """Boresight and first port, in words: north-east; across the nose to the right; north, from west to east."""
     tower, uav, line = tower_comparison_array(), uav_comparison_array(0.0875), linear_array(4, 0.04)
     ahead, half = np.array([1.0, 0, 0]), np.sqrt(0.5)
+    assert np.degrees(tower.slant_rad) == pytest.approx([45, -45, 45, -45], abs=1e-12)
+    assert np.degrees(uav.slant_rad) == pytest.approx([45, -45, -45, 45], abs=1e-12)
+    assert not line.slant_rad.any()
     assert tower.mount @ ahead == pytest.approx([half, half, 0], abs=1e-12)
     assert tower.mount @ tower.positions_m[0] == pytest.approx([-0.9 * half, 0.9 * half, 0], abs=1e-12)
     assert uav.mount @ ahead == pytest.approx([half, -half, 0], abs=1e-12)

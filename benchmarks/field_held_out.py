@@ -95,7 +95,7 @@ def rank(root: Path, replicates: int, step_deg: float) -> dict[str, Any]:
             "headline": row["rows"][rank_receiver.HEADLINE],
             "geometry": row["geometry"],
             "candidates": row["candidates"],
-            "tied": len(row["tied"]),
+            "tied": row["tied"],
             "sector_left_out": row["sector_left_out"],
         }
         for way, row in ways.items()

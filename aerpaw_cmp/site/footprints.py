@@ -304,9 +304,10 @@ def _check_place(content: MapFile, frame: SiteFrame, path: Path) -> None:
 def _distance_m(latitude: Any, longitude: Any, frame: SiteFrame) -> Any:
     """Rough distance [m] from the origin; inf where it is no position on Earth."""
     good = (np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)
-    mean = math.radians(frame.latitude_deg)
-    turn = (longitude - frame.longitude_deg + 180) % 360 - 180
-    return np.where(good, 111_200 * np.hypot(latitude - frame.latitude_deg, turn * math.cos(mean)), np.inf)
+    north = np.where(good, latitude, 0.0) - frame.latitude_deg  # a torn number may be 1e306
+    turn = (np.where(good, longitude, 0.0) - frame.longitude_deg + 180) % 360 - 180
+    east = turn * math.cos(math.radians(frame.latitude_deg))
+    return np.where(good, 111_200 * np.hypot(north, east), np.inf)
 
 
 def _project(outline: Outline, frame: SiteFrame, actions: list[str]) -> _Shape | None:

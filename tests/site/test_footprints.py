@@ -12,6 +12,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.geodesy import SiteFrame
+from aerpaw_cmp.site import footprints
 from aerpaw_cmp.site.footprints import Footprints, import_footprints, import_site, write_site_yaml
 from aerpaw_cmp.site.siteyaml import build_site, load_site
 
@@ -357,3 +358,9 @@ def test_geofence_of_the_field() -> None:
     assert (len(found.geofences), len(found.buildings), found.actions) == (1, 0, [])
     assert 1e4 < found.geofences[0].area.area < 5e6
     assert found.geofences[0].area.distance(shapely.Point(0, 0)) < 500  # the flights start near LW1
+
+
+def test_a_number_that_is_no_degree_is_infinitely_far_and_overflows_nowhere():
+    frame = SiteFrame(35.7275, -78.696)
+    latitude, longitude = np.array([3.571e306, 35.7275, np.inf, np.nan]), np.array([-78.696, -78.696, 0.0, 1e300])
+    assert footprints._distance_m(latitude, longitude, frame).tolist() == [np.inf, 0.0, np.inf, np.inf]

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import compiled, compiled_field, compiled_search, tracer
+from aerpaw_cmp.propagation import compiled, compiled_field, compiled_search
 from aerpaw_cmp.propagation.arrays import Poses
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.channel import channel_matrices
@@ -51,7 +51,7 @@ def timed(mode: str, case, threads: int | None = 1) -> tuple[Replay, float, floa
 
 def serial(case) -> tuple[float, float]:
     """CPU seconds of a compiled replay, and those outside the parts that threads share."""
-    modules = (compiled, compiled_field, compiled_search, tracer)
+    modules = (compiled, compiled_field, compiled_search)
     real, shared = compiled.in_threads, 0.0
 
     def watched(*arguments):

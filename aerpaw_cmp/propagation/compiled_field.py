@@ -124,7 +124,8 @@ def evaluate(
     wavelength = wavelength_m(link.carrier_hz)
     order = _by_link(paths, len(arrays))
     some = paths if order is None else paths.select(order)
-    h = np.zeros((len(poses) * len(arrays), len(pair), 2))
+    h = np.empty((len(poses) * len(arrays), len(pair), 2))
+    h.fill(0.0)  # touched here: threads that meet fresh pages wait for each other in the kernel of the system
     power = np.zeros(len(paths))
     known: dict[str, Any] = {
         "pose": column(some.pose, np.int64),

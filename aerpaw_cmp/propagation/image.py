@@ -147,7 +147,7 @@ def find_paths(
                     found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
         if progress:
             progress((group[-1] + 1) / len(sources_m))
-    return merge(found, max_depth, faces, in_order=in_order, threads=threads)
+    return merge(found, max_depth, faces, in_order=in_order)
 
 
 def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:
@@ -513,7 +513,6 @@ def merge(
     faces: Faces | None,
     *,
     in_order: bool = False,
-    threads: int | None = 1,
 ) -> PathSet:
     """One sorted set of several.
 
@@ -526,8 +525,6 @@ def merge(
         Where given, of paths over coplanar faces that overlap only one is kept.
     in_order : bool
         The pieces, one after another, are sorted.
-    threads : int, optional
-        That copy; default: the cores that this process may use.
 
     Returns
     -------
@@ -537,7 +534,7 @@ def merge(
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    whole = _one_after_another(pieces, threads)
+    whole = _one_after_another(pieces)
     order = np.arange(len(whole)) if in_order else _order(whole)
     kept = len(whole)
     if faces is not None:
@@ -549,18 +546,16 @@ def merge(
     return whole if same else whole.select(order)
 
 
-def _one_after_another(pieces: list[PathSet], threads: int | None) -> PathSet:
-    """The paths of all pieces; NumPy lets other threads run while it copies."""
+def _one_after_another(pieces: list[PathSet]) -> PathSet:
+    """The paths of all pieces; by one thread: several would wait for each other's fresh pages longer than they copy."""
     columns = ("pose", "tower", "depth", "faces", "vertices_m", "tree")
     total, first = sum(map(len, pieces)), pieces[0]
     whole = {name: np.empty((total, *(own := getattr(first, name)).shape[1:]), own.dtype) for name in columns}
     starts = np.cumsum([0, *map(len, pieces)])
 
-    def copy(number: int) -> None:
+    for number, piece in enumerate(pieces):
         for name, values in whole.items():
-            values[starts[number] : starts[number + 1]] = getattr(pieces[number], name)
-
-    compiled.in_threads(copy, range(len(pieces)), threads)
+            values[starts[number] : starts[number + 1]] = getattr(piece, name)
     return PathSet(**whole)
 
 

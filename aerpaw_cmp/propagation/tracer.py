@@ -21,7 +21,7 @@ from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import Fields, channel_matrices, mean_pair_power, rss_dbm
-from .compiled import ENOUGH_WORK, beams, in_threads, switch, warn_once
+from .compiled import ENOUGH_WORK, beams, switch, warn_once
 from .crowns import Crowns
 from .effort import Estimate, OnEstimate
 from .faces import inside_solids, smaller_than_fresnel_zone
@@ -403,7 +403,7 @@ def replay_parts(
 
 
 LEVELS_AT_ONCE = 1024
-"""Poses of which a thread makes levels at once."""
+"""Poses of which levels are made at once."""
 
 LONG_SEARCH_S = 60.0
 """A search that will take longer is a warning where nobody asked to be told."""
@@ -916,7 +916,7 @@ def _evaluate(
     if relevance_db is not None:
         labels, _ = idle_objects(paths, scene.faces, fields.path_power, mean_pair_power(fields.h), relevance_db)
         idle = in_words(labels, relevance_db)
-    level_dbm, power_dbm = _levels(fields, has_path, link, settings.threads)
+    level_dbm, power_dbm = _levels(fields, has_path, link)
     return Replay(
         rss_dbm=level_dbm,
         rss_power_dbm=power_dbm,
@@ -932,12 +932,11 @@ def _evaluate(
     ), idle
 
 
-def _levels(fields: Fields, has_path: BoolArray, link: Link, threads: int | None) -> tuple[FloatArray, FloatArray]:
+def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:
     """Levels (poses, towers) of H and of the summed powers; below the noise floor H and ``has_path`` become nothing."""
     h, sent, floor = fields.h, link.transmit_power_dbm, link.noise_floor_dbm
     level_dbm, power_dbm = np.empty(has_path.shape), np.empty(has_path.shape)
-
-    def some(first: int) -> None:
+    for first in range(0, len(h), LEVELS_AT_ONCE):  # in the cache; a second thread would gain nothing
         part = slice(first, first + LEVELS_AT_ONCE)
         level_dbm[part] = rss_dbm(mean_pair_power(h[part]), sent, floor)
         power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
@@ -945,6 +944,4 @@ def _levels(fields: Fields, has_path: BoolArray, link: Link, threads: int | None
         if not above_floor.all():
             h[part][~above_floor] = 0.0
         has_path[part] &= above_floor
-
-    in_threads(some, range(0, len(h), LEVELS_AT_ONCE), threads)
     return level_dbm, power_dbm

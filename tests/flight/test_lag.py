@@ -60,6 +60,8 @@ def test_a_planted_drift_comes_back_within_half_a_millisecond_per_minute(drift_m
     assert abs(fit.drift_s_per_s - drift) * 60e3 < 0.5
     low, high = fit.drift_interval_s_per_s
     assert low - 1e-6 < drift < high + 1e-6
+    assert fit.as_dict()["drift_ci95_ms_per_min"] == [60_000.0 * low, 60_000.0 * high]
+    assert fit.reference == pytest.approx(middle, abs=1e-6)
     np.testing.assert_allclose(fit.apply(t), t + 4.2 - drift * (t - middle), atol=0.05)
 
 
@@ -73,7 +75,7 @@ def test_lag_with_time_stamps_and_slow_shadowing():
     fit = estimate_lag(at(t), level(t - 1.5) + shadow, lambda asked: level(asked.astype(np.int64) * 1e-9 - origin))
     assert fit.verdict == "ok"
     assert abs(fit.radio_minus_telemetry_s - 1.5) < 0.1
-    assert (at(t) - fit.apply(at(t)) - np.timedelta64(1_500_000_000, "ns")).astype(int).max() < 1e8
+    assert np.abs((at(t) - fit.apply(at(t)) - np.timedelta64(1_500_000_000, "ns")).astype(int)).max() < 1e8
 
 
 @pytest.mark.parametrize("seed", range(4))
@@ -294,3 +296,65 @@ def test_free_terms_of_many_lags_at_once_are_those_of_each_alone():
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(lag, "_NO_THREADS", 0)
         np.testing.assert_allclose(lag._without_terms(y, terms, 0.6), left, rtol=0, atol=1e-11)
+
+
+def test_the_interval_of_a_mean_is_that_of_its_blocks():
+    """One parameter: Student's t over the sums of blocks, by hand."""
+    from scipy.stats import t as student
+
+    residual = np.random.default_rng(4).normal(0, 2, 1000)
+    length = round(2.0 * 1000 ** (1 / 3))
+    sums = residual[: 1000 // length * length].reshape(-1, length).sum(axis=1)
+    count = len(sums)
+    expected = student.ppf(0.975, count - 1) * np.sqrt(count / (count - 1) * (sums**2).sum()) / 1000
+    assert lag._sandwich(residual, np.ones((1, 1000))) == pytest.approx([expected], rel=1e-12)
+
+
+def test_evidence_is_that_of_independent_samples():
+    """Residuals that go together in runs of 20 count as a twentieth; runs that turn their sign add nothing."""
+    chance = np.random.default_rng(5)
+    cost = np.array([1.0, np.e, 2.0])
+    white, runs = chance.normal(size=8000), np.repeat(chance.normal(size=400), 20)
+    turning = np.tile([1.0, -1.0], 4000)
+    assert lag._likelihood_ratios(cost, white)[1] == pytest.approx(8000, rel=0.15)
+    assert lag._likelihood_ratios(cost, runs)[1] == pytest.approx(400, rel=0.5)
+    assert lag._likelihood_ratios(cost, turning)[1] == pytest.approx(8000, rel=1e-9)
+
+
+def test_memory_of_a_residual_does_not_depend_on_its_mean():
+    from scipy.signal import lfilter
+
+    residual = lfilter([1], [1, -0.6], np.random.default_rng(6).normal(size=20_000))
+    assert lag._phi(residual + 25.0) == pytest.approx(lag._phi(residual), abs=1e-9)
+    assert lag._phi(residual) == pytest.approx(0.6, abs=0.03)
+
+
+def test_the_last_instant_that_every_shift_reaches():
+    prediction = lag._Prediction(0.0, 0.5, np.zeros((21, 1)))  # 0 to 10 s
+    assert prediction.common(np.array([0.9, 1.0, 5.0, 9.0, 9.1]), 1.0).tolist() == [False, True, True, True, False]
+
+
+def test_a_sharp_channel_beside_a_stronger_one_lends_no_sharpness():
+    """Its interval was taken where its lag was not."""
+    lags = np.round(np.arange(-100, 101) * 0.1, 6)
+    shape = {"drift_s_per_s": 0.0, "drift_interval_s_per_s": (np.nan, np.nan), "verdict": "ok", "reason": ""}
+    rest = {"reference": 0.0, "n": 100, "rmse_db": 3.0, "rmse_unshifted_db": 4.0, "window_s": 10.0}
+
+    def fit(place, half, strength):
+        evidence = strength * (lags - place) ** 2
+        return lag.LagFit(
+            radio_minus_telemetry_s=place,
+            ci95_s=(place - half, place + half),
+            curve_lag_s=lags,
+            curve_rmse_db=np.full(len(lags), 3.0),
+            evidence=evidence,
+            **shape,
+            **rest,
+        )
+
+    sharp, strong = fit(2.0, 0.001, 100.0), fit(-1.0, 0.3, 1e6)
+    both = combine_lags([sharp, strong])
+    assert both.radio_minus_telemetry_s == pytest.approx(-1.0)
+    assert both.ci95_s[1] - both.ci95_s[0] >= 0.1 - 1e-9
+    agreeing = combine_lags([sharp, fit(2.0, 0.3, 1e6)])
+    assert agreeing.ci95_s[1] - agreeing.ci95_s[0] < 0.1

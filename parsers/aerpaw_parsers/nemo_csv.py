@@ -10,7 +10,7 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray, IntArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
@@ -19,7 +19,9 @@ from . import _by_eights, _lines, _nemo, _rows, _table
 
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
-_ROW = re.compile(rb"^(\d{1,12}), ?" + _N + (rb", ?" + _CELL) * 7 + rb"[ \t]*\r?$", re.MULTILINE)
+_ROW = re.compile(rb"^" + _N + rb", ?" + _N + (rb", ?" + _CELL) * 7 + rb"[ \t]*\r?$", re.MULTILINE)
+_MOST = 1e12
+"""No table has so many rows."""
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 
 
@@ -41,16 +43,16 @@ def _plain(lines: _lines.Lines, found: _table.Fields) -> tuple[IntArray, list[Fl
     made = _by_eights.decimals(lines, found, range(9))
     value, odd = made.value, np.any(made.odd, axis=0)
     some = int(np.count_nonzero(odd))
-    if 16 * some > len(rows) or (some and (made.odd[0].any() or not _counted(lines, found.take(~odd)))):
+    if 16 * some > len(rows):
         return _at_once(lines, rows)
-    valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1]) & ~odd
+    valid = _valid(value) & ~odd
     return (rows, value) if valid.all() else (rows[valid], [column[valid] for column in value])
 
 
-def _counted(lines: _lines.Lines, found: _table.Fields) -> bool:
-    """Whether rows have an index as the pattern wants it."""
-    index = _table.texts(lines, found.begin, found.ends[:, 0])
-    return index.dtype.itemsize <= 12 and bool(np.char.isdigit(index).all())
+def _valid(value: list[FloatArray]) -> BoolArray:
+    """Rows whose index is a whole number, however written, and that have a time: alike on every way of reading."""
+    index = value[0]
+    return np.asarray((index >= 0) & (index < _MOST) & (index == np.floor(index)) & np.isfinite(value[1]))
 
 
 def _at_once(lines: _lines.Lines, rows: IntArray) -> tuple[IntArray, list[FloatArray]]:
@@ -58,7 +60,7 @@ def _at_once(lines: _lines.Lines, rows: IntArray) -> tuple[IntArray, list[FloatA
     value = _table.numbers(lines, rows, 9)
     if value is None:
         return rows[:0], [np.empty(0)] * 9
-    valid = (value[0] >= 0) & (value[0] == np.floor(value[0])) & np.isfinite(value[1])
+    valid = _valid(value)
     return rows[valid], [column[valid] for column in value]
 
 
@@ -69,6 +71,8 @@ def _columns(lines: _lines.Lines, found: _table.Fields) -> tuple[IntArray, list[
     if not len(odd):
         return rows, value
     texts = [_lines.numbers(cells) for cells in _lines.columns(groups, 9)]
+    valid = _valid(texts)
+    odd, texts = odd[valid], [column[valid] for column in texts]
     order = np.argsort(np.concatenate((rows, odd)), kind="stable")
     joined = [np.concatenate(pair)[order] for pair in zip(value, texts, strict=True)]
     return np.concatenate((rows, odd))[order], joined

@@ -214,3 +214,31 @@ def test_steps_back_are_counted_over_the_edges(monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(blocks, "_AT_ONCE", 3)
     time = np.random.default_rng(3).integers(0, 5, 100)
     assert blocks.steps_back(time.astype("datetime64[ns]")) == (np.diff(time) < 0).sum()
+
+
+@pytest.mark.parametrize("index", [b"85e8", b"9223372036854775808", b"7.0", b"-3", b"7.5"])
+def test_an_index_in_another_form_counts_alike_whatever_stands_beside_it(
+    index: bytes, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Beside a row that is no number the pattern decided, and it wanted digits alone."""
+    (data, *_) = samples.SAMPLES["nemo_csv"]["table"]
+    head, row = data.splitlines(keepends=True)[:2]
+    odd = index + row[row.index(b",") :]
+    fields = row.split(b",")
+    torn = b",".join((*fields[:2], b"35x.7", *fields[3:]))
+    log = head + row * 40 + odd + row * 40 + torn + row
+    reader = by_name("nemo_csv")
+    assert reader.in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 10 * len(row))
+    same(reader.in_blocks((log[i : i + 100] for i in range(0, len(log), 100)), OPTIONS), reader.read(log, OPTIONS))
+
+
+def test_a_head_whose_lines_end_twice_is_cut_at_the_line_feed(monkeypatch: pytest.MonkeyPatch) -> None:
+    options = ReadOptions(timezone="UTC", kind="rss", columns={"time": "Time", "rss_db": "Level"})
+    rows = b"".join(b"2025-03-02T10:00:%02d.5,-81.5\r\r\n" % second for second in range(40))
+    reader = by_name("generic_csv")
+    assert reader.in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 200)
+    data = b"Time,Level\r\r\n" + rows
+    chunks = (data[i : i + 100] for i in range(0, len(data), 100))
+    same(reader.in_blocks(chunks, options), reader.read(data, options))

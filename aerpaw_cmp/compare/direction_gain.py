@@ -416,7 +416,10 @@ def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSample
 
 @dataclass(slots=True)
 class _Sum:
-    """Running sum of the equations of several series, with the noise as the unit; ``members`` by key."""
+    """Running sum of the equations of several series, with the noise as the unit; ``members`` by key.
+
+    ``steps``: series added to it and taken from it since it was made.
+    """
 
     gram: FloatArray
     right: FloatArray
@@ -425,6 +428,7 @@ class _Sum:
     total: dict[str, FloatArray] = field(default_factory=dict)
     count: dict[str, int] = field(default_factory=dict)
     members: dict[bytes, _Member] = field(default_factory=dict)
+    steps: int = 0
 
     def add(self, member: _Member, sign: int) -> None:
         """Add a series, or take it away again."""
@@ -455,8 +459,6 @@ _last_sum: list[_Sum] = []
 LONGEST_CHAIN = 64
 """Series that are added to and taken from one sum before it is made anew: rounding adds up."""
 
-_chain = [0]
-
 
 def _summed(
     model: GainModel, series: Sequence[LinkSamples], blocks: Sequence[_Block]
@@ -470,14 +472,15 @@ def _summed(
     ]
     antennas = dict.fromkeys(s.antenna for s in series)
     last = _last_sum[0] if _last_sum else None
-    gone = [] if last is None else [key for key in last.members if key not in set(keys)]
+    wanted = set(keys)
+    gone = [] if last is None else [key for key in last.members if key not in wanted]
     new = [i for i, key in enumerate(keys) if last is None or key not in last.members]
     steps = len(gone) + len(new)
-    if last is None or len(set(keys)) < len(keys) or steps >= len(keys) or _chain[0] + steps > LONGEST_CHAIN:
+    if last is None or len(wanted) < len(keys) or steps >= len(keys) or last.steps + steps > LONGEST_CHAIN:
         last = _Sum(gram=np.zeros((width, width)), right=np.zeros(width))
-        gone, new, _chain[0] = [], list(range(len(keys))), 0
+        gone, new = [], list(range(len(keys)))
     else:
-        _chain[0] += steps
+        last.steps += steps
     for antenna in antennas:
         last.total.setdefault(antenna, np.zeros(width))
         last.count.setdefault(antenna, 0)
@@ -713,7 +716,7 @@ def fit_gain(series: Sequence[LinkSamples], model: GainModel | None = None) -> G
     series : sequence of LinkSamples
         Of all flights.
     model : GainModel, optional
-        Terms and their strength; see :func:`choose_model`.
+        Terms and their strength; see :func:`.gain_choice.choose_and_fit`.
 
     Raises
     ------

@@ -95,6 +95,7 @@ def choose_and_fit(
     rows = binned_series(series, coarse.bin_s)
     evidence: dict[tuple[float, float], float] = {}
     best: _Whitened | None = None
+    chosen = 1.0, 1.0
     frames = {t.frame for t in model.terms}
     towers = TOWER_FACTORS if "mast" in frames and len(frames) > 1 else (1.0,)
     parts = _kernels(coarse, rows)
@@ -103,21 +104,15 @@ def choose_and_fit(
         for tower in towers:
             tried = whole.at(tower)
             evidence[tower, longer] = tried.log_evidence(coarse.noise_sd_db)
-            if best is None or evidence[tower, longer] > max(v for k, v in evidence.items() if k != (tower, longer)):
+            if best is None or evidence[tower, longer] > evidence[chosen]:
                 best, chosen = tried, (tower, longer)
     assert best is not None
     balanced = _balanced(model, *chosen)
     errors = best.left_out(rows, coarse.noise_sd_db, spreads)
     spread = min(errors, key=lambda f: errors[f]) if errors else 1.0
     fit = fit_gain(series, _with_spread(balanced, spread))
-    return Choice(fit.scaled().model, spread, errors, fit.common_scale, evidence), fit.scaled()
-
-
-def choose_model(
-    series: Sequence[LinkSamples], model: GainModel | None = None, spreads: Sequence[float] = SPREADS
-) -> Choice:
-    """The choice of :func:`choose_and_fit` alone."""
-    return choose_and_fit(series, model, spreads)[0]
+    scaled = fit.scaled()
+    return Choice(scaled.model, spread, errors, fit.common_scale, evidence), scaled
 
 
 def _balanced(model: GainModel, tower: float, longer: float) -> GainModel:

@@ -379,7 +379,7 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         )
     hidden = head.startswith(_GZIP)
     if packed.form(head) is not None:
-        head, hidden = as_utf8(packed.head_of(place, HEAD_BYTES)), False
+        head = as_utf8(packed.head_of(place, HEAD_BYTES))
         hidden = not head  # damaged, or empty
     elif hidden and place.stat().st_size > blocks.FROM_BYTES // 16:
         head, hidden = as_utf8(_unpacked_head(head)), False

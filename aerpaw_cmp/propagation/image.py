@@ -534,7 +534,7 @@ def merge(
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    whole = _one_after_another(pieces)
+    whole = PathSet.one_after_another(pieces)  # by one thread: several would wait for each other's fresh pages
     order = np.arange(len(whole)) if in_order else _order(whole)
     kept = len(whole)
     if faces is not None:
@@ -544,19 +544,6 @@ def merge(
             kept = len(order)
     same = kept == len(whole) and (in_order or bool((np.diff(order) == 1).all()))
     return whole if same else whole.select(order)
-
-
-def _one_after_another(pieces: list[PathSet]) -> PathSet:
-    """The paths of all pieces; by one thread: several would wait for each other's fresh pages longer than they copy."""
-    columns = ("pose", "tower", "depth", "faces", "vertices_m", "tree")
-    total, first = sum(map(len, pieces)), pieces[0]
-    whole = {name: np.empty((total, *(own := getattr(first, name)).shape[1:]), own.dtype) for name in columns}
-    starts = np.cumsum([0, *map(len, pieces)])
-
-    for number, piece in enumerate(pieces):
-        for name, values in whole.items():
-            values[starts[number] : starts[number + 1]] = getattr(piece, name)
-    return PathSet(**whole)
 
 
 def _order(paths: PathSet) -> IntArray:

@@ -232,18 +232,15 @@ def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
 
 def _convex(footprints: AnyArray) -> list[list[Polygon]]:
     """The convex pieces of each footprint."""
-    hull, area = shapely.area(shapely.convex_hull(footprints)), shapely.area(footprints)
-    whole = (hull - area <= ROUNDING * hull) & (shapely.get_num_interior_rings(footprints) == 0)
-    return [[one] if convex else convex_pieces(one) for one, convex in zip(footprints, whole.tolist(), strict=True)]
+    whole = _is_convex(footprints).tolist()
+    return [[one] if convex else convex_pieces(one) for one, convex in zip(footprints, whole, strict=True)]
 
 
 def convex_pieces(footprint: Polygon) -> list[Polygon]:
-    """Convex polygons that together are the footprint, with corners at its corners only.
+    """Convex polygons that together are a footprint that is not convex, with corners at its corners only.
 
     Triangles are joined as long as what they make is convex (Hertel and Mehlhorn, 1983).
     """
-    if _is_convex(footprint):
-        return [footprint]
     pieces = list(shapely.get_parts(shapely.constrained_delaunay_triangles(footprint)))
     first = 0
     while first < len(pieces):
@@ -258,9 +255,11 @@ def convex_pieces(footprint: Polygon) -> list[Polygon]:
     return pieces
 
 
-def _is_convex(polygon: Polygon) -> bool:
-    hull = polygon.convex_hull.area
-    return not polygon.interiors and bool(hull - polygon.area <= ROUNDING * hull)
+def _is_convex(polygons: Polygon | AnyArray) -> BoolArray:
+    """Whether a polygon, or each of an array, fills its hull."""
+    hull = shapely.area(shapely.convex_hull(polygons))
+    full = hull - shapely.area(polygons) <= ROUNDING * hull
+    return np.asarray(full & (shapely.get_num_interior_rings(polygons) == 0))
 
 
 def _planes(footprints: list[Polygon], foot: FloatArray, top: FloatArray) -> list[tuple[FloatArray, FloatArray]]:

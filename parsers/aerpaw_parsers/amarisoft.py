@@ -12,7 +12,7 @@ rank.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -21,7 +21,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _json, _lines, _rows, _time
+from . import _agreeing, _json, _lines, _rows, _time
 
 _STAMP = rb"^\[(" + _time.TIME + rb")\] *"
 _TITLE = re.compile(
@@ -95,22 +95,14 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     return _read_answers(data, options, set())
 
 
-def _json_in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    """The same, where all blocks have the one kind of time, or the other."""
-    kinds: set[bool] = set()
-    read_block = blocks.by_lines(lambda data, given: _read_answers(data, given, kinds), apart=_json.WHOLE)
-    return read_block(chunks, options)
-
-
-def _read_answers(data: bytes, options: ReadOptions, kinds: set[bool]) -> ReadResult:
+def _read_answers(data: bytes, options: ReadOptions, kinds: set[Hashable]) -> ReadResult:
     """Answers of a block; ``kinds`` gathers whether they have ``utc``, which no log may change half way."""
     lines = _lines.split(data)
     answers = _json.objects(lines)
     found = answers.found
     has_utc = any("utc" in one for one in found)
-    kinds |= {has_utc} if found else set()
-    if len(kinds) > 1:
-        raise blocks.Whole
+    if found:
+        kinds.add(has_utc)
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
@@ -149,5 +141,5 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_json_in_blocks,
+    in_blocks=_agreeing.in_blocks(_read_answers),
 )

@@ -11,7 +11,7 @@ gives no rank.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Hashable, Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _json, _lines, _rows, _stamps, _time
+from . import _agreeing, _json, _lines, _rows, _stamps, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
@@ -83,14 +83,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     return _read_reports(data, options, set())
 
 
-def _json_in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    """The same, where the times of all blocks are of one form."""
-    forms: set[tuple[str, ...]] = set()
-    read_block = blocks.by_lines(lambda data, given: _read_reports(data, given, forms), apart=_json.WHOLE)
-    return read_block(chunks, options)
-
-
-def _read_reports(data: bytes, options: ReadOptions, forms: set[tuple[str, ...]]) -> ReadResult:
+def _read_reports(data: bytes, options: ReadOptions, forms: set[Hashable]) -> ReadResult:
     """Reports of a block; ``forms`` gathers how times were understood, which all blocks must agree on."""
     lines = _lines.split(data)
     reports = _json.objects(lines)
@@ -98,9 +91,8 @@ def _read_reports(data: bytes, options: ReadOptions, forms: set[tuple[str, ...]]
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
     clock, time, warnings = _stamps.read(texts, options)
-    forms |= {(clock, *warnings)} if texts else set()
-    if len(forms) > 1:
-        raise blocks.Whole
+    if texts:
+        forms.add((clock, *warnings))
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines,
@@ -139,5 +131,5 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_json_in_blocks,
+    in_blocks=_agreeing.in_blocks(_read_reports),
 )

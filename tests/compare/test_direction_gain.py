@@ -17,7 +17,7 @@ from aerpaw_cmp.compare.direction_gain import (
     Term,
     fit_gain,
 )
-from aerpaw_cmp.compare.gain_choice import choose_model
+from aerpaw_cmp.compare.gain_choice import choose_and_fit
 from aerpaw_cmp.compare.mount import fit_mounts
 from aerpaw_cmp.compare.sphere import even_directions, gaussian_features, gaussian_spectrum, harmonics_on_sphere
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, rotation_from_yaw_pitch_roll
@@ -173,12 +173,12 @@ def test_place_field_stays_apart_from_the_antennas():
 
 def test_choice_of_spread_uses_the_training_flights_alone_and_scales_to_them():
     loud = [dataclasses.replace(s, residual_db=s.residual_db * 3.0) for s in TRAIN]
-    once, thrice = choose_model(TRAIN, MODEL), choose_model(loud, MODEL)
+    once, thrice = choose_and_fit(TRAIN, MODEL)[0], choose_and_fit(loud, MODEL)[0]
     assert thrice.spread == once.spread
     assert thrice.scale == pytest.approx(3.0 * once.scale)
     assert set(once.left_out_rmse_db) == {0.5, 1.0, 2.0, 4.0}
     assert once.spread == min(once.left_out_rmse_db, key=once.left_out_rmse_db.get)
-    assert choose_model(TRAIN[:2], MODEL).left_out_rmse_db == {}  # one flight: nothing to choose by
+    assert choose_and_fit(TRAIN[:2], MODEL)[0].left_out_rmse_db == {}  # one flight: nothing to choose by
 
 
 def test_mounts_are_found_together():

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import os
+import signal
 import sys
 import tempfile
 import time
@@ -26,12 +27,13 @@ def measure(seconds: float, folder: Path) -> dict[str, object]:
     """Share of one core over a session, after the start."""
     link = folder / "modem"
     with ModemSimulator(ModemSimSettings(link=link, faults=Faults(latency_s=0.03, jitter_s=0.03))) as modem:
-        process = start_tap(link, folder / "log", duration_s=seconds + 5, show_status=True)
+        process = start_tap(link, folder / "log", duration_s=seconds + 60, show_status=True)
         while len(modem.journal) < 6:
             time.sleep(0.05)
         start, before = time.monotonic(), cpu_s(process.pid)
         time.sleep(seconds)
         used, elapsed = cpu_s(process.pid) - before, time.monotonic() - start
+        process.send_signal(signal.SIGINT)
         summary = json.loads(process.communicate(timeout=30)[0])
     return {
         "seconds": round(elapsed, 1),

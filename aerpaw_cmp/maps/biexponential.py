@@ -191,18 +191,30 @@ class _Projection:
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        found = [self._search(grid[cell]) for cell in np.argsort(cost)[:starts]]
-        best = min(found, key=lambda log_rates: float((self.amplitudes(log_rates)[1] ** 2).sum()))
-        return np.sort(best)[::-1]
+        found = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:starts]])
+        valley = found[np.argmin((self.amplitudes(found)[1] ** 2).sum(axis=1))]
+        return np.sort(self._search(valley, 1e-15))[::-1]
 
-    def _search(self, start: FloatArray) -> FloatArray:
+    def _search(self, start: FloatArray, tolerance: float) -> FloatArray:
+        """Bottom of the valley that a start lies in."""
         from scipy.optimize import least_squares
 
-        inside = np.clip(start, self.log_rates[0] + 1e-9, self.log_rates[1] - 1e-9)
         fit = least_squares(
-            lambda p: self.amplitudes(p)[1], inside, bounds=self.log_rates, xtol=1e-15, ftol=1e-15, gtol=1e-15
+            lambda log_rates: self.amplitudes(log_rates)[1],
+            np.clip(start, self.log_rates[0] + 1e-9, self.log_rates[1] - 1e-9),
+            jac=self._slopes,
+            bounds=self.log_rates,
+            xtol=tolerance,
+            ftol=tolerance,
+            gtol=1e-15,
         )
         return np.asarray(fit.x)
+
+    def _slopes(self, log_rates: FloatArray) -> FloatArray:
+        """Central differences (n, 2) of the residuals over the logarithms of the rates, all at once."""
+        away = 1e-5 * np.eye(2)
+        ahead, behind = self.amplitudes(log_rates + np.stack([away, -away]))[1]
+        return np.asarray((ahead - behind).T / 2e-5)
 
     def single(self) -> float:
         """Logarithm of the rate of the best single exponential."""

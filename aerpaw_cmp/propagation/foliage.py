@@ -11,7 +11,7 @@ centimetres where a crown shades metres.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Literal, Protocol
 
 import numpy as np
@@ -289,12 +289,17 @@ _last_index: list[CrownIndex] = []
 
 
 def crown_index(trees: Trees) -> CrownIndex:
-    """The index of cones of these trees; that of the trees asked for last is kept, as a flight asks many times."""
-    kept = next((one for one in _last_index if one.trees is trees), None)
+    """The index of cones of these trees; the last one is kept: a flight asks many times, the next has its site."""
+    kept = next((one for one in _last_index if one.trees is trees or _same(one.trees, trees)), None)
     if kept is None:
         kept = CrownIndex(trees)
         _last_index[:] = [kept]
     return kept
+
+
+def _same(one: Trees, other: Trees) -> bool:
+    """Whether two sets of trees are equal to the last digit."""
+    return all(np.array_equal(getattr(one, of.name), getattr(other, of.name)) for of in fields(Trees))
 
 
 class CrownIndex:

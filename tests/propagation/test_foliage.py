@@ -17,6 +17,7 @@ from aerpaw_cmp.propagation.foliage import (
     NoFoliage,
     Opaque,
     Weissberger,
+    crown_index,
     foliage_depth_m,
     foliage_loss_db,
     foliage_model,
@@ -230,3 +231,12 @@ def test_models_by_name() -> None:
         foliage_model("attenuating", 3.4e9, gamma_db_per_m=-1)
     with pytest.raises(UsageError, match="30 MHz"):
         P833.at(3.4)
+
+
+def test_the_index_of_equal_trees_is_made_once_and_of_others_anew():
+    kept = crown_index(grove(20, 3))
+    assert crown_index(grove(20, 3)) is kept
+    taller = grove(20, 3)
+    taller.height_m[7] += 1e-9
+    assert crown_index(taller).trees is taller
+    assert crown_index(grove(19, 3)).trees.east_m.shape == (19,)

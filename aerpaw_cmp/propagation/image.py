@@ -17,7 +17,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
-from itertools import product
 
 import numpy as np
 
@@ -48,6 +47,9 @@ CELLS_PER_CHUNK = 1_000_000
 
 TARGETS_AT_ONCE = 1024
 """Targets whose heights over all faces stay in the cache of a core."""
+
+FEW_TARGETS = 32
+"""Targets that show most faces to have one in front."""
 
 Progress = Callable[[float], None]
 
@@ -108,7 +110,7 @@ def find_paths(
     known = targets_m[np.isfinite(targets_m).all(axis=1)] if extent_m is None else extent_m
     tolerance_m = scene_tolerance_m(faces, sources_m, known)
     hiding = Occlusion(faces, tolerance_m)
-    box = corners(faces, 10.0 * float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
+    box = _Bounds.of(faces, float(max(1.0, *(np.abs(p).max(initial=0.0) for p in (known, sources_m)))))
     # without a second reflection nobody asks
     facing = _facing(faces, box, tolerance_m) if max_depth > 1 else np.zeros((0, len(faces)), np.bool_)
     alive = _alive(sources_m, targets_m, excluded)
@@ -174,11 +176,33 @@ def _groups(sequences: Callable[[int], list[Sequences]], towers: int) -> Iterato
 
 def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
     """Absolute tolerance [m] of side tests in this scene."""
-    sizes = [np.nanmax(np.abs(p), initial=0.0, where=np.isfinite(p)) for p in (*points_m, faces.lower, faces.upper)]
+    sizes = [np.abs(p).max(initial=0.0, where=np.isfinite(p)) for p in (*points_m, faces.lower, faces.upper)]
     return RELATIVE_TOLERANCE * max(1.0, *(float(s) for s in sizes))
 
 
-_CORNERS_OF_A_BOX = np.array(list(product((False, True), repeat=3)))
+@dataclass(frozen=True, slots=True)
+class _Bounds:
+    """In-plane bounds of the faces.
+
+    Parameters
+    ----------
+    corners_m : (faces, 4, 3)
+        In order round the face; infinite ones are cut far away.
+    centre_m : (faces, 3)
+    reach_m : (faces, 2, 3)
+        Half of each side.
+    """
+
+    corners_m: FloatArray
+    centre_m: FloatArray
+    reach_m: FloatArray
+
+    @classmethod
+    def of(cls, faces: Faces, farthest_m: float) -> _Bounds:
+        """Bounds of faces, the infinite ones cut at ten times the farthest point."""
+        box = corners(faces, 10.0 * farthest_m)
+        first, second, third, fourth = box.transpose(1, 0, 2)
+        return cls(box, (first + third) / 2, np.stack([second - first, fourth - first], axis=1) / 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -189,26 +213,34 @@ class _Ends:
     ----------
     lit : (faces,) bool
         Faces with a target in front.
-    hull_m : (8, 3)
-        Corners of the box of the targets.
+    hull_m : (1, 3), (1, 3, 3)
+        Centre of the box of the targets, and half of each of its sides.
     """
 
     lit: BoolArray
-    hull_m: FloatArray
+    hull_m: tuple[FloatArray, FloatArray]
 
     @classmethod
     def of(cls, faces: Faces, targets_m: FloatArray, some: BoolArray, tolerance_m: float) -> _Ends:
         targets = targets_m if some.all() else targets_m[some]
         if not len(targets):
-            return cls(np.zeros(len(faces), dtype=np.bool_), np.zeros((8, 3)))
-        highest = np.full(len(faces), -np.inf)
-        for start in range(0, len(targets), TARGETS_AT_ONCE):
-            height = faces.normal @ targets[start : start + TARGETS_AT_ONCE].T
-            height -= faces.offset_m[:, None]
-            np.maximum(highest, height.max(axis=1), out=highest)
+            return cls(np.zeros(len(faces), dtype=np.bool_), (np.zeros((1, 3)), np.zeros((1, 3, 3))))
+        lit = cls._before(faces, targets[:: max(1, len(targets) // FEW_TARGETS)], tolerance_m)
+        dark = np.flatnonzero(~lit)  # by a few targets; the others are asked about what is left
+        lit[dark] = cls._before(faces, targets, tolerance_m, dark)
         low, high = targets.min(axis=0), targets.max(axis=0)
-        hull = np.where(_CORNERS_OF_A_BOX, high, low)
-        return cls(highest >= -tolerance_m, hull)
+        return cls(lit, ((low + high)[None] / 2, np.diag(high - low)[None] / 2))
+
+    @staticmethod
+    def _before(
+        faces: Faces, targets: FloatArray, tolerance_m: float, some: IntArray | slice = slice(None)
+    ) -> BoolArray:
+        """Which faces have a target in front."""
+        normal, offset = faces.normal[some], faces.offset_m[some]
+        highest = np.full(len(offset), -np.inf)
+        for start in range(0, len(targets), TARGETS_AT_ONCE):
+            np.maximum(highest, (normal @ targets[start : start + TARGETS_AT_ONCE].T).max(axis=1), out=highest)
+        return np.asarray(highest - offset >= -tolerance_m)
 
 
 @dataclass(frozen=True, slots=True)
@@ -229,7 +261,7 @@ class Sequences:
     def of(
         cls,
         faces: Faces,
-        box: FloatArray,
+        box: _Bounds,
         facing: BoolArray,
         source: FloatArray,
         ends: _Ends,
@@ -240,13 +272,13 @@ class Sequences:
     ) -> list[Sequences]:
         """Sequences of depth 0 .. max_depth that geometry does not rule out for any target.
 
-        ``box`` are the corners of the faces, ``facing`` which of them can follow which.
+        ``box`` are the bounds of the faces, ``facing`` which of them can follow which.
 
         Parameters
         ----------
         faces : Faces
-        box : (faces, c, 3)
-            Corners of the faces [m].
+        box : _Bounds
+            Of the faces.
         facing : (faces, faces) bool
             Which of them can follow which.
         source : (3,)
@@ -274,13 +306,15 @@ class Sequences:
             if not len(level.faces):
                 break
             levels.append(level)
-        return [_reaching(faces, step, ends.lit, box, ends.hull_m, tolerance_m) for step in levels]
+        return [_reaching(faces, step, ends, box, tolerance_m) for step in levels]
 
 
-def _facing(faces: Faces, box: FloatArray, tolerance_m: float) -> BoolArray:
+def _facing(faces: Faces, box: _Bounds, tolerance_m: float) -> BoolArray:
     """Pairs (first, second) of which each has a point in front of the other."""
-    side = np.einsum("fi,gki->fgk", faces.normal, box) - faces.offset_m[:, None, None]
-    ahead = (side > tolerance_m).any(axis=2)
+    highest = faces.normal @ box.centre_m.T - faces.offset_m[:, None]
+    for half in box.reach_m.transpose(1, 2, 0):
+        highest += np.abs(faces.normal @ half)
+    ahead = highest > tolerance_m
     return np.asarray(ahead & ahead.T)
 
 
@@ -290,7 +324,7 @@ def _grow(
     source: FloatArray,
     usable: BoolArray,
     facing: BoolArray,
-    box: FloatArray,
+    box: _Bounds,
     tolerance_m: float,
     budget: int,
 ) -> Sequences:
@@ -309,7 +343,9 @@ def _grow(
         if now.shape[1]:
             good &= facing[now[:, -1]]
             row, face = np.nonzero(good)
-            keep = _beam_meets(last_image[row], box[now[row, -1]], box[face], tolerance_m)
+            keep = _beam_meets(
+                last_image[row], box.corners_m[now[row, -1]], box.centre_m[face], box.reach_m[face], tolerance_m
+            )
             keep |= ~np.isfinite(faces.lower[face, 0]) | ~np.isfinite(faces.lower[now[row, -1], 0])
             row, face = row[keep], face[keep]
         else:
@@ -328,34 +364,39 @@ def _grow(
     return Sequences(np.concatenate(grown), np.concatenate(images))
 
 
-def _beam_meets(apex: FloatArray, window: FloatArray, target: FloatArray, tolerance_m: float) -> BoolArray:
-    """Whether the beam from ``apex`` through the quadrilateral ``window`` may meet the points ``target``.
+def _beam_meets(
+    apex: FloatArray, window: FloatArray, centre: FloatArray, reach: FloatArray, tolerance_m: float
+) -> BoolArray:
+    """Whether the beam from ``apex`` through the quadrilateral ``window`` may meet a parallelogram or a box.
 
-    apex (n, 3), window (n, 4, 3), target (n or 1, points, 3). Conservative: True unless one side plane of the
-    beam has all target points outside.
+    apex (n, 3), window (n, 4, 3), centre (n or 1, 3), reach (n or 1, axes, 3): half of each side. Conservative: True
+    unless one side plane of the beam has all of it outside.
     """
-    ray = window - apex[:, None, :]
-    (a, b, c), (d, e, f) = ray.transpose(2, 0, 1), ray[:, [1, 2, 3, 0]].transpose(2, 0, 1)
-    side = np.stack([b * f - c * e, c * d - a * f, a * e - b * d], axis=2)
+    # components first, then corners: each step is one pass over contiguous rows of sequences
+    ray = np.ascontiguousarray((window - apex[:, None, :]).transpose(2, 1, 0))
+    following = ray[:, _NEXT_CORNER]
+    side = ray[_SECOND] * following[_THIRD] - ray[_THIRD] * following[_SECOND]
     # the sense in which the window goes round decides which way the side planes point
-    sense = np.sign(np.einsum("ni,ni->n", side.sum(axis=1), ray.sum(axis=1)))
-    size = np.sqrt(np.einsum("nki,nki->nk", side, side)) + 1e-300
-    offset = np.matmul(target - apex[:, None, :], np.swapaxes(side, 1, 2)) * sense[:, None, None]
-    outside = offset < -tolerance_m * size[:, None, :]
-    return np.asarray(~outside.all(axis=1).any(axis=1))
+    sense = np.sign((side.sum(axis=1) * ray.sum(axis=1)).sum(axis=0))
+    ahead = (side * (centre - apex).T[:, None]).sum(axis=0) * sense
+    ahead += np.abs((side * reach.transpose(1, 2, 0)[:, :, None]).sum(axis=1)).sum(axis=0)
+    size = np.sqrt((side * side).sum(axis=0))
+    return np.asarray((ahead >= -tolerance_m * size).all(axis=0))
 
 
-def _reaching(
-    faces: Faces, level: Sequences, lit: BoolArray, box: FloatArray, hull: FloatArray, tolerance_m: float
-) -> Sequences:
+_NEXT_CORNER, _SECOND, _THIRD = [1, 2, 3, 0], [1, 2, 0], [2, 0, 1]
+
+
+def _reaching(faces: Faces, level: Sequences, ends: _Ends, box: _Bounds, tolerance_m: float) -> Sequences:
     """Sequences whose last face, and the beam through it, can reach the box of targets."""
     if not level.faces.shape[1]:
         return level
     last = level.faces[:, -1]
-    keep = lit[last]
+    keep = ends.lit[last]
     row = np.flatnonzero(keep & np.isfinite(faces.lower[last, 0]))
     for part in np.array_split(row, max(1, len(row) // 20_000)):
-        keep[part] = _beam_meets(level.images_m[part, -1], box[last[part]], hull[None], tolerance_m)
+        window = box.corners_m[last[part]]
+        keep[part] = _beam_meets(level.images_m[part, -1], window, *ends.hull_m, tolerance_m)
     return Sequences(level.faces[keep], level.images_m[keep])
 
 
@@ -575,6 +616,7 @@ def _repeated(paths: PathSet, order: IntArray, faces: Faces) -> BoolArray:
 def planes_of(faces: Faces) -> IntArray:
     """Number (faces,) of the plane each face lies in; coplanar faces that look the same way share it."""
     key = np.column_stack([faces.normal / 1e-9, faces.offset_m / 1e-6]).round()
-    rows = np.ascontiguousarray(key + 0.0).view(np.dtype((np.void, key.shape[1] * key.itemsize)))
-    _, plane = np.unique(rows, return_inverse=True)  # bytes: -0 became 0
-    return np.asarray(plane.reshape(-1), dtype=np.int64)
+    order = np.lexsort(key.T)
+    plane = np.empty(len(key), dtype=np.int64)
+    plane[order] = np.cumsum((np.diff(key[order], axis=0, prepend=np.nan) != 0.0).any(axis=1))
+    return plane - 1

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from threading import get_ident
 from types import ModuleType
 from typing import Any
 
@@ -69,26 +70,49 @@ def find(
         "tolerance_m": float(hiding.tolerance_m),
     }
 
+    rooms: dict[int, _Room] = {}  # of the threads
+
     def run(first: int) -> PathSet:
         last = min(first + POSES_PER_CHUNK, len(targets_m))
-        found = _run(kernels, known, first, last, max_depth)
+        room = rooms.setdefault(get_ident(), _Room(max_depth))
+        found = room.fill(kernels, known, first, last)
         return _decided(kernels, found, faces, known, hiding)
 
     return in_threads(run, range(0, len(targets_m), POSES_PER_CHUNK), threads)
 
 
-def _run(kernels: ModuleType, known: dict[str, Any], first: int, last: int, max_depth: int) -> tuple[Any, ...]:
-    """Numbers (paths, 4), faces and points that the kernel finds."""
-    room = 4 * (last - first) * len(known["sources_m"])
-    while True:
-        numbers = np.empty((room, 4), dtype=np.int64)
-        faces = np.full((room, max_depth), -1, dtype=np.int64)
-        points = np.full((room, max_depth, 3), np.nan)
-        values = {"first_pose": first, "last_pose": last, "numbers": numbers, "faces": faces, "points": points, **known}
-        found = int(kernels.search(*(values[name] for name in kernels.SEARCH_ARGUMENTS)))
-        if found <= room:
-            return numbers[:found], faces[:found].copy(), points[:found].copy()
-        room = found
+class _Room:
+    """Where the kernel writes what it finds: kept for the next run, as fresh memory is dear where threads share it.
+
+    Parameters
+    ----------
+    max_depth : int
+    """
+
+    def __init__(self, max_depth: int) -> None:
+        self.max_depth = max_depth
+        self._make(0)
+
+    def _make(self, paths: int) -> None:
+        self.numbers = np.empty((paths, 4), dtype=np.int64)
+        self.faces = np.full((paths, self.max_depth), -1, dtype=np.int64)
+        self.points = np.full((paths, self.max_depth, 3), np.nan)
+
+    def fill(self, kernels: ModuleType, known: dict[str, Any], first: int, last: int) -> tuple[Any, ...]:
+        """Numbers (paths, 4), faces and points of poses ``first`` to ``last``, as arrays of their own."""
+        least = 4 * (last - first) * len(known["sources_m"])
+        if least > len(self.numbers):
+            self._make(least)
+        while True:
+            own = {"numbers": self.numbers, "faces": self.faces, "points": self.points}
+            values = {"first_pose": first, "last_pose": last, **own, **known}
+            found = int(kernels.search(*(values[name] for name in kernels.SEARCH_ARGUMENTS)))
+            if found <= len(self.numbers):
+                break
+            self._make(found)
+        taken = tuple(array[:found].copy() for array in own.values())
+        self.faces[:found], self.points[:found] = -1, np.nan
+        return taken
 
 
 def _decided(

@@ -18,6 +18,10 @@ LARGE_DB = 1.5
 """A channel whose RMSE is this much [dB] above the pooled one is named as where the prediction fails."""
 
 
+LEAST_DB = 0.05
+"""A smaller difference [dB] is none at the digits of the first sentence."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Headline:
     """One number of the first screen: what it is, its value with unit, its interval or range, what stands beside it."""
@@ -76,16 +80,23 @@ def _rss_sentence(panels: Sequence[RssPanel]) -> str:
         tail = f", {shown.get(words[0], 'no difference is shown')}" if words else ""
     else:
         tail = f"; it is shown to be better on {better} and worse on {worse} of {len(panels)} channels" if words else ""
-    if total - other >= 0.05:  # less than that is no difference at the digits of the sentence
+    digits = _digits(total, other)
+    if total - other >= LEAST_DB:
         return (
-            f"Ray tracing is WORSE than {pretty(name)}: it misses the measured level by {total:.1f} dB RMSE, "
-            f"{pretty(name)} by {other:.1f} dB{tail}."
+            f"Ray tracing is WORSE than {pretty(name)}: it misses the measured level by {total:.{digits}f} dB RMSE, "
+            f"{pretty(name)} by {other:.{digits}f} dB{tail}."
         )
-    gain = min(total - other, 0.0) + 0.0
+    gain = round(total, digits) - round(other, digits)
+    beside = f"{gain:+.{digits}f}" if gain else f"{0.0:.{digits}f}"
     return (
-        f"Ray tracing misses the measured level by {total:.1f} dB RMSE, {gain:.1f} dB against {pretty(name)} "
-        f"({other:.1f} dB){tail}.".replace("-", "−", 1)
+        f"Ray tracing misses the measured level by {total:.{digits}f} dB RMSE, {beside} dB against "
+        f"{pretty(name)} ({other:.{digits}f} dB){tail}.".replace("-", "−", 1)
     )
+
+
+def _digits(total: float, other: float) -> int:
+    """Digits with which two errors and their difference, each rounded, still add up: one where that will do."""
+    return 1 if abs(round(total, 1) - round(other, 1) - (total - other)) < LEAST_DB else 2
 
 
 def _rank_sentence(panels: Sequence[RankPanel]) -> str:

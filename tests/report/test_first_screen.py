@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -42,6 +43,14 @@ def test_worse_than_the_best_baseline_is_the_first_thing_said(report_data):
     alike = verdict(with_errors(report_data, 3.01, 3.0))[0]  # both print as 3.0
     assert "WORSE" not in alike
     assert ", 0.0 dB against" in alike
+
+
+@pytest.mark.parametrize(("ours", "other"), [(2.84, 2.98), (2.96, 2.94), (3.04, 3.96), (3.0, 3.0), (2.849, 2.951)])
+def test_the_numbers_of_the_first_sentence_add_up(report_data, ours, other):
+    said = verdict(with_errors(report_data, ours, other))[0].replace("\u2212", "-")
+    total, difference, baseline = (float(number) for number in re.findall(r"([-+]?\d+\.\d+) dB", said))
+    assert total - baseline == pytest.approx(difference, abs=1e-9)
+    assert difference == pytest.approx(ours - other, abs=0.05)
 
 
 def test_at_most_four_numbers_each_with_something_beside_it(report_data):

@@ -18,6 +18,8 @@ from __future__ import annotations
 import os
 import sys
 
+from .common import interrupts
+
 INTERNAL_ERROR = 70
 INTERRUPTED = 130
 BROKEN_PIPE = 141
@@ -108,6 +110,15 @@ def _message(error: BaseException) -> tuple[str, int]:
     )
 
 
+def _notes(error: BaseException | None) -> list[str]:
+    """What is kept, by the exception or those that it came of."""
+    found: list[str] = []
+    while error is not None:
+        found += [note for note in getattr(error, "__notes__", ()) if note not in found]
+        error = error.__cause__ or error.__context__
+    return found
+
+
 def _run(arguments: list[str]) -> int:
     from . import cli
 
@@ -140,9 +151,12 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault(_SHELL_IS_NAMED, "1")
     try:
         code = _quick_answer(arguments)
-        return _run(arguments) if code is None else code
+        if code is not None:
+            return code
+        with interrupts.noted():
+            return _run(arguments)
     except KeyboardInterrupt as interrupt:
-        print("; ".join(["aerpaw-cmp: interrupted", *getattr(interrupt, "__notes__", ())]), file=sys.stderr)
+        print("; ".join(["aerpaw-cmp: interrupted", *_notes(interrupt)]), file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:
         # the interpreter flushes standard output once more at exit: give it a place that accepts

@@ -19,6 +19,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+from .interrupts import came
+
 
 def one_line(text: str) -> str:
     r"""Text for one line of a message: line breaks, control characters and bytes that are no UTF-8 as escapes.
@@ -57,8 +59,9 @@ def noting_interrupts(text: str) -> Iterator[None]:
     """An interrupt inside says ``text`` when it is told."""
     try:
         yield
-    except KeyboardInterrupt as error:
-        add_note(error, text)
+    except BaseException as error:
+        if isinstance(error, KeyboardInterrupt) or came():
+            add_note(error, text)
         raise
 
 

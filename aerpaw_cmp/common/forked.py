@@ -20,6 +20,8 @@ from contextlib import contextmanager, suppress
 from multiprocessing.connection import Connection, wait
 from typing import Any, Generic, TypeVar
 
+from .interrupts import held
+
 _Item = TypeVar("_Item")
 
 MOST = 4
@@ -124,7 +126,8 @@ class _Shared(Generic[_Item]):
                 here, there = context.Pipe(duplex=False)
                 child = context.Process(target=_work, args=(calls, tickets, there, os.getpid()), daemon=True)
                 try:
-                    child.start()
+                    with held():  # what runs around a fork swallows an interrupt
+                        child.start()
                 except OSError:  # no process or memory left: those that run, or this one, do it all
                     here.close()
                     break

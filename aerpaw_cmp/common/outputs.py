@@ -36,6 +36,7 @@ from typing import Any, BinaryIO
 
 from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
+from .interrupts import came, held, look
 
 SUMS = "SHA256SUMS"
 """The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it."""
@@ -213,23 +214,26 @@ class OutputFile:
                 os.fsync(stream.fileno())
             self._refuse()  # what came there meanwhile is not replaced either
             place.refuse_gone()
-            place.part.rename(self.target)
-            place.leave()  # HDF5 opens no file that somebody locks
-            self._place = None
-            _sync_folder(self.target.parent)
+            look()
+            with held():
+                place.part.rename(self.target)
+                place.leave()  # HDF5 opens no file that somebody locks
+                self._place = None
+                _sync_folder(self.target.parent)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         if self._place is not None:
-            self._place.leave()
-            self._place = None
-            _say_kept(error, self.named)
+            with held():
+                self._place.leave()
+                self._place = None
+                _say_kept(error, self.named)
 
 
 def _say_kept(error: BaseException | None, named: Path) -> None:
     """Add to an interrupt what stands at the output's name."""
-    if isinstance(error, KeyboardInterrupt):
+    if isinstance(error, KeyboardInterrupt) or (error is not None and came()):
         there = os.path.lexists(named)
         add_note(error, f"{one_line(str(named))} {'is as it was before' if there else 'was not written'}")
 
@@ -369,8 +373,10 @@ class OutputFolder:
         with explained_os_errors(self.named):
             yield place.part
             place.refuse_gone()
-            self._commit(place)
-            self._written = True
+            look()
+            with held():
+                self._commit(place)
+                self._written = True
         self._made = []
 
     def _commit(self, place: _Place) -> None:
@@ -423,12 +429,13 @@ class OutputFolder:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._place is not None:
-            self._place.leave()
-            self._place = None
-        _remove_folders(self._made)
-        if not self._written:
-            _say_kept(error, self.named)
+        with held():
+            if self._place is not None:
+                self._place.leave()
+                self._place = None
+            _remove_folders(self._made)
+            if not self._written:
+                _say_kept(error, self.named)
 
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
@@ -562,7 +569,8 @@ class OutputSet:
         }
         text = json.dumps({**listing, "files": {**others, **digests}}, indent=1) + "\n"
         everything = {**contents, self._listing: text.encode("utf-8")}
-        with explained_os_errors(self.named):
+        look()
+        with explained_os_errors(self.named), held():
             try:
                 for name, content in everything.items():
                     _write_synced(self._new(name), content)
@@ -619,12 +627,13 @@ class OutputSet:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        if self._place is not None:
-            self._place.leave()
-            self._place = None
-        _remove_folders(self._made)
-        if not self._written:
-            _say_kept(error, self.named)
+        with held():
+            if self._place is not None:
+                self._place.leave()
+                self._place = None
+            _remove_folders(self._made)
+            if not self._written:
+                _say_kept(error, self.named)
 
 
 def _listed(listing: Path) -> dict[str, str]:

@@ -10,6 +10,8 @@ from dataclasses import dataclass, field
 from functools import cache
 from typing import Protocol
 
+from .interrupts import look
+
 
 class Progress(Protocol):
     """Takes what is being done and, where it is known, the share of it that is done (0 to 1).
@@ -71,7 +73,8 @@ class Stages:
 
     @contextmanager
     def __call__(self, name: str) -> Iterator[None]:
-        """Time one stage; one that comes again is not announced again."""
+        """Time one stage; one that comes again is not announced again. A swallowed interrupt is raised first."""
+        look()
         if name not in self.seconds:
             self.progress(name)
         start = time.perf_counter()

@@ -1,0 +1,149 @@
+"""Interrupts that Python swallows or wraps are raised again; held ones come at the end, once."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+
+import pytest
+
+from aerpaw_cmp import __main__
+from aerpaw_cmp.common import interrupts
+from aerpaw_cmp.common.errors import InputError, add_note
+from aerpaw_cmp.common.outputs import OutputFile, OutputFolder
+from aerpaw_cmp.common.stages import Stages
+
+
+@pytest.fixture(autouse=True)
+def _default_handler():
+    """A run in the background ignores interrupts, and so would the tests."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before)
+
+
+def interrupt() -> None:
+    os.kill(os.getpid(), signal.SIGINT)
+
+
+class Finalised:
+    """Where Python prints "Exception ignored in" and goes on."""
+
+    def __del__(self) -> None:
+        interrupt()
+
+
+def swallowed() -> None:
+    Finalised()
+
+
+def test_a_swallowed_interrupt_ends_the_job_before_its_next_stage():
+    reached, before = [], sys.unraisablehook
+
+    def job() -> None:
+        with Stages()("one"):
+            swallowed()
+            reached.append("one")
+        with Stages()("two"):
+            reached.append("two")
+
+    with pytest.raises(KeyboardInterrupt), interrupts.noted():
+        job()
+    assert reached == ["one"]
+    with Stages()("a later job"):  # is not ended by it
+        assert not interrupts.came()
+    assert sys.unraisablehook is before
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_a_swallowed_interrupt_leaves_the_old_output_and_says_so(tmp_path, kind):
+    name = tmp_path / "out"
+
+    def job() -> None:
+        if kind == "file":
+            with OutputFile(name, own=lambda _: True) as output:
+                swallowed()
+                output.write(b"new")
+        else:
+            with OutputFolder(name, job="report") as output, output.filling() as folder:
+                (folder / "a.txt").write_text("new")
+                swallowed()
+
+    with pytest.raises(KeyboardInterrupt) as caught, interrupts.noted():
+        job()
+    assert caught.value.__notes__ == [f"{name} was not written"]
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("wrapped", [RuntimeError("Error calling __set_name__"), InputError("a cut pipe")])
+def test_an_interrupt_that_became_another_error_is_told_as_one(wrapped, monkeypatch, capsys):
+    def job(_arguments: list[str]) -> int:
+        try:
+            interrupt()
+            raise AssertionError("not interrupted")
+        except KeyboardInterrupt:
+            add_note(wrapped, "out is as it was before")
+            raise wrapped from None
+
+    monkeypatch.setattr(__main__, "_run", job)
+    assert __main__.main(["ingest"]) == 130
+    assert capsys.readouterr().err == "aerpaw-cmp: interrupted; out is as it was before\n"
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_without_an_interrupt_an_error_stays_what_it_is():
+    with pytest.raises(RuntimeError), interrupts.noted():
+        raise RuntimeError
+
+
+def test_held_interrupts_come_once_and_at_the_end():
+    done = []
+
+    def block() -> None:
+        interrupt()
+        interrupt()
+        done.append("the whole block")
+
+    with pytest.raises(KeyboardInterrupt), interrupts.held():
+        block()
+    assert done == ["the whole block"]
+    assert signal.getsignal(signal.SIGINT) is signal.default_int_handler
+
+
+def test_an_error_inside_goes_before_a_held_interrupt():
+    def block() -> None:
+        interrupt()
+        raise ValueError("first")
+
+    with pytest.raises(ValueError, match="first"), interrupts.held():
+        block()
+
+
+def test_a_process_that_ignores_interrupts_goes_on_ignoring_them():
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    with interrupts.noted(), interrupts.held():
+        interrupt()
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    assert not interrupts.came()
+
+
+@pytest.mark.parametrize("at", ["before", "after_in_parent"])
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="work is shared by forked processes on Linux only")
+def test_an_interrupt_around_a_fork_is_raised(at):
+    script = f"""
+import os, signal
+from aerpaw_cmp.common import interrupts
+from aerpaw_cmp.common.forked import in_order
+signal.signal(signal.SIGINT, signal.default_int_handler)
+os.register_at_fork({at}=lambda: os.kill(os.getpid(), signal.SIGINT))
+try:
+    with interrupts.noted():
+        list(in_order([lambda: 1, lambda: 2], processes=2))
+    print("lost")
+except KeyboardInterrupt:
+    print("interrupted")
+"""
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
+    assert (done.stdout, done.stderr) == ("interrupted\n", "")

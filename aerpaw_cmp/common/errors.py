@@ -19,8 +19,6 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from .interrupts import came
-
 
 def one_line(text: str) -> str:
     r"""Text for one line of a message: line breaks, control characters and bytes that are no UTF-8 as escapes.
@@ -59,9 +57,8 @@ def noting_interrupts(text: str) -> Iterator[None]:
     """An interrupt inside says ``text`` when it is told."""
     try:
         yield
-    except BaseException as error:
-        if isinstance(error, KeyboardInterrupt) or came():
-            add_note(error, text)
+    except KeyboardInterrupt as error:
+        add_note(error, text)
         raise
 
 

@@ -11,7 +11,10 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import OutputError
+from .errors import InputError, OutputError
+
+LARGEST_TABLE = 64 << 20
+"""Of small files that are read whole: antenna patterns, receivers, the numbers of a report [bytes]."""
 
 
 @contextlib.contextmanager
@@ -59,6 +62,43 @@ def _clear_old_parts(folder: Path, prefix: str) -> None:
         with contextlib.suppress(OSError):
             if time.time() - part.stat().st_mtime > 3600:
                 part.unlink()
+
+
+def read_bounded(path: Path, most: int, expected: str = "a file") -> bytes:
+    """Content of a file, or of a pipe, never more than ``most`` bytes: a device, or a log named by mistake, has no end.
+
+    Parameters
+    ----------
+    path : Path
+    most : int
+    expected : str
+        What the file should be, for the message.
+
+    Returns
+    -------
+    bytes
+
+    Raises
+    ------
+    InputError
+        If it holds more.
+    OSError
+        If it cannot be read.
+    """
+    with path.open("rb") as file:
+        size = os.fstat(file.fileno()).st_size
+        chunks: list[bytes] = []
+        held = 0
+        while size <= most and held <= most and (chunk := file.read(_CHUNK)):
+            chunks.append(chunk)
+            held += len(chunk)
+    if max(size, held) > most:
+        found = f"the file has {size} bytes" if size > most else f"it has more than {most} bytes"
+        raise InputError(found, expected=f"{expected} of at most {most} bytes", path=path)
+    return b"".join(chunks)
+
+
+_CHUNK = 1 << 20
 
 
 def seal(content: bytes, mark: bytes) -> bytes:

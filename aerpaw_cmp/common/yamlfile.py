@@ -23,7 +23,8 @@ from typing import Any, TypeVar
 import pydantic
 import yaml
 
-from .errors import UsageError
+from .errors import InputError, UsageError
+from .files import read_bounded
 
 MAX_BYTES = 32 * 1024 * 1024
 """Larger files are refused unread; a site with 100 000 single trees has about 6 MB."""
@@ -154,12 +155,11 @@ def _checked(document: _Document, model: type[ModelT], path: str | Path | None) 
 
 def _read_text(path: Path) -> str:
     try:
-        size = path.stat().st_size
         if path.is_dir():
             raise UsageError("a folder was named", expected="a YAML file", path=path)
-        if size > MAX_BYTES:
-            raise UsageError(f"the file has {size} bytes", expected=f"at most {MAX_BYTES}", path=path)
-        data = path.read_bytes()
+        data = read_bounded(path, MAX_BYTES, "a YAML file")
+    except InputError as error:
+        raise UsageError(error.found, expected=error.expected, path=path) from None
     except FileNotFoundError:
         raise UsageError("no such file", path=path) from None
     except OSError as error:

@@ -18,6 +18,7 @@ import numpy as np
 from pydantic import Field
 
 from ..common.errors import InputError, UsageError
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.units import FloatArray, IntArray
 from ..compare.forecast import ForecastScore, constant_forecast, score_forecast
 from ..compare.receiver import (
@@ -180,7 +181,7 @@ def read_receiver(path: Path) -> dict[str, FittedReceiver]:
         If it is no such file.
     """
     try:
-        content = json.loads(path.read_text(encoding="utf-8"))
+        content = json.loads(read_bounded(path, LARGEST_TABLE, "a receiver file"))
         if content["format"] != FORMAT:
             raise ValueError(f"format {content['format']!r}")
         return {tower: FittedReceiver.from_dict(tower, one) for tower, one in content["towers"].items()}

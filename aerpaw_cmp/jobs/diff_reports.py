@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError, UsageError, one_line
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
 from ..common.units import FloatArray
 from ..compare.report_difference import (
@@ -125,7 +126,7 @@ def read_report(place: Path) -> ReadReport:
 
 def _metrics(file: Path, named: Path) -> dict[str, Any]:
     try:
-        content = json.loads(file.read_text(encoding="utf-8"))
+        content = json.loads(read_bounded(file, LARGEST_TABLE, "metrics.json"))
     except FileNotFoundError:
         other = next((n for n in ("campaign.json", "diff.json") if (named / n).is_file()), None)
         raise InputError(

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError, UsageError
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..report.data import InputFile, ReportData
 
 METRICS = "metrics.json"
@@ -172,7 +173,7 @@ def _metrics_of(folder: Path) -> dict[str, Any]:
             "no report there", expected=f"a folder with {METRICS}", cause="run 'aerpaw-cmp report' first", path=folder
         )
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
+        found = json.loads(read_bounded(path, LARGEST_TABLE, METRICS))
         made, inputs = found["made_from"], found["inputs"]
         whole = {"flight", "logs_root", "engine", "figures", "style", "export"} <= set(made) and isinstance(
             inputs, list

@@ -12,6 +12,8 @@ from urllib.parse import quote
 
 import numpy as np
 
+from ..common.errors import InputError
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.units import FloatArray
 from ..compare.season import (
     error_at_offset,
@@ -254,7 +256,7 @@ def find_reports(flights: Iterable[str], folder: Path, beside: Sequence[Path]) -
 
 def _flight_of(path: Path) -> str | None:
     try:
-        name = json.loads(path.read_text(encoding="utf-8")).get("flight")
-    except (OSError, ValueError, AttributeError):
+        name = json.loads(read_bounded(path, LARGEST_TABLE)).get("flight")
+    except (InputError, OSError, ValueError, AttributeError):
         return None
     return name if isinstance(name, str) else None

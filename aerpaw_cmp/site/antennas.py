@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import InputError, UsageError
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.units import AnyArray, ComplexArray, FloatArray, amplitude_from_db, db_from_power, power_from_db
 from ..logs.matfile import read_arrays
 
@@ -285,7 +286,7 @@ _FREQUENCY = re.compile(
 
 def _read_rows(path: Path) -> _Rows:
     try:
-        text = path.read_bytes().decode("utf-8-sig")
+        text = read_bounded(path, LARGEST_TABLE, "an antenna pattern file").decode("utf-8-sig")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     except UnicodeDecodeError:
@@ -509,7 +510,7 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
     """
     path = Path(path)
     try:
-        content = read_arrays(path.read_bytes(), None)
+        content = read_arrays(read_bounded(path, LARGEST_TABLE, "a file of gain grids"), None)
     except OSError as error:
         raise InputError(f"the file cannot be read ({error.strerror or error})", path=path) from None
     except InputError as error:

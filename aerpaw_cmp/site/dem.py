@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.errors import InputError, UsageError
+from ..common.files import read_bounded
 from ..common.geodesy import SiteFrame
 from ..common.units import BoolArray, FloatArray
 
@@ -194,7 +195,7 @@ def read_dem(path: str | Path, frame: SiteFrame, *, crs: str | None = None) -> D
 
 def _read_ascii(path: Path, frame: SiteFrame, crs: str) -> Dem:
     try:
-        lines = path.read_bytes().decode("utf-8-sig").splitlines()
+        lines = read_bounded(path, MAX_BYTES).decode("utf-8-sig").splitlines()
     except UnicodeDecodeError:
         raise InputError("not text", expected="an ESRI ASCII grid", path=path) from None
     header, begin = _ascii_header(lines, path)

@@ -21,6 +21,7 @@ from xml.etree import ElementTree
 from xml.parsers import expat
 
 from ..common.errors import InputError
+from ..common.files import read_bounded
 from .osmfiles import read_elements
 from .outlines import BROKEN_ELEMENT, MapFile, Outline, Position, TreeLine, left_out, lonlat
 
@@ -52,9 +53,7 @@ def read_map_file(path: str | Path) -> MapFile:
     """
     path = Path(path)
     try:
-        if path.stat().st_size > MAX_BYTES:
-            raise InputError(f"the file has {path.stat().st_size} bytes", expected=f"at most {MAX_BYTES}", path=path)
-        data = path.read_bytes()
+        data = read_bounded(path, MAX_BYTES, "a map file")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror})", path=path) from None
     if data.startswith(b"PK\x03\x04"):

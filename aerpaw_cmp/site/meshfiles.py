@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from ..common.errors import InputError
+from ..common.files import read_bounded
 from ..common.units import FloatArray, IntArray
 
 LARGEST_HEADER = 65_536
@@ -56,9 +57,7 @@ def read_mesh(path: Path) -> tuple[RawMesh, bytes]:
         No such file, too large, or damaged.
     """
     try:
-        if path.stat().st_size > LARGEST_FILE:
-            raise InputError(f"{path.stat().st_size} bytes", expected=f"a mesh of at most {LARGEST_FILE}", path=path)
-        data = path.read_bytes()
+        data = read_bounded(path, LARGEST_FILE, "a mesh")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
     mesh = read_obj(data, path) if path.suffix.lower() == ".obj" else read_ply(data, path)

@@ -17,6 +17,7 @@ from xml.etree import ElementTree
 import numpy as np
 
 from ..common.errors import InputError, UsageError
+from ..common.files import read_bounded
 from ..common.units import FloatArray, IntArray
 from .materials import material, stated_name
 from .meshfiles import RawMesh, read_mesh
@@ -140,9 +141,7 @@ def _gathered(reading: _Reading, notes: list[str]) -> TriangleScene:
 
 def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
     try:
-        if path.stat().st_size > LARGEST_XML:
-            raise InputError(f"{path.stat().st_size} bytes", expected=f"a scene of at most {LARGEST_XML}", path=path)
-        data = path.read_bytes()
+        data = read_bounded(path, LARGEST_XML, "a scene")
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", path=path) from None
     # entities are how XML explodes or reads other files; UTF-16 would hide them from this look

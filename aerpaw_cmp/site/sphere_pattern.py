@@ -11,6 +11,7 @@ import numpy as np
 
 from ..common.cf import CONVENTIONS, DB
 from ..common.errors import InputError
+from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
 
@@ -139,7 +140,7 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     """
     path = Path(path)
     try:
-        text = path.read_text(encoding="utf-8-sig")
+        text = read_bounded(path, LARGEST_TABLE, "an antenna file").decode("utf-8-sig")
     except (OSError, UnicodeDecodeError) as error:
         raise InputError(
             f"cannot be read ({error})", expected="a text file of gain over direction", path=path

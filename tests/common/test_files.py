@@ -7,7 +7,8 @@ from pathlib import Path
 
 import pytest
 
-from aerpaw_cmp.common.files import atomic_path
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.common.files import atomic_path, read_bounded
 
 
 @pytest.mark.parametrize("durable", [False, True])
@@ -60,3 +61,98 @@ def test_what_a_killed_run_left_is_removed_after_an_hour(tmp_path: Path) -> None
     with atomic_path(tmp_path / "a") as part:
         part.write_text("whole")
     assert {p.name for p in tmp_path.iterdir()} == {"a", new.name, other.name}
+
+
+def _yaml(path):
+    from aerpaw_cmp.flight.settings import load_flight
+
+    return load_flight(path)
+
+
+def _map(path):
+    from aerpaw_cmp.site.mapfiles import read_map_file
+
+    return read_map_file(path)
+
+
+def _scene(path):
+    from aerpaw_cmp.site.mitsuba import _root
+
+    return _root(path)
+
+
+def _mesh(path):
+    from aerpaw_cmp.site.meshfiles import read_mesh
+
+    return read_mesh(path)
+
+
+def _elevation(path):
+    from aerpaw_cmp.common.geodesy import SiteFrame
+    from aerpaw_cmp.site.dem import read_dem
+
+    return read_dem(path, SiteFrame(35.7, -78.7), crs="EPSG:4326")
+
+
+def _pattern(path):
+    from aerpaw_cmp.site.antennas import read_pattern_text
+
+    return read_pattern_text(path)
+
+
+def _sphere(path):
+    from aerpaw_cmp.site.sphere_pattern import read_sphere_csv
+
+    return read_sphere_csv(path)
+
+
+def _gain_grids(path):
+    from aerpaw_cmp.site.antennas import read_gain_grid
+
+    return read_gain_grid(path, "rad_pat")
+
+
+def _numbers_of_a_report(path):
+    from aerpaw_cmp.jobs.diff_reports import _metrics
+
+    return _metrics(path, path)
+
+
+def _receiver(path):
+    from aerpaw_cmp.jobs.calibrate_rank import read_receiver
+
+    return read_receiver(path)
+
+
+READERS_OF_WHOLE_FILES = (
+    _yaml, _map, _scene, _mesh, _elevation, _pattern, _sphere, _gain_grids, _numbers_of_a_report, _receiver,
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("read", READERS_OF_WHOLE_FILES)
+def test_a_file_that_is_far_too_large_is_not_read(read, tmp_path):
+    """A log named by mistake may be larger than the memory."""
+    path = tmp_path / "large"
+    with path.open("wb") as file:
+        file.truncate(1 << 40)  # a hole: takes no room
+    with pytest.raises((InputError, UsageError), match=f"the file has {1 << 40} bytes.*at most"):
+        read(path)
+
+
+@pytest.mark.skipif(not Path("/dev/zero").exists(), reason="needs a device without an end")
+@pytest.mark.parametrize("read", [_yaml, _pattern, _receiver])
+def test_a_device_without_an_end_is_read_to_the_limit_only(read):
+    with pytest.raises((InputError, UsageError), match=r"it has more than \d+ bytes; expected .* at most"):
+        read(Path("/dev/zero"))
+
+
+@pytest.mark.parametrize("size", [0, 1, (1 << 20) - 1, 1 << 20, (1 << 20) + 1])
+def test_a_bounded_file_is_read_to_the_last_byte(size, tmp_path):
+    content = bytes(i % 251 for i in range(size))
+    (tmp_path / "a").write_bytes(content)
+    assert read_bounded(tmp_path / "a", size) == content
+    if size:
+        with pytest.raises(
+            InputError, match=f"the file has {size} bytes; expected a table of at most {size - 1} bytes"
+        ):
+            read_bounded(tmp_path / "a", size - 1, "a table")

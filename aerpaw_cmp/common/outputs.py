@@ -253,10 +253,31 @@ def _ask(own: Callable[[Path], bool], path: Path) -> bool:
         return False
 
 
+class _SeveralFiles:
+    """How outputs of several files end: what is unfinished goes, and an interrupt says what stands."""
+
+    named: Path
+    _place: _Place | None
+    _made: list[Path]
+    """Parents made for this run, removed again where it fails."""
+    _written: bool
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        with held():
+            if self._place is not None:
+                self._place.leave()
+                self._place = None
+            _remove_folders(self._made)
+            if not self._written:
+                _say_kept(error, self.named)
+
+
 # --- a folder -------------------------------------------------------------------------------------
 
 
-class OutputFolder:
+class OutputFolder(_SeveralFiles):
     """A folder of results, replaced as a whole; a context around the whole command.
 
     Parameters
@@ -293,7 +314,6 @@ class OutputFolder:
         self._job, self._inputs, self._force = job, tuple(inputs), force
         self._place: _Place | None = None
         self._made: list[Path] = []
-        """Parents made for this run, removed again where it fails."""
         self._written = False
 
     def __enter__(self) -> OutputFolder:
@@ -426,17 +446,6 @@ class OutputFolder:
                 )
         return forced
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with held():
-            if self._place is not None:
-                self._place.leave()
-                self._place = None
-            _remove_folders(self._made)
-            if not self._written:
-                _say_kept(error, self.named)
-
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
     """Make a folder and its parents; ``made`` gets those that were not there."""
@@ -468,7 +477,7 @@ def _link(file: Path, name: Path) -> None:
 # --- several files beside files of others -----------------------------------------------------------
 
 
-class OutputSet:
+class OutputSet(_SeveralFiles):
     """Files in a folder that is not the tool's alone, with a list that names them; a context around the command.
 
     Parameters
@@ -623,17 +632,6 @@ class OutputSet:
                     _sync_folder((self.folder / name).parent)
         self._journal.unlink()
         _sync_folder(self.folder)
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        with held():
-            if self._place is not None:
-                self._place.leave()
-                self._place = None
-            _remove_folders(self._made)
-            if not self._written:
-                _say_kept(error, self.named)
 
 
 def _listed(listing: Path) -> dict[str, str]:

@@ -22,7 +22,8 @@ SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
 WHOLE = re.compile(rb"\s*\{.*\}\s*,?\s*$")
 """A line that is an object of its own: between two of them a large file may be cut."""
 _MOST_LINES = 5000
-_MOST_TRIES = 20
+_MOST_TRIED = 64 << 20
+"""Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time."""
 
 
 @dataclass
@@ -57,7 +58,7 @@ def objects(lines: _lines.Lines) -> Objects:
     rejected: list[RejectedLine] = []
     more: list[int] = []
     ends: dict[bytes, list[int]] | None = None
-    tries = 0
+    tried = 0
     for i in np.flatnonzero(~lines.blank).tolist():
         if more and i <= more[-1]:
             continue
@@ -65,12 +66,14 @@ def objects(lines: _lines.Lines) -> Objects:
         if text in (b"[", b"]"):
             continue
         one = _loaded(text)
-        if one is None and text.startswith(b"{") and tries < _MOST_TRIES:
+        if one is None and tried < _MOST_TRIED and _goes_on(text):
             ends = _ends(lines) if ends is None else ends
             last = _end_of(lines, i, ends)
-            one = None if last < 0 else _loaded(_bare(lines.data[lines.starts[i] : lines.ends[last]]))
-            more += range(i + 1, last + 1) if isinstance(one, dict) else ()
-            tries += not isinstance(one, dict)
+            if last >= 0:
+                several = _bare(lines.data[lines.starts[i] : lines.ends[last]])
+                one = _loaded(several)
+                more += range(i + 1, last + 1) if isinstance(one, dict) else ()
+                tried += 0 if isinstance(one, dict) else len(several)
         if isinstance(one, dict):
             rows.append(i)
             found.append(one)
@@ -81,6 +84,19 @@ def objects(lines: _lines.Lines) -> Objects:
 
 def _bare(text: bytes) -> bytes:
     return text.strip().lstrip(b"\xef\xbb\xbf").rstrip(b",")
+
+
+def _goes_on(text: bytes) -> bool:
+    """Whether a line begins an object and nothing in it is wrong: what lacks may stand on the next lines."""
+    if not text.startswith(b"{"):
+        return False
+    try:
+        json.loads(text)
+    except json.JSONDecodeError as error:
+        return error.pos >= len(error.doc)
+    except (ValueError, RecursionError):
+        return False
+    return False
 
 
 def _loaded(text: bytes) -> Any:

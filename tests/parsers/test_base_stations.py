@@ -14,6 +14,7 @@ from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_parsers import _json, _lines
 from tests.parsers import samples
 
 PLAIN = ReadOptions(timezone="America/New_York")
@@ -163,3 +164,13 @@ def test_a_rank_that_is_none_in_a_tap_export_is_missing_and_flagged(rank: str) -
     (frame,) = (s.frame for s in read("own_csv", data).streams if s.kind == "rank")
     assert np.isnan(frame["rank"].to_numpy()).all()
     assert list(frame["flag"]) == ["ri_out_of_range"]
+
+
+def test_objects_over_several_lines_are_read_behind_any_number_of_damaged_ones():
+    damaged = b'{"timestamp": 1740927600.25, "cells": ~}\n'
+    good = json.dumps({"timestamp": 1740927601.25, "ue_list": []}, indent=2).encode() + b"\n"
+    lines = _lines.split(40 * damaged + good)
+    found = _json.objects(lines)
+    assert [one["timestamp"] for one in found.found] == [1740927601.25]
+    assert len(found.rejected) == 40
+    assert found.row.tolist() == [40]

@@ -156,6 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
         with interrupts.noted():
             return _run(arguments)
     except KeyboardInterrupt as interrupt:
+        exec("")  # CPython remembers an interrupt that left an exec(), and would end by the signal in place of 130
         print("; ".join(["aerpaw-cmp: interrupted", *_notes(interrupt)]), file=sys.stderr)
         return INTERRUPTED
     except BrokenPipeError:

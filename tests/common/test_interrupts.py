@@ -147,3 +147,17 @@ except KeyboardInterrupt:
 """
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
     assert (done.stdout, done.stderr) == ("interrupted\n", "")
+
+
+def test_an_interrupt_that_met_an_exec_ends_with_its_exit_code(tmp_path):
+    """dataclasses and namedtuples are made by exec(); run by ``-m``, the interpreter would end by the signal."""
+    (tmp_path / "program.py").write_text(
+        "import sys\n"
+        "from aerpaw_cmp import __main__ as program\n"
+        "program._run = lambda _: exec('raise KeyboardInterrupt')\n"
+        "sys.exit(program.main(['ingest']))\n"
+    )
+    paths = os.pathsep.join([str(tmp_path), *sys.path])
+    command = [sys.executable, "-m", "program"]
+    done = subprocess.run(command, env={**os.environ, "PYTHONPATH": paths}, check=False, timeout=60)
+    assert done.returncode == 130

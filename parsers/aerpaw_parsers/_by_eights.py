@@ -114,7 +114,7 @@ def _column(room: AnyArray, begin: IntArray, end: IntArray) -> tuple[FloatArray,
     size = end - begin
     lead = room[begin]
     minus = empty = None
-    if lead.min() < 46:  # a sign, or what stands behind an empty cell
+    if lead.min() < 46 or not size.all():  # a sign, or an empty cell: any separator stands behind it
         minus, empty = lead == 45, size == 0
         signed = minus | (lead == 43)
         size -= signed

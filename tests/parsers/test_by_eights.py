@@ -88,3 +88,14 @@ def test_short_texts_and_decimal_commas() -> None:
 def test_what_is_no_decimal_is_odd_alone_and_among_others(cell: bytes) -> None:
     for others in ([], [cell], [b"1.5"], [b"12", b""], [b"123456789.25"], [b"35.72959158368319"]):
         assert check([cell, *others]) == 0
+
+
+@pytest.mark.parametrize("separator", [b",", b";", b"\t", b"|"])
+@pytest.mark.parametrize("number", [b"7", b"12.5", b"123456.25", b"35.72959158368319"])
+def test_an_empty_cell_is_no_zero_whatever_separates_it(separator: bytes, number: bytes) -> None:
+    """Alone among positive numbers: nothing but the separator behind it tells."""
+    text = b"head;x;y\n1,%s,2\n2,,3\n3,%s,4\n" % (number, number)
+    lines, found = _by_eights.table(text.replace(b",", separator).replace(b";", separator), 3, separator[0])
+    made = _by_eights.decimals(lines, found.take(found.rows > 0), [1], comma=separator != b",")
+    np.testing.assert_array_equal(made.value[0], [float(number), np.nan, float(number)])
+    assert not made.odd[0].any()

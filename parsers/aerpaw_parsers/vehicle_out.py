@@ -17,7 +17,10 @@ Writers: AERPAW/aerpawlib ``examples/v1/{gps_logger,preplanned_trajectory,guided
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
+from functools import partial
+from itertools import chain
 
 import numpy as np
 
@@ -52,8 +55,11 @@ _END = rb"[ ,\t]{0,8}\r?$"
 _MORE = rb"(?:,[^,\n]{0,80})"
 _ROW = re.compile(_FIELDS + _END, re.MULTILINE)
 _LONGER = re.compile(_FIELDS + _MORE + rb"{1,6}" + _END, re.MULTILINE)
-"""A logger that writes further fields behind these: only where most rows have them, as glued rows look so too."""
-_EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END)
+"""A logger that writes further fields behind these: only where most first rows have them: glued rows look so too."""
+_EITHER = re.compile(_FIELDS + _MORE + rb"{0,6}" + _END, re.MULTILINE)
+_HEAD_BYTES = 16_384
+"""What :func:`_lines.mostly` looks at."""
+_TENS = 10.0 ** np.arange(1, 13)
 _GROUPS = 20
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
 
@@ -61,6 +67,11 @@ _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while t
 def sniff(head: bytes) -> bool:
     """Whether most of the first lines are telemetry rows."""
     return _lines.mostly(head, _ROW) or _lines.mostly(head, _LONGER)
+
+
+def _form(head: bytes) -> re.Pattern[bytes]:
+    """What a row of the log looks like: its beginning says so for all of it."""
+    return _EITHER if _lines.mostly(head, _LONGER) and not _lines.mostly(head, _ROW) else _ROW
 
 
 _TITLE = re.compile(rb"(?i)(?:\xef\xbb\xbf)?\s*[\"']?(?:num|number|line_?num|index|id|no\.?)[\"']?\s*,.*lon.*")
@@ -106,10 +117,9 @@ class _Rows:
 _NUMBERS = ("index", "lon", "lat", "alt", "pitch", "yaw", "roll", "north", "east", "down", "fix", "satellites")
 
 
-def _by_pattern(lines: _lines.Lines, done: IntArray) -> _Rows:
+def _by_pattern(lines: _lines.Lines, form: re.Pattern[bytes], done: IntArray) -> _Rows:
     """Rows of every layout, one by one and strictly: what the fast way left."""
-    longer = not len(done) and not _lines.mostly(lines.data, _ROW) and _lines.mostly(lines.data, _LONGER)
-    rows, groups = _lines.match_rest(lines, _LONGER if longer else _ROW, done)
+    rows, groups = _lines.match_rest(lines, form, done)
     column = _lines.columns(groups, _GROUPS)
     value = {i: _lines.numbers(column[i]) for i in (*range(10), 11, 12, 13, 18, 19)}
     # groups 4-6 hold the angles of the 10-field layout, 11-13 those of the 11-field one
@@ -135,15 +145,16 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         if count == 14 and not _tuples_in_place(lines, found):
             return nothing
         wanted = [i for i in range(count) if i != time]
-        value = _table.numbers(lines, found.rows, count, wanted, strip=b'"()', also=b" :T/")
+        marks = b'"()' if count == 14 else b""
+        value = _table.numbers(lines, found.rows, count, wanted, strip=marks, also=b" :T/")
         if value is None:
             return nothing
         unknown = np.full(len(found.rows), np.nan)
         middle = value[4:10] if count == 14 else [unknown] * 6
         number = np.stack([*value[:4], *middle, *value[-2:]])
         wall, keep = _time.parse_digits(_table.cells_at(lines, found.start(time), 26), 6)
-        for whole, most in ((number[0], 1e12), (number[10], 1000.0), (number[11], 1000.0)):
-            keep &= (whole == np.floor(whole)) & (np.abs(whole) < most)
+        for column, whole, most in ((0, number[0], 1e12), (-2, number[10], 1000.0), (-1, number[11], 1000.0)):
+            keep &= (whole == np.floor(whole)) & (np.abs(whole) < most) & _digits_only(lines, found, column, whole)
         keep &= ~np.isnan(number[1:10] if count == 14 else number[1:4]).any(axis=0)
         rows = found.rows
         if not keep.all():
@@ -151,6 +162,17 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         zero = np.zeros(len(rows), dtype=np.int64)
         return _Rows(line=rows, number=number, wall=wall, valid=zero == 0, offset_s=zero, zoned=zero > 0)
     return nothing
+
+
+def _digits_only(lines: _lines.Lines, found: _table.Fields, column: int, whole: FloatArray) -> BoolArray:
+    """Cells that are digits behind at most a sign: as many as the whole number has, and no exponent among them."""
+    column %= found.ends.shape[1]
+    end, at = found.ends[:, column], lines.buffer
+    digits = 1 + np.searchsorted(_TENS, np.abs(whole), side="right") + (whole < 0)
+    exponent = np.zeros(len(end), dtype=bool)
+    for place in (2, 3):  # 1e2 is as wide as 100; with an exponent of two digits 1.2345678e11
+        exponent |= (at[end - place] | 32) == 101
+    return np.asarray((found.width(column) == digits) & ~exponent)
 
 
 def _tuples_in_place(lines: _lines.Lines, found: _table.Fields) -> bool:
@@ -173,14 +195,24 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If the times carry no offset and no time zone is given.
     """
-    return _settled(_read(data, options))
+    return _settled(_read(_form(data), data, options))
 
 
-def _read(data: bytes, options: ReadOptions) -> ReadResult:
+def _in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+    begin: list[bytes] = []
+    for piece in chunks:
+        begin.append(piece)
+        if sum(map(len, begin)) > _HEAD_BYTES:
+            break
+    form = _form(b"".join(begin).removeprefix(b"\xef\xbb\xbf"))
+    return blocks.by_lines(partial(_read, form), apart=form, settle=_settled)(chain(begin, chunks), options)
+
+
+def _read(form: re.Pattern[bytes], data: bytes, options: ReadOptions) -> ReadResult:
     """What each row says by itself."""
     lines = _lines.split(data)
     fast = _at_once(lines)
-    rows = fast.join(_by_pattern(lines, fast.line))
+    rows = fast.join(_by_pattern(lines, form, fast.line))
     instants = _time.parsed_to_utc(rows.wall, rows.valid, rows.offset_s, rows.zoned, options, needed_by="vehicleOut")
     keep = np.flatnonzero(rows.valid)
     blank, rejected = _lines.remainder(lines, rows.line, _reason)
@@ -270,5 +302,5 @@ READER = Reader(
     sample='7,-78.6960001,35.7280002,30.1,"(0.01,1.57,-0.02)","(0.0,5.0,0.1)",48.1,2025-01-01 12:00:07.000000,4,18',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, apart=_EITHER, settle=_settled),
+    in_blocks=_in_blocks,
 )

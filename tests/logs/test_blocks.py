@@ -242,3 +242,13 @@ def test_a_head_whose_lines_end_twice_is_cut_at_the_line_feed(monkeypatch: pytes
     data = b"Time,Level\r\r\n" + rows
     chunks = (data[i : i + 100] for i in range(0, len(data), 100))
     same(reader.in_blocks(chunks, options), reader.read(data, options))
+
+
+def test_a_glued_row_before_a_cut_is_read_as_the_log_is() -> None:
+    """Alone it looks like the row of a logger with further fields; what those are like the head of the log says."""
+    rows = [b"%d,-78.69,35.72,79.9,44.2,2022-01-13 14:07:%02d.285580,3,14\n" % (i, i) for i in range(9)]
+    glued = rows[4][:-1] + b",44.3,2022-01-13 14:07:32.286453,3,14\n"
+    for lines in ([*rows[:4], glued, *rows[5:]], [row[:-1] + b",7,x\n" for row in rows], [*rows[:1], *[glued] * 9]):
+        whole = by_name("vehicle_out").read(b"".join(lines), OPTIONS)
+        same(in_two("vehicle_out", lines, OPTIONS), whole)
+        assert whole.accepted == (10 if lines[1] == glued else sum(line != glued for line in lines))

@@ -51,6 +51,13 @@ def test_samples(reader: str, sample: str) -> None:
         ("vehicle_out", "ten_fields", b"35.7300002", b""),
         ("vehicle_out", "nine_fields", b"35.7300002", b"35.73.0002"),
         ("vehicle_out", "nine_fields", b"35.7300002", b"35 7300002"),
+        ("vehicle_out", "nine_fields", b"35.7300002", b"35.7300002("),
+        ("vehicle_out", "eight_fields", b"35.7300002", b'35.73"00002'),
+        *(
+            ("vehicle_out", "ten_fields", b",4,14", b",%s,14" % fix)
+            for fix in (b"-0.0", b"1e2", b"1.5e4", b"+4", b"4.")
+        ),
+        ("vehicle_out", "ten_fields", b"3,-78", b"1.2345678e11,-78"),
         ("nemo_csv", "table", b",4.0,,,", b",NA,,,"),
         ("nemo_csv", "table", b",4.0,,,", b",4.0,--1,,"),
         ("nemo_csv", "table", b"1000.0", b""),

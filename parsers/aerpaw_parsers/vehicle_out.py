@@ -33,11 +33,12 @@ from . import _frames, _lines, _table, _time
 
 _N = rb'"?(' + _lines.NUMBER + rb'|nan|NaN|None)"?'
 _TRIPLE = rb'"?[(\[]' + _N + rb", ?" + _N + rb", ?" + _N + rb'[)\]]"?'
+_UNUSED = rb'"?(' + _lines.NUMBER + rb'|nan|NaN|None|)"?'  # voltage and charge: a row without them is one
 _SEP = rb", ?"
 _BODY = (
-    _SEP.join((_TRIPLE, _TRIPLE, _N)),  # 10 fields
-    _SEP.join((_N, _N, _N, _N)),  # 11 fields
-    _N + rb"(?:" + _SEP + _N + rb")?",  # 8 and 9 fields
+    _SEP.join((_TRIPLE, _TRIPLE, _UNUSED)),  # 10 fields
+    _SEP.join((_N, _N, _N, _UNUSED)),  # 11 fields
+    _UNUSED + rb"(?:" + _SEP + _UNUSED + rb")?",  # 8 and 9 fields
 )
 _FIELDS = _SEP.join(
     (
@@ -142,6 +143,9 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         if 2 * mine.sum() <= len(lines):
             continue
         found = found.take(mine)
+        spaces = int(np.count_nonzero(lines.buffer[found.start(time) + 10] == 32))
+        if _table.bytes_of(lines, found.rows).count(b" ") != spaces:  # a space elsewhere than in the times
+            return nothing
         if count == 14 and not _tuples_in_place(lines, found):
             return nothing
         wanted = [i for i in range(count) if i != time]
@@ -155,7 +159,7 @@ def _at_once(lines: _lines.Lines) -> _Rows:
         wall, keep = _time.parse_digits(_table.cells_at(lines, found.start(time), 26), 6)
         for column, whole, most in ((0, number[0], 1e12), (-2, number[10], 1000.0), (-1, number[11], 1000.0)):
             keep &= (whole == np.floor(whole)) & (np.abs(whole) < most) & _digits_only(lines, found, column, whole)
-        keep &= ~np.isnan(number[1:10] if count == 14 else number[1:4]).any(axis=0)
+        keep &= (number[0] >= 0) & ~np.isnan(number[1:10] if count == 14 else number[1:4]).any(axis=0)
         rows = found.rows
         if not keep.all():
             rows, number, wall = rows[keep], number[:, keep], wall[keep]

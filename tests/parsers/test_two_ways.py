@@ -58,6 +58,8 @@ def test_samples(reader: str, sample: str) -> None:
             for fix in (b"-0.0", b"1e2", b"1.5e4", b"+4", b"4.")
         ),
         ("vehicle_out", "ten_fields", b"3,-78", b"1.2345678e11,-78"),
+        ("vehicle_out", "ten_fields", b"3,-78", b"-3,-78"),
+        ("vehicle_out", "ten_fields", b"48.0", b"48.0 "),
         ("nemo_csv", "table", b",4.0,,,", b",NA,,,"),
         ("nemo_csv", "table", b",4.0,,,", b",4.0,--1,,"),
         ("nemo_csv", "table", b"1000.0", b""),
@@ -71,6 +73,25 @@ def test_what_is_wrong_is_rejected_by_both(reader: str, sample: str, old: bytes,
     fast, slow = by_name(reader).read(data, OPTIONS), by_the_slow_way(reader, data)
     assert fast.accepted == good.accepted - 1
     assert_same(fast, slow)
+
+
+@pytest.mark.parametrize(
+    ("sample", "old", "new"),
+    [("ten_fields", b"48.0", b""), ("nine_fields", b",98,", b",,"), ("eleven_fields", b",48.1,", b",,")],
+)
+def test_a_row_without_voltage_is_one_by_both(sample: str, old: bytes, new: bytes) -> None:
+    data = SAMPLES["vehicle_out"][sample][0]
+    fast, slow = (read(data.replace(old, new, 1)) for read in (by_the_fast_way, by_the_slow_vehicle))
+    assert fast.accepted == by_the_fast_way(data).accepted
+    assert_same(fast, slow)
+
+
+def by_the_fast_way(data: bytes) -> ReadResult:
+    return by_name("vehicle_out").read(data, OPTIONS)
+
+
+def by_the_slow_vehicle(data: bytes) -> ReadResult:
+    return by_the_slow_way("vehicle_out", data)
 
 
 def test_the_fast_way_is_taken() -> None:

@@ -9,7 +9,7 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _rows, _sheet
+from . import _decided, _rows, _sheet
 
 LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
 LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")
@@ -38,6 +38,10 @@ COUNTS = {
 }
 
 
+_MOST = 1e9
+"""No count is so large."""
+
+
 def has_position(names: list[str]) -> bool:
     """Whether plain names hold a latitude and a longitude."""
     from re import fullmatch
@@ -45,16 +49,19 @@ def has_position(names: list[str]) -> bool:
     return all(any(fullmatch(p, name) for p in form[:1] for name in names) for form in (LATITUDE, LONGITUDE))
 
 
-def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str) -> Stream | None:
-    """The telemetry stream of a table; None where it has no position.
+def from_sheet(
+    rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided, *, name: str, source: str
+) -> Stream | None:
+    """The telemetry stream of a table, or of a block of it, as written; None where it has no position.
 
-    Altitudes above sea level are brought to height above the first position; angles are degrees unless the column
-    names radians or no yaw of the log is beyond 2 pi.
+    What the whole table says, :func:`settled` does.
 
     Parameters
     ----------
     rows : Rows
     sheet : Sheet
+    decided : Decided
+        Told what the table has.
     name, source : str
         Of the stream, and where its pose comes from.
     """
@@ -62,18 +69,41 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
     if latitude is None or longitude is None:
         return None
     values: dict[str, AnyArray] = {"latitude_deg": sheet.numbers(latitude), "longitude_deg": sheet.numbers(longitude)}
-    lost = clean(rows, values)
-    values["altitude_m"] = _altitude(rows, sheet, lost)
-    angles = {key: column for key, form in ANGLES.items() if (column := sheet.find(*form)) is not None}
-    values |= _angles(rows, sheet, angles)
+    clean(rows, values)
+    values["altitude_m"] = _altitude(rows, sheet, decided)
+    values |= _angles(sheet, decided)
     for key, form in VELOCITIES.items():
         if (column := sheet.find(*form)) is not None:
             values[key] = sheet.numbers(column)
     for key, form in COUNTS.items():
         if (column := sheet.find(*form)) is not None:
-            values[key] = np.nan_to_num(sheet.numbers(column), nan=-1).astype(np.int64)
-    where = ~lost if lost.any() and not lost.all() else None
-    return rows.stream("telemetry", name, values, where=where, source=source)
+            count = sheet.numbers(column)
+            values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
+    return rows.stream("telemetry", name, values, source=source)
+
+
+def settled(stream: Stream, decided: _decided.Decided) -> tuple[Stream, list[str]]:
+    """A table's telemetry with what only all of it says, and the warnings of that.
+
+    Rows without a position are left out unless all are; altitudes above sea level are brought to height above the
+    first position; angles are degrees unless the column names radians or no yaw of the log is beyond 2 pi.
+    """
+    frame, warnings = stream.frame, []
+    lost = np.isnan(frame["latitude_deg"].to_numpy())
+    if lost.any() and not lost.all():
+        frame = frame[~lost].reset_index(drop=True)
+    altitude = frame["altitude_m"].to_numpy()
+    known = np.flatnonzero(np.isfinite(altitude) & ~np.isnan(frame["latitude_deg"].to_numpy()))
+    zero = float(altitude[known[0]]) if len(known) else 0.0
+    # take-off is where a flight's log begins: what begins within a few metres of zero is relative to it
+    if "above sea level" in decided.marks and abs(zero) >= 10.0:
+        frame["altitude_m"] = altitude - zero
+        warnings.append(_TAKEN_OFF.format(zero))
+    if "a yaw" in decided.marks and "beyond 2 pi" not in decided.marks:
+        for name in ANGLES:
+            frame[name] = np.degrees(frame[name].to_numpy())
+        warnings.append("no yaw is beyond 2 pi: the angles were read as radians")
+    return replace(stream, frame=frame), warnings
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
@@ -111,7 +141,7 @@ def from_takeoff(result: ReadResult) -> ReadResult:
 _TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first position, was taken off"
 
 
-def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: AnyArray) -> FloatArray:
+def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) -> FloatArray:
     column = sheet.find(*ABOVE_TAKEOFF)
     if column is not None:
         return sheet.numbers(column)
@@ -119,19 +149,18 @@ def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: AnyArray) -> FloatArr
     if column is None:
         rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
         return np.full(len(rows), np.nan)
-    altitude = sheet.numbers(column)
-    known = altitude[np.isfinite(altitude) & ~lost]
-    # take-off is where a flight's log begins: what begins within a few metres of zero is relative to it
-    if not len(known) or abs(known[0]) < 10.0:
-        return altitude
-    return above_takeoff(rows, altitude, lost)
+    decided.marks.add("above sea level")
+    return sheet.numbers(column)
 
 
-def _angles(rows: _rows.Rows, sheet: _sheet.Sheet, columns: dict[str, int]) -> dict[str, FloatArray]:
+def _angles(sheet: _sheet.Sheet, decided: _decided.Decided) -> dict[str, FloatArray]:
+    columns = {key: column for key, form in ANGLES.items() if (column := sheet.find(*form)) is not None}
     values = {key: sheet.numbers(column) for key, column in columns.items()}
     named = any(sheet.unit(c) or sheet.plain[c].endswith((" deg", " degrees", " rad")) for c in columns.values())
-    yaw = values.get("yaw_deg")
-    if yaw is None or named or not np.isfinite(yaw).any() or np.nanmax(np.abs(yaw)) > 2 * np.pi:
+    if named or "yaw_deg" not in values:
         return values
-    rows.warnings.append("no yaw is beyond 2 pi: the angles were read as radians")
-    return {key: np.degrees(column) for key, column in values.items()}
+    yaw = np.abs(values["yaw_deg"])
+    decided.marks |= {
+        text for text, known in (("a yaw", np.isfinite(yaw)), ("beyond 2 pi", yaw > 2 * np.pi)) if known.any()
+    }
+    return values

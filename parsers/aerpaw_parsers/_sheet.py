@@ -8,17 +8,17 @@ from __future__ import annotations
 
 import csv
 import re
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 
-from aerpaw_cmp.common.units import FloatArray, IntArray
+from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _lines, _rows, _stamps
+from . import _by_eights, _decided, _lines, _rows, _stamps, _table
 from ._quantities import plain
 
 SEPARATORS = (",", ";", "\t", "|")
@@ -88,7 +88,7 @@ def _number(text: str) -> float:
 
 @dataclass
 class Sheet:
-    """A table: names of its columns, and its rows as text.
+    """A table: names of its columns, and where its cells are.
 
     Parameters
     ----------
@@ -97,27 +97,50 @@ class Sheet:
         Column names as written, and in plain form.
     row : int array, shape (n,)
         0-based lines of the rows.
-    cells : list of list of str
-        One list per row.
+    quick : Fields
+        Cells of the rows that separators alone divide.
+    quick_at : int array
+        Which of the rows these are.
+    slow : list of list of str
+        Cells of all other rows: quoted ones, mostly.
+    slow_at : int array
+        Which of the rows these are.
     blank_rows : int array
         0-based lines of titles and header.
     rejected : list of RejectedLine
     comma : bool
         Is a comma in a number its decimal sign?
+    foot : bool
+        Do words stand below the table?
     """
 
     lines: _lines.Lines
     names: list[str]
     row: IntArray
-    cells: list[list[str]]
+    quick: _table.Fields
+    quick_at: IntArray
+    slow: list[list[str]]
+    slow_at: IntArray
     blank_rows: IntArray
     rejected: list[RejectedLine] = field(default_factory=list)
     comma: bool = False
+    foot: bool = False
+    _silent: dict[int, BoolArray] = field(default_factory=dict)
+
+    def __len__(self) -> int:
+        """Count the rows."""
+        return len(self.row)
 
     @cached_property
     def plain(self) -> list[str]:
         """Names in plain form."""
         return [plain(name) for name in self.names]
+
+    @cached_property
+    def _pointed(self) -> _lines.Lines:
+        """The lines with each comma of a number as a point."""
+        lines = self.lines
+        return _lines.Lines(lines.data.replace(b",", b"."), lines.starts, lines.ends) if self.comma else lines
 
     def find(self, *patterns: str) -> int | None:
         """The first column whose plain name is wholly one of the patterns; earlier patterns are preferred."""
@@ -132,22 +155,94 @@ class Sheet:
         found = _UNIT.search(self.names[column])
         return found[1].strip().lower() if found else ""
 
+    def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
+        """Read the cells of some rows as empty."""
+        for column in columns:
+            self._silent[column] = where
+
+    def keep(self, where: BoolArray) -> None:
+        """Leave the rows out that a mask does not hold."""
+        if where.all():
+            return
+        at = np.cumsum(where) - 1
+        quick, slow = where[self.quick_at], where[self.slow_at]
+        self.quick, self.quick_at = self.quick.take(quick), at[self.quick_at[quick]]
+        self.slow = [cells for cells, kept in zip(self.slow, slow.tolist(), strict=True) if kept]
+        self.slow_at = at[self.slow_at[slow]]
+        self.row = self.row[where]
+        self._silent = {column: mask[where] for column, mask in self._silent.items()}
+
     def texts(self, column: int) -> list[str]:
         """A column as text."""
-        return [cells[column].strip() for cells in self.cells]
+        made = np.full(len(self), "", dtype=object)
+        if column < self.quick.ends.shape[1]:
+            made[self.quick_at] = self._cells(column)
+        made[self.slow_at] = [cells[column].strip() for cells in self.slow]
+        if column in self._silent:
+            made[self._silent[column]] = ""
+        return list(made)
+
+    def _cells(self, column: int) -> list[str]:
+        """Texts of the quick rows."""
+        data, form, text = self.lines.data, _form(column), self._ascii
+        places = zip(self.quick.start(column).tolist(), self.quick.ends[:, column].tolist(), strict=True)
+        if text is not None:
+            return [text[begin:end].strip() for begin, end in places]
+        return [data[begin:end].decode(form, "replace").strip() for begin, end in places]
+
+    @cached_property
+    def _ascii(self) -> str | None:
+        return self.lines.data.decode("ascii") if self.lines.data.isascii() else None
 
     def numbers(self, column: int) -> FloatArray:
         """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN."""
         factor = _FACTORS.get(self.unit(column), 1.0)
-        known: dict[str, float] = {}  # few distinct texts in most columns
-        out = np.empty(len(self.cells))
-        for i, cells in enumerate(self.cells):
-            text = cells[column]
-            value = known.get(text)
-            if value is None:
-                value = known[text] = _number(text.strip())
-            out[i] = value
+        out = np.full(len(self), np.nan)
+        if len(self.quick.rows) and column < self.quick.ends.shape[1]:
+            out[self.quick_at] = self._quick_numbers(column)
+        if self.slow:
+            texts = [cells[column] for cells in self.slow]
+            known = {text: _number(text.strip()) for text in set(texts)}  # few distinct texts in most columns
+            out[self.slow_at] = [known[text] for text in texts]
+        if column in self._silent:
+            out[self._silent[column]] = np.nan
         return out * factor
+
+    def _quick_numbers(self, column: int) -> FloatArray:
+        begin, end, data = self.quick.start(column), self.quick.ends[:, column], self.lines.data
+        begin = begin + ((end > begin) & (self.lines.buffer[np.minimum(begin, len(data) - 1)] == 32))
+        read = _by_eights.decimals(self._pointed, _table.Fields(self.quick.rows, begin, end[:, None]), [0])
+        value, odd = read.value[0], np.flatnonzero(read.odd[0])
+        known: dict[bytes, float] = {}
+        for i, first, last in zip(odd.tolist(), begin[odd].tolist(), end[odd].tolist(), strict=True):
+            cell = data[first:last]
+            found = known.get(cell)
+            if found is None:
+                found = known[cell] = _number(cell.decode(_form(column), "replace").strip())
+            value[i] = found
+        return value
+
+
+def _form(column: int) -> str:
+    """What a cell is encoded as: a mark may stand in front of a line."""
+    return "utf-8" if column else "utf-8-sig"
+
+
+def head_bytes(is_header: IsHeader) -> Callable[[bytes], int]:
+    """How many bytes titles and header of a table take: ``head(data)``, more than there are while it may yet come."""
+
+    def head(data: bytes) -> int:
+        lines: list[bytes] = []
+        ends = [0]
+        while len(lines) < TITLES and (stop := data.find(b"\n", ends[-1])) >= 0:
+            lines.append(data[ends[-1] : stop].removesuffix(b"\r"))
+            ends.append(stop + 1)
+        found = header_of(lines, is_header)
+        if found is None:
+            return 0 if len(lines) == TITLES else len(data) + 1
+        return ends[found[0] + 1]
+
+    return head
 
 
 def read(data: bytes, is_header: IsHeader) -> Sheet | None:
@@ -157,46 +252,91 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     if found is None:
         return None
     at, separator, names = found
-    number: list[int] = []
-    cells: list[list[str]] = []
-    rejected: list[RejectedLine] = []
-    repeats: list[int] = []
+    quick = _quick(lines, at, separator, names)
+    left = ~lines.blank
+    left[: at + 1] = False
+    left[quick.rows] = False
+    rest = _rest(lines, np.flatnonzero(left), separator, names)
+    number = np.array(rest.number, dtype=np.int64)
+    row = np.sort(np.concatenate((quick.rows, number)))
+    last = int(row[-1]) if len(row) else at
+    foot = [line.number - 1 for line in rest.rejected if line.number - 1 > last and separator not in line.text]
+    if foot and lines.unterminated and foot[-1] == len(lines) - 1:
+        foot.pop()  # a torn row
+    below = set(foot)  # words below the table, as Nemo writes them
+    return Sheet(
+        lines=lines,
+        names=names,
+        row=row,
+        quick=quick,
+        quick_at=np.searchsorted(row, quick.rows),
+        slow=rest.cells,
+        slow_at=np.searchsorted(row, number),
+        blank_rows=np.array([*range(at + 1), *rest.repeats, *foot], dtype=np.int64),
+        rejected=[line for line in rest.rejected if line.number - 1 not in below],
+        comma=separator != ",",
+        foot=bool(foot),
+    )
+
+
+def _quick(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> _table.Fields:
+    """Rows that separators alone divide: as many cells as names, no quote, and no repeated header."""
     width = len(names)
+    found = _table.fields(lines, width, ord(separator))
+    if 2 * len(found.rows) < len(lines) - at and len(lines) > at + 1:
+        others = [_table.fields(lines, width + 1, ord(separator))]  # a separator at the end of each row
+        if not names[-1]:
+            others.append(_table.fields(lines, width - 1, ord(separator)))
+        found = max(found, *others, key=lambda fields: len(fields.rows))
+    plain_rows = (found.rows > at) & ~lines.blank[found.rows]
+    for sign in (b'"', b"\0"):
+        if sign in lines.data:
+            marked = np.searchsorted(lines.starts, _lines.places(lines.buffer, sign[0]), side="right") - 1
+            plain_rows &= ~np.isin(found.rows, marked)
+    if found.ends.shape[1] > width:
+        plain_rows &= found.width(width) == 0
+    plain_rows &= ~_may_be(lines, found, names[0])
+    return found.take(plain_rows)
+
+
+def _may_be(lines: _lines.Lines, found: _table.Fields, name: str) -> BoolArray:
+    """Rows whose first cell may be a name: one that begins as the name does, or with what is no text."""
+    first = lines.buffer[np.minimum(found.begin, max(len(lines.data) - 1, 0))]
+    begins = name.encode()[:1]
+    if not begins:
+        return np.asarray((first < 48) | (first > 57))
+    return np.asarray((first == begins[0]) | (first <= 32) | (first >= 128))
+
+
+@dataclass
+class _Rest:
+    """Lines that are read one by one: rows, lines of another width, repeated headers."""
+
+    number: list[int] = field(default_factory=list)
+    cells: list[list[str]] = field(default_factory=list)
+    rejected: list[RejectedLine] = field(default_factory=list)
+    repeats: list[int] = field(default_factory=list)
+
+
+def _rest(lines: _lines.Lines, numbers: IntArray, separator: str, names: list[str]) -> _Rest:
+    made, width = _Rest(), len(names)
     same: dict[str, str] = {}  # one text object for equal cells: tables repeat themselves
-    for i in np.flatnonzero(~lines.blank).tolist():
-        if i <= at:
-            continue
+    for i in numbers.tolist():
         one = _split(lines.raw(i), separator)
         if len(one) == width + 1 and not one[-1].strip():
             one.pop()  # a separator at the end of each row
         if len(one) == width - 1 and not names[-1]:
             one.append("")
         if [text.strip() for text in one] == names:
-            repeats.append(i)  # files joined by hand
+            made.repeats.append(i)  # files joined by hand
         elif len(one) == width:
-            number.append(i)
-            cells.append([same.setdefault(text, text) for text in one])
+            made.number.append(i)
+            made.cells.append([same.setdefault(text, text) for text in one])
             if len(same) > _MOST_TEXTS:
                 same.clear()
         else:
-            rejected.append(lines.reject(i, f"{len(one)} fields where the header has {width} (torn line?)"))
-    last = number[-1] if number else at
-    foot = [line.number - 1 for line in rejected if line.number - 1 > last and separator not in line.text]
-    if foot and lines.unterminated and foot[-1] == len(lines) - 1:
-        foot.pop()  # a torn row
-    if foot:
-        repeats += foot  # words below the table, as Nemo writes them
-        rejected = [line for line in rejected if line.number - 1 not in foot]
-    comments = np.array([*range(at + 1), *repeats], dtype=np.int64)
-    return Sheet(
-        lines=lines,
-        names=names,
-        row=np.array(number, dtype=np.int64),
-        cells=cells,
-        blank_rows=comments,
-        rejected=rejected,
-        comma=separator != ",",
-    )
+            made.rejected.append(lines.reject(i, f"{len(one)} fields where the header has {width} (torn line?)"))
+    return made
 
 
 TIME_NAMES = (
@@ -214,17 +354,22 @@ SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
 """Columns of srsUE's metrics file, whose time counts milliseconds."""
 
 
-def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
+def rows(
+    sheet: Sheet, options: ReadOptions, decided: _decided.Decided, *, reader: str, also: Sequence[str] = ()
+) -> _rows.Rows | None:
     """Rows of a table with their times; None where no column is one of times.
 
     Parameters
     ----------
+    decided : Decided
+        How earlier blocks of the table were read. Raises ``blocks.Whole`` where this one must be read otherwise.
     also : sequence of str
         Patterns of further names of the time column, preferred.
     """
     column = sheet.find(*also, *TIME_NAMES)
     if column is None:
         return None
+    decided.begin(len(sheet), foot=sheet.foot)
     texts = sheet.texts(column)
     day = sheet.find(r"(custom )?date( local| utc)?")
     if day is not None and day != column:
@@ -233,7 +378,10 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
-    clock, cells, warnings = _stamps.read(texts, options, unit=count)
+    before: _stamps.Day = decided.kept.setdefault("day", _stamps.Day())
+    clock, cells, warnings = _stamps.read(texts, options, unit=count, day=before)
+    if any(texts):
+        decided.agree("times", (clock, *warnings))
     if clock == "wall" and utc and len(cells):
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
     made = _rows.built(
@@ -241,9 +389,7 @@ def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str]
         extra=sheet.rejected, markup=sheet.blank_rows,
     )  # fmt: skip
     made.warnings += warnings
-    kept = np.isin(sheet.row, made.row)
-    sheet.cells = [cells for cells, keep in zip(sheet.cells, kept.tolist(), strict=True) if keep]
-    sheet.row = made.row
+    sheet.keep(np.isin(sheet.row, made.row))
     return made
 
 

@@ -7,12 +7,16 @@ first and a warning says so.
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from itertools import islice
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import ReadOptions
+
+from . import _alike
 
 _CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
 _ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
@@ -23,6 +27,8 @@ _DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})
 _OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
+DATELESS = "the times have no date"
+"""How a warning begins where times of the day are read: one before tells which day it is."""
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
@@ -74,11 +80,58 @@ def _dated(text: str, day_first: bool) -> bytes | None:
     return None
 
 
-def _day_first(texts: Sequence[str]) -> bool | None:
+def _dates(part: _alike.Alike, day_first: bool) -> AnyArray:
+    """Times of one form in the common form, as :func:`_dated` writes each."""
+    found = _YEAR_FIRST.fullmatch(part.first) or _YEAR_LAST.fullmatch(part.first) or _WORD_MONTH.fullmatch(part.first)
+    if found is None:
+        return np.full(len(part), b"-")
+    span = _alike.spans(found)
+    if found.re is _YEAR_FIRST:
+        return _common(part, span[1:9])
+    if found.re is _YEAR_LAST:
+        day, month = (1, 3) if day_first else (3, 1)
+        return _common(part, [span[4], span[month], span[day], *span[5:]])
+    return _common(part, [span[3], span[2], span[1], *span[4:]])
+
+
+def _common(part: _alike.Alike, span: Sequence[tuple[int, int]]) -> AnyArray:
+    """The common form from the places of year, month, day, hour, minute, second, half of the day and zone."""
+    year, month, _day, _hour, _minute, second, half, zone = (part.first[begin:end] for begin, end in span)
+    hours = part.whole(span[3])
+    if half:
+        hours = hours % 12 + (12 if half.lower() == "pm" else 0)
+    months = part.whole(span[1]) if month.isdigit() else np.full(len(part), _month(month))
+    end = "Z" if zone in ("UTC", "GMT") else zone
+    begin = span[5][0]
+    seconds = part.whole((begin, begin + 2) if second else (0, 0))
+    made = np.empty((len(part), 19 + len(second[2:]) + len(end)), dtype=np.uint8)
+    made[:, :19] = np.frombuffer(b"2000-00-00 00:00:00", dtype=np.uint8)
+    made[:, 4 - len(year) : 4] = part.cells[:, slice(*span[0])]
+    for place, value in ((5, months), (8, part.whole(span[2])), (11, hours), (14, part.whole(span[4])), (17, seconds)):
+        made[:, place], made[:, place + 1] = 48 + value // 10, 48 + value % 10
+    if second[2:]:
+        made[:, 19] = 46
+        made[:, 20 : 19 + len(second[2:])] = part.cells[:, begin + 3 : span[5][1]]
+    if end:
+        made[:, -len(end) :] = part.cells[:, slice(*span[7])] if end == zone else 90
+    return np.asarray(made.view(f"S{made.shape[1]}").ravel())
+
+
+def _day_first(texts: Sequence[str], groups: Iterable[_alike.Alike]) -> bool | None:
     """Whether the day stands before the month; None where every date can be read both ways."""
-    dates = [found for text in texts if (found := _YEAR_LAST.fullmatch(text))]
-    pairs = [(int(found[1]), int(found[3])) for found in dates]
-    if dates and all(found[2] == "." for found in dates):
+    points, pairs = [], []
+    for part in groups:
+        found = _YEAR_LAST.fullmatch(part.first)
+        if found is None:
+            continue
+        points.append(found[2] == ".")
+        if part.at_once:
+            span = _alike.spans(found)
+            pairs.append((int(part.whole(span[1]).max()), int(part.whole(span[3]).max())))
+        else:
+            ones = [one for i in part.at.tolist() if (one := _YEAR_LAST.fullmatch(texts[i]))]
+            pairs += [(int(one[1]), int(one[3])) for one in ones]
+    if points and all(points):
         return True  # 02.03.2025: where points stand, the day comes first
     if any(first > 12 for first, _ in pairs):
         return True
@@ -87,7 +140,17 @@ def _day_first(texts: Sequence[str]) -> bool | None:
     return None
 
 
-def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None) -> tuple[str, AnyArray, list[str]]:
+@dataclass
+class Day:
+    """Where times of the day have come to in the blocks before: the last of them [s], and midnights since the first."""
+
+    last_s: float = np.nan
+    midnights: int = 0
+
+
+def read(
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, day: Day | None = None
+) -> tuple[str, AnyArray, list[str]]:
     """A column of times in any of the known forms.
 
     Parameters
@@ -95,6 +158,8 @@ def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None)
     texts : sequence of str
     unit : {"s", "ms"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
+    day : Day, optional
+        Of the column's part before; brought to its end.
 
     Returns
     -------
@@ -105,24 +170,40 @@ def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None)
     warnings : list of str
     """
     shown = [text.strip().strip('"').strip() for text in texts]
-    some = [text for text in shown if text]
-    if (
-        some
-        and sum(_NUMBER.fullmatch(text) is not None for text in some) * 2 > len(some)
-        and not any(_DIGITS.fullmatch(text) for text in some[:3])
-    ):
-        return _numbers(shown, unit)
-    if some and sum(_OF_DAY.fullmatch(text) is not None for text in some) * 2 > len(some):
-        return _of_day(shown, options)
-    first = _day_first(some)
-    cells = np.array([_dated(text, bool(first)) or b"-" for text in shown] or [b"-"], dtype=np.bytes_)[: len(shown)]
+    groups = _alike.grouped(shown)
+    some, counts, of_day = (
+        sum(len(part) for part in groups if known(part.first)) for known in (bool, _NUMBER.fullmatch, _OF_DAY.fullmatch)
+    )
+    if counts * 2 > some and not any(_DIGITS.fullmatch(text) for text in islice(filter(None, shown), 3)):
+        return _numbers(shown, groups, unit)
+    if of_day * 2 > some:
+        return _of_day(shown, groups, options, day or Day())
+    first = _day_first(shown, groups)
     warnings = ["the dates can be read with the day or the month first: the month was taken"] if first is None else []
+    parts = [(part.at, _in_common(part, shown, bool(first))) for part in groups]
+    cells = np.zeros(len(shown), dtype=f"S{max((made.dtype.itemsize for _, made in parts), default=1)}")
+    for at, made in parts:
+        cells[at] = made
     return "wall", cells, warnings
 
 
-def _numbers(texts: Sequence[str], unit: str | None) -> tuple[str, FloatArray, list[str]]:
+def _in_common(part: _alike.Alike, texts: Sequence[str], day_first: bool) -> AnyArray:
+    """Times of one form in the common one, ``-`` where they are none."""
+    if part.at_once and not part.first[:8].isdigit():  # of _DIGITS it matters which they are
+        return _dates(part, day_first)
+    return np.array([_dated(texts[i], day_first) or b"-" for i in part.at.tolist()], dtype=np.bytes_)
+
+
+def _numbers(
+    texts: Sequence[str], groups: Iterable[_alike.Alike], unit: str | None
+) -> tuple[str, FloatArray, list[str]]:
     """Numbers: epochs by their size, else relative times."""
-    value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
+    value = np.full(len(texts), np.nan)
+    for part in groups:
+        if _NUMBER.fullmatch(part.first) and part.at_once:
+            value[part.at] = part.numbers((0, len(part.first)))
+        elif _NUMBER.fullmatch(part.first):
+            value[part.at] = [float(texts[i].replace(",", ".")) for i in part.at.tolist()]
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         if middle >= 0.9 * scale:
@@ -130,23 +211,40 @@ def _numbers(texts: Sequence[str], unit: str | None) -> tuple[str, FloatArray, l
     return f"relative_{unit or 's'}", value, []
 
 
-def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
+def _of_day(
+    texts: Sequence[str], groups: Iterable[_alike.Alike], options: ReadOptions, day: Day
+) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
-    found = [_OF_DAY.fullmatch(text) for text in texts]
-    seconds = np.array([_seconds(one.groups()) if one else np.nan for one in found], dtype=np.float64)
-    steps = np.diff(seconds, prepend=seconds[:1])
-    seconds = seconds + 86_400.0 * np.cumsum(np.nan_to_num(steps) < -43_200)  # past midnight
+    seconds = np.full(len(texts), np.nan)
+    marked = False
+    for part in groups:
+        if found := _OF_DAY.fullmatch(part.first):
+            marked |= bool(found[5])
+            seconds[part.at] = _seconds_of(part, found, texts)
+    midnights = day.midnights + np.cumsum(np.nan_to_num(np.diff(seconds, prepend=day.last_s)) < -43_200)
+    day.last_s, day.midnights = float(seconds[-1]), int(midnights[-1])
+    seconds = seconds + 86_400.0 * midnights
     date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
-        return "relative_s", seconds, ["the times have no date and the file name has none either"]
-    day = np.datetime64(date, "us")
-    stamps = day + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
-    cells = np.array([str(stamp).encode() for stamp in stamps], dtype=np.bytes_)
+        return "relative_s", seconds, [f"{DATELESS} and the file name has none either"]
+    stamps = np.datetime64(date, "us") + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
+    cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     cells = np.where(np.isnan(seconds), b"-", cells)
-    marked = any(one and one.groups()[4] for one in found)
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
     source = "time_origin" if options.time_origin else "the file name"
-    return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
+    return "wall", cells, [f"{DATELESS}: it is that of {source}, {date}", *warnings]
+
+
+def _seconds_of(part: _alike.Alike, found: re.Match[str], texts: Sequence[str]) -> FloatArray:
+    """Times of the day of one form [s]."""
+    if not part.at_once:
+        ones = [_OF_DAY.fullmatch(texts[i]) for i in part.at.tolist()]
+        return np.array([_seconds(one.groups()) if one else np.nan for one in ones], dtype=np.float64)
+    span = _alike.spans(found)
+    hour = part.whole(span[1])
+    if found[4]:
+        hour = hour % 12 + (12 if found[4].lower() == "pm" else 0)
+    return np.asarray(hour * 3600.0 + part.whole(span[2]) * 60.0 + part.numbers(span[3]))
 
 
 def _seconds(parts: Sequence[str | None]) -> float:

@@ -10,7 +10,7 @@ quantities become streams of kind ``kpi``, RI a rank stream (from one). Position
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -18,7 +18,20 @@ from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _cells, _lines, _nemo, _pose, _quantities, _rows, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri
+from . import (
+    _cells,
+    _decided,
+    _lines,
+    _nemo,
+    _pose,
+    _quantities,
+    _rows,
+    _sheet,
+    aadm_snr,
+    own_csv,
+    pose_csv,
+    quectel_ri,
+)
 
 _PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
 _ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")
@@ -146,6 +159,7 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         row = np.flatnonzero(np.isfinite(level))
         pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
         beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
+        pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
         rat, serving = np.full(len(row), cell.rat, dtype=object), np.full(len(row), cell.serving)
         tables.append(
             _cells.Table(row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, beside=beside)
@@ -159,17 +173,107 @@ def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells, ranks, KPIs and the track of the phone; UsageError if the clock has no zone and none is given."""
+    return _decided.in_one_piece(_read, _settled, data, options)
+
+
+def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
+    """What each row says by itself, and the cell that served before."""
     sheet = _sheet.read(data, is_header)
-    rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
+    rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
     _settle_names(sheet)
     cells, others, ranks = _places(sheet)
-    streams: list[Stream | None] = [_pose.from_sheet(rows, sheet, name="phone", source="table of a phone")]
-    streams += _cells.streams(rows, _readings(sheet, cells), source="drive test")
-    streams += [_rank(rows, sheet, column) for column in ranks]
-    streams += [_other(rows, sheet, column) for column in [*others, *_alone(sheet, cells)]]
-    return rows.result(_distinct(streams))
+    readings = _readings(sheet, cells)
+    track = _pose.from_sheet(rows, sheet, decided, name="phone", source="table of a phone")
+    levels = _cells.streams(rows, readings, source="drive test")
+    _carry_on(levels, readings, decided)
+    columns = [*ranks, *others, *_beside(sheet, cells, decided)]
+    names = [_stream_name(sheet, column) for column in columns]
+    decided.kept["order"] = names
+    if len(set(names) | _TAKEN) < len(names) + len(_TAKEN):
+        decided.one_piece()  # which of two columns of one name has values all rows say
+    streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
+    return rows.result(_distinct([track, *levels, *streams]))
+
+
+_TAKEN = {"phone", "rsrp", "lte_rsrp", "nr_rsrp"}
+"""Names that other streams may have."""
+
+
+def _stream_name(sheet: _sheet.Sheet, column: int) -> str:
+    name = sheet.plain[column]
+    found = _TOWER_SNR.fullmatch(name)
+    return found[1].upper() if found else re.sub(r"\W+", "_", name)
+
+
+def _carry_on(levels: list[Stream], readings: _cells.Table, decided: _decided.Decided) -> None:
+    """Which cell serves the block before tells until this one does; noted for the next, with the carriers of cells."""
+    known = np.isfinite(readings.rsrp_dbm)
+    key = np.where(readings.pci >= 0, readings.pci, -1.0)
+    carried = np.flatnonzero(known & np.isfinite(readings.arfcn))
+    columns = (readings.rat[carried].tolist(), key[carried].tolist(), readings.arfcn[carried].tolist())
+    carriers: set[tuple[str, float, float]] = decided.kept.setdefault("carriers", set())
+    carriers |= set(zip(*columns, strict=True))
+    before: dict[str, float] = decided.kept.setdefault("serving", {})
+    for stream in levels:
+        rat, pci = str(stream.attributes.get("rat", "")), stream.attributes.get("pci")
+        if rat in before:
+            served = stream.frame["serving"].to_numpy()
+            stream.frame["serving"] = np.where(np.isnan(served), float(pci == before[rat]), served)
+    for rat in set(readings.rat.tolist()):
+        told = np.flatnonzero(known & readings.serving & (readings.rat == rat))
+        if len(told):
+            before[rat] = float(readings.pci[told[np.argmax(readings.row[told])]])
+            if before[rat] < 0:
+                decided.one_piece()
+
+
+def _beside(sheet: _sheet.Sheet, cells: list[_Cell], decided: _decided.Decided) -> list[int]:
+    """Columns beside a serving level; marked where values stand in rows of their own: Nemo writes a row per event."""
+    found = []
+    for cell in cells:
+        if cell.rsrp is None or not cell.serving:
+            continue
+        silent = np.isnan(sheet.numbers(cell.rsrp))
+        for column in cell.beside.values():
+            found.append(column)
+            name = _stream_name(sheet, column)
+            decided.kept.setdefault("beside", set()).add(name)
+            if np.isfinite(sheet.numbers(column)[silent]).any():
+                decided.marks.add(("alone", name))
+    return found
+
+
+def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
+    """What only the whole table says."""
+    order: list[str] = decided.kept.get("order", [])
+    beside: set[str] = decided.kept.get("beside", set())
+    streams: list[Stream] = []
+    warnings: list[str] = []
+    for stream in _cells.settled(result).streams:
+        if stream.kind == "telemetry":
+            stream, warnings = _pose.settled(stream, decided)
+        elif "serving" in stream.frame:
+            cell = (stream.attributes.get("rat", ""), stream.attributes.get("pci", -1))
+            numbers = {arfcn for *one, arfcn in decided.kept["carriers"] if tuple(one) == cell}
+            about = {key: value for key, value in stream.attributes.items() if key != "arfcn"}
+            about |= {"arfcn": int(*numbers)} if len(numbers) == 1 else {}
+            columns = [name for name in stream.frame if name not in _cells.BESIDE]
+            columns += [name for name in _cells.BESIDE if name in stream.frame and stream.frame[name].notna().any()]
+            stream = replace(stream, attributes=about, frame=stream.frame[columns])
+        elif stream.name in beside and ("alone", stream.name) not in decided.marks:
+            continue
+        streams.append(stream)
+
+    def place(stream: Stream) -> tuple[int, str, int, int]:
+        if stream.kind == "telemetry":
+            return 0, "", 0, 0
+        if "serving" in stream.frame:
+            return 1, str(stream.attributes.get("rat", "")), int(stream.attributes.get("pci", -1)), 0
+        return 2, "", 0, order.index(stream.name)
+
+    return _decided.finished(result, sorted(streams, key=place), *warnings)
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
@@ -177,21 +281,11 @@ def _settle_names(sheet: _sheet.Sheet) -> None:
     words = known(sheet.plain)
     if words != sheet.plain and "level" in sheet.plain:
         places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find("networktech", "networkmode")
-        for cells in sheet.cells:
-            if tech is not None and not _TECH.search(cells[tech]):
-                cells[places[0]] = cells[places[1]] = ""
+        if tech is not None:
+            texts = sheet.texts(tech)
+            other = {text for text in set(texts) if not _TECH.search(text)}
+            sheet.silence(np.array([text in other for text in texts], dtype=bool), places)
     sheet.plain = words
-
-
-def _alone(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
-    """Columns beside a level whose values stand in rows of their own, too: Nemo writes one row per event."""
-    found = []
-    for cell in cells:
-        if cell.rsrp is None or not cell.serving:
-            continue
-        silent = np.isnan(sheet.numbers(cell.rsrp))
-        found += [column for column in cell.beside.values() if np.isfinite(sheet.numbers(column)[silent]).any()]
-    return found
 
 
 def _rank(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
@@ -232,4 +326,5 @@ READER = Reader(
     sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)",
     sniff=sniff,
     read=read,
+    in_blocks=_decided.in_blocks(_read, _settled, _sheet.head_bytes(is_header)),
 )

@@ -7,13 +7,15 @@ origin.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _rows, _sheet
+from . import _decided, _rows, _sheet
 
 _RSS = ("time utc", "tower", "channel", "unit", "measured db")
 _RANK = ("time utc", "tower", "measured rank")
@@ -32,21 +34,50 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """What the table was made of."""
+    return _decided.in_one_piece(_read, _settled, data, options)
+
+
+def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
+    """What each row says by itself."""
     sheet = _sheet.read(data, is_header)
     if sheet is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
     column = sheet.find("time utc")
-    seconds = sheet.find("time s")
     empty = column is not None and not any(sheet.texts(column))
-    rows = _sheet.rows(
-        sheet, options, reader="own_csv", also=("time s",) if empty and seconds is not None else ("time utc",)
-    )
+    if len(sheet):
+        decided.agree("times in UTC", empty)
+    also = ("time s",) if empty and sheet.find("time s") is not None else ("time utc",)
+    rows = _sheet.rows(sheet, options, decided, reader="own_csv", also=also)
     if rows is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
     names = set(sheet.plain)
     if set(_RSS) <= names:
-        return rows.result(_levels(rows, sheet))
-    return rows.result(_ranks(rows, sheet) if set(_RANK) <= names else _tap(rows, sheet))
+        return rows.result(_levels(rows, sheet, decided))
+    return rows.result(_ranks(rows, sheet, decided) if set(_RANK) <= names else _tap(rows, sheet))
+
+
+_TAPPED = ("nr5g", "lte", "nr5g_rsrp")
+
+
+def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
+    """Streams in the order of the table, with the unit of their first row; the LTE leg of a tap where it has a rank."""
+    first: dict[str, tuple[str, ...]] = decided.kept.get("streams", {})
+    order = [*first, *_TAPPED]
+    streams = []
+    for stream in result.streams:
+        if stream.name == "lte" and not np.isfinite(stream.frame["rank"].to_numpy()).any():
+            continue
+        if stream.kind == "rss" and stream.name in first:
+            stream = replace(stream, attributes={**stream.attributes, "unit": first[stream.name][-1]})
+        streams.append(stream)
+    return _decided.finished(result, sorted(streams, key=lambda stream: order.index(stream.name)))
+
+
+def _of_stream(decided: _decided.Decided, name: str, *about: str) -> None:
+    """What the first row of a stream says of it; two streams of one name are told apart in one piece only."""
+    known: dict[str, tuple[str, ...]] = decided.kept.setdefault("streams", {})
+    if known.setdefault(name, about)[:-1] != about[:-1]:
+        decided.one_piece()
 
 
 def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
@@ -56,27 +87,31 @@ def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-ar
 
 def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
     place = sheet.find(name)
-    return np.full(len(sheet.cells), np.nan) if place is None else sheet.numbers(place)
+    return np.full(len(sheet), np.nan) if place is None else sheet.numbers(place)
 
 
-def _levels(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+def _levels(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) -> list[Stream | None]:
     tower, channel, unit = (_text(sheet, name) for name in ("tower", "channel", "unit"))
     level, flag = rows.level(_number(sheet, "measured db"))
     made = []
-    for node, name in dict.fromkeys(zip(tower.tolist(), channel.tolist(), strict=True)):
-        mine: BoolArray = (tower == node) & (channel == name)
-        about = {"node": node, "channel": name, "unit": str(unit[mine][0])}
-        made.append(rows.stream("rss", f"{node}_{name}", {"rss_db": level}, where=mine, flag=flag, about=about))
+    for node, channel_name in dict.fromkeys(zip(tower.tolist(), channel.tolist(), strict=True)):
+        mine: BoolArray = (tower == node) & (channel == channel_name)
+        name = f"{node}_{channel_name}"
+        about = {"node": node, "channel": channel_name, "unit": str(unit[mine][0])}
+        _of_stream(decided, name, *about.values())
+        made.append(rows.stream("rss", name, {"rss_db": level}, where=mine, flag=flag, about=about))
     return made
 
 
-def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
+def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) -> list[Stream | None]:
     tower, ri = _text(sheet, "tower"), _number(sheet, "measured rank")
     values = rows.rank(ri)
-    return [
-        rows.stream("rank", f"{node}_rank", values, where=tower == node, node=node, ri_base="one", source="report")
-        for node in dict.fromkeys(tower.tolist())
-    ]
+    made = []
+    for node in dict.fromkeys(tower.tolist()):
+        _of_stream(decided, f"{node}_rank", node, "")
+        about = {"node": node, "ri_base": "one", "source": "report"}
+        made.append(rows.stream("rank", f"{node}_rank", values, where=tower == node, about=about))
+    return made
 
 
 def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
@@ -91,8 +126,7 @@ def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         rows.mark(odd, "ri_out_of_range")
         values["rank"] = np.where(odd, np.nan, rank)
         name = name.removesuffix("_csi")
-        if name == "nr5g" or np.isfinite(values["rank"][mine]).any():
-            made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
+        made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
     cell: BoolArray = (query == "servingcell") & np.isfinite(_number(sheet, "rsrp dbm"))
     level, flag = rows.level(_number(sheet, "rsrp dbm"))
     values = {"rss_db": level, "sinr_db": _number(sheet, "sinr db")}
@@ -109,4 +143,5 @@ READER = Reader(
     sample="time_utc,time_s,tower,channel,unit,east_m,north_m,up_m,measured_db",
     sniff=sniff,
     read=read,
+    in_blocks=_decided.in_blocks(_read, _settled, _sheet.head_bytes(is_header)),
 )

@@ -92,7 +92,8 @@ def _read_reports(data: bytes, options: ReadOptions, forms: set[Hashable]) -> Re
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
     clock, time, warnings = _stamps.read(texts, options)
     if texts:
-        forms.add((clock, *warnings))
+        dateless = any(text.startswith(_stamps.DATELESS) for text in warnings)
+        forms.add((clock, *warnings, texts[0] if dateless else ""))  # a day more is known of the whole log alone
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines,

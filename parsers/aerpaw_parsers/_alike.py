@@ -1,0 +1,76 @@
+"""Texts of one form, digits aside, at once: what a pattern finds in one of them is at the same place in all."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+
+_AS_ZERO = bytes.maketrans(b"123456789", b"000000000")
+_FEW = 8
+"""Fewer texts are sooner read one by one."""
+
+
+@dataclass(frozen=True)
+class Alike:
+    """Texts of one form.
+
+    Parameters
+    ----------
+    first : str
+        One of them.
+    at : int array, shape (n,)
+        Which of all texts these are.
+    cells : uint8 array, shape (n, m)
+        Their characters; empty where they are few or beyond ASCII, to be read one by one.
+    """
+
+    first: str
+    at: IntArray
+    cells: AnyArray
+
+    def __len__(self) -> int:
+        """Count the texts."""
+        return len(self.at)
+
+    @property
+    def at_once(self) -> bool:
+        """Whether the characters are there."""
+        return self.cells.size > 0
+
+    def whole(self, span: tuple[int, int]) -> IntArray:
+        """Digits between two places as numbers; 0 where there are none."""
+        total = np.zeros(len(self), dtype=np.int64)
+        for column in self.cells[:, span[0] : span[1]].T:
+            total = total * 10 + (column - np.uint8(48))
+        return total
+
+    def numbers(self, span: tuple[int, int]) -> FloatArray:
+        """Decimals between two places, with a point or a comma."""
+        part = self.cells[:, span[0] : span[1]].copy()
+        part[part == 44] = 46
+        return np.asarray(part.view(f"S{part.shape[1]}").ravel().astype(np.float64))
+
+
+def grouped(texts: Sequence[str]) -> list[Alike]:
+    """Texts by their form, in the order of its first text."""
+    groups: dict[bytes, list[int]] = {}
+    coded = [text.encode("utf-8", "surrogatepass") for text in texts]
+    for i, code in enumerate(coded):
+        groups.setdefault(code.translate(_AS_ZERO), []).append(i)
+    made = []
+    for form, at in groups.items():
+        few = len(at) < _FEW or not form or not form.isascii() or b"\0" in form
+        cells = b"" if few else b"".join([coded[i] for i in at])
+        room = np.frombuffer(cells, dtype=np.uint8).reshape(len(at), -1) if cells else np.zeros((0, 0), dtype=np.uint8)
+        made.append(Alike(texts[at[0]], np.array(at, dtype=np.int64), room))
+    return made
+
+
+def spans(found: re.Match[str]) -> list[tuple[int, int]]:
+    """Places of a match and of its groups; an empty one where a group found nothing."""
+    return [(max(begin, 0), max(end, 0)) for begin, end in (found.span(i) for i in range(found.re.groups + 1))]

@@ -223,6 +223,46 @@ def write_mapped(place: Path, lines: int) -> None:
             )
 
 
+def write_poses(place: Path, lines: int) -> None:
+    """An autopilot's export: named columns, local times."""
+    rng = np.random.default_rng(11)
+    with place.open("wb") as file:
+        file.write(b"timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw\n")
+        for first, count in _blocks(lines):
+            angles = rng.uniform(-20, 20, (3, count)).tolist()
+            rows = zip(_wall(first, count, 10_000_000).tolist(), range(first, first + count), *angles, strict=True)
+            file.writelines(
+                b"%s,35.73%05d,-78.70%05d,%.2f,%.3f,%.3f,%.2f\n"
+                % (time, n % 99991, n % 99989, n % 90, roll, pitch, 9 * yaw)
+                for time, n, roll, pitch, yaw in rows
+            )
+
+
+def write_drive_test(place: Path, lines: int) -> None:
+    """A phone's log as G-NetTrack writes it, of eight cells: a neighbour in one row of two."""
+    rng = np.random.default_rng(12)
+    with place.open("wb") as file:
+        file.write(b"Timestamp,Longitude,Latitude,Speed,CellID,LTEPCI,RSRP,RSRQ,SNR,CQI,NRxRSRP\n")
+        for first, count in _blocks(lines):
+            level = rng.integers(-115, -60, count).tolist()
+            rows = zip(_wall(first, count, 500_000_000).tolist(), range(first, first + count), level, strict=True)
+            file.writelines(
+                b"%s,-78.70%05d,35.73%05d,%d,11,%d,%d,%d,%d,9,%s\n"
+                % (
+                    time,
+                    n % 99989,
+                    n % 99991,
+                    n % 7,
+                    n // 50 % 8,
+                    rsrp,
+                    -9 - n % 5,
+                    n % 25,
+                    b"%d" % (rsrp - 6) if n % 2 else b"",
+                )
+                for time, n, rsrp in rows
+            )
+
+
 MAPPED = ReadOptions(
     timezone=ZONE,
     kind="rss",
@@ -236,6 +276,8 @@ SCALED: dict[str, tuple[Callable[[Path, int], None], str, ReadOptions]] = {
     "nemo_csv": (write_nemo, "x_nemo.csv", ReadOptions(time_origin="2025-03-02T15:00:00Z")),
     "nemo_csv:all_digits": (write_nemo_digits, "x_nemo.csv", ReadOptions(time_origin="2025-03-02T15:00:00Z")),
     "generic_csv": (write_mapped, "x_mapped.csv", MAPPED),
+    "pose_csv": (write_poses, "x_poses.csv", ReadOptions(timezone=ZONE)),
+    "drive_test": (write_drive_test, "x_phone.csv", ReadOptions(timezone=ZONE)),
 }
 """By reader, a colon and more for a second file of one."""
 TABLES: dict[str, tuple[int, int | None, list[int]]] = {
@@ -245,6 +287,8 @@ TABLES: dict[str, tuple[int, int | None, list[int]]] = {
     "nemo_csv": (1, None, [2, 3, 4, 5, 6, 7, 8]),
     "nemo_csv:all_digits": (1, None, [2, 3, 4, 5, 6, 7, 8]),
     "generic_csv": (1, 0, [1, 2, 3]),
+    "pose_csv": (1, 0, [1, 2, 3, 4, 5, 6]),
+    "drive_test": (1, 0, [1, 2, 3, 4, 5, 6, 7, 8, 9, 10]),
 }
 
 

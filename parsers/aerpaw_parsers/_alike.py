@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 _AS_ZERO = bytes.maketrans(b"123456789", b"000000000")
 _FEW = 8
 """Fewer texts are sooner read one by one."""
+_MOST_FORMS = 16
 
 
 @dataclass(frozen=True)
@@ -69,6 +71,49 @@ def grouped(texts: Sequence[str]) -> list[Alike]:
         room = np.frombuffer(cells, dtype=np.uint8).reshape(len(at), -1) if cells else np.zeros((0, 0), dtype=np.uint8)
         made.append(Alike(texts[at[0]], np.array(at, dtype=np.int64), room))
     return made
+
+
+class Cells(Sequence[str]):
+    """Texts of a column that never were objects of Python.
+
+    Parameters
+    ----------
+    cells : bytes array, shape (n,)
+        ASCII without NUL.
+    """
+
+    def __init__(self, cells: AnyArray) -> None:
+        self.cells = cells
+
+    def __len__(self) -> int:
+        """Count the texts."""
+        return len(self.cells)
+
+    def __getitem__(self, i: Any) -> Any:
+        """One of them as a text."""
+        return self.cells[i].decode("ascii")
+
+    def grouped(self) -> list[Alike] | None:
+        """As :func:`grouped`; None where there are many forms, or where marks or spaces stand around a text."""
+        width = self.cells.dtype.itemsize
+        table = np.ascontiguousarray(self.cells).view(np.uint8).reshape(len(self), width)
+        forms = np.where((table >= 49) & (table <= 57), np.uint8(48), table)
+        left = np.arange(len(self))
+        made: list[Alike] = []
+        while len(left):
+            alike = (forms[left] == forms[left[0]]).all(axis=1)
+            at, left = left[alike], left[~alike]
+            first = self[int(at[0])]
+            if len(made) == _MOST_FORMS or first != bare(first):
+                return None
+            few = len(at) < _FEW or not first
+            made.append(Alike(first, at, np.zeros((0, 0), dtype=np.uint8) if few else table[at, : len(first)]))
+        return made
+
+
+def bare(text: str) -> str:
+    """A text without the spaces and quotes around it."""
+    return text.strip().strip('"').strip()
 
 
 def spans(found: re.Match[str]) -> list[tuple[int, int]]:

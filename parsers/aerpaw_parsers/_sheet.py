@@ -18,13 +18,14 @@ from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _by_eights, _decided, _lines, _rows, _stamps, _table
+from . import _alike, _by_eights, _decided, _lines, _rows, _stamps, _table
 from ._quantities import plain
 
 SEPARATORS = (",", ";", "\t", "|")
 TITLES = 60
 """Lines in front of a header, at most."""
 _MOST_TEXTS = 200_000
+_LONGEST_TIME = 64
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
 _FACTORS = {
@@ -181,6 +182,13 @@ class Sheet:
         if column in self._silent:
             made[self._silent[column]] = ""
         return list(made)
+
+    def cells(self, column: int) -> Sequence[str]:
+        """A column as text, spaces around included; without an object per cell where that can be."""
+        plain = not self.slow and column not in self._silent and self.lines.data.isascii() and len(self) > 0
+        if not plain or column >= self.quick.ends.shape[1] or int(self.quick.width(column).max()) > _LONGEST_TIME:
+            return self.texts(column)
+        return _alike.Cells(_table.texts(self.lines, self.quick.start(column), self.quick.ends[:, column]))
 
     def _cells(self, column: int) -> list[str]:
         """Texts of the quick rows."""
@@ -370,10 +378,11 @@ def rows(
     if column is None:
         return None
     decided.begin(len(sheet), foot=sheet.foot)
-    texts = sheet.texts(column)
+    texts = sheet.cells(column)
     day = sheet.find(r"(custom )?date( local| utc)?")
     if day is not None and day != column:
-        texts = [f"{date} {time}".strip() for date, time in zip(sheet.texts(day), texts, strict=True)]
+        pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
+        texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = sheet.plain[column], sheet.unit(column)
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
@@ -382,7 +391,7 @@ def rows(
     clock, cells, warnings = _stamps.read(texts, options, unit=count, day=before)
     if any(texts):
         decided.agree("times", (clock, *warnings))
-    if clock == "wall" and utc and len(cells):
+    if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
     made = _rows.built(
         sheet.lines, sheet.row, {"time": cells}, options, reader=reader, reason=lambda _line: None, clock=clock,

@@ -169,8 +169,10 @@ def read(
         Bytes or floats for it.
     warnings : list of str
     """
-    shown = [text.strip().strip('"').strip() for text in texts]
-    groups = _alike.grouped(shown)
+    shown, groups = texts, texts.grouped() if isinstance(texts, _alike.Cells) else None
+    if groups is None:
+        shown = [_alike.bare(text) for text in texts]
+        groups = _alike.grouped(shown)
     some, counts, of_day = (
         sum(len(part) for part in groups if known(part.first)) for known in (bool, _NUMBER.fullmatch, _OF_DAY.fullmatch)
     )

@@ -387,10 +387,10 @@ def rows(
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
-    before: _stamps.Day = decided.kept.setdefault("day", _stamps.Day())
-    clock, cells, warnings = _stamps.read(texts, options, unit=count, day=before)
+    course: _stamps.Course = decided.kept.setdefault("times", _stamps.Course())
+    clock, cells, warnings = _stamps.read(texts, options, unit=count, course=course)
     if any(texts):
-        decided.agree("times", (clock, *warnings))
+        decided.agree("times", (clock, course.day_first, *warnings))
     if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
     made = _rows.built(

@@ -141,15 +141,26 @@ def _day_first(texts: Sequence[str], groups: Iterable[_alike.Alike]) -> bool | N
 
 
 @dataclass
-class Day:
-    """Where times of the day have come to in the blocks before: the last of them [s], and midnights since the first."""
+class Course:
+    """Where a column of times has come to.
+
+    Parameters
+    ----------
+    last_s : float
+        The last time of the day [s].
+    midnights : int
+        Since the first.
+    day_first : bool or None
+        Whether the day of a date came before its month, as the last part of the column says.
+    """
 
     last_s: float = np.nan
     midnights: int = 0
+    day_first: bool | None = False
 
 
 def read(
-    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, day: Day | None = None
+    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, course: Course | None = None
 ) -> tuple[str, AnyArray, list[str]]:
     """A column of times in any of the known forms.
 
@@ -158,8 +169,8 @@ def read(
     texts : sequence of str
     unit : {"s", "ms"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
-    day : Day, optional
-        Of the column's part before; brought to its end.
+    course : Course, optional
+        Of the column's part before; brought to the end of this one.
 
     Returns
     -------
@@ -179,8 +190,10 @@ def read(
     if counts * 2 > some and not any(_DIGITS.fullmatch(text) for text in islice(filter(None, shown), 3)):
         return _numbers(shown, groups, unit)
     if of_day * 2 > some:
-        return _of_day(shown, groups, options, day or Day())
+        return _of_day(shown, groups, options, course or Course())
     first = _day_first(shown, groups)
+    if course is not None:
+        course.day_first = first
     warnings = ["the dates can be read with the day or the month first: the month was taken"] if first is None else []
     parts = [(part.at, _in_common(part, shown, bool(first))) for part in groups]
     cells = np.zeros(len(shown), dtype=f"S{max((made.dtype.itemsize for _, made in parts), default=1)}")
@@ -214,7 +227,7 @@ def _numbers(
 
 
 def _of_day(
-    texts: Sequence[str], groups: Iterable[_alike.Alike], options: ReadOptions, day: Day
+    texts: Sequence[str], groups: Iterable[_alike.Alike], options: ReadOptions, course: Course
 ) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
     seconds = np.full(len(texts), np.nan)
@@ -223,8 +236,8 @@ def _of_day(
         if found := _OF_DAY.fullmatch(part.first):
             marked |= bool(found[5])
             seconds[part.at] = _seconds_of(part, found, texts)
-    midnights = day.midnights + np.cumsum(np.nan_to_num(np.diff(seconds, prepend=day.last_s)) < -43_200)
-    day.last_s, day.midnights = float(seconds[-1]), int(midnights[-1])
+    midnights = course.midnights + np.cumsum(np.nan_to_num(np.diff(seconds, prepend=course.last_s)) < -43_200)
+    course.last_s, course.midnights = float(seconds[-1]), int(midnights[-1])
     seconds = seconds + 86_400.0 * midnights
     date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):

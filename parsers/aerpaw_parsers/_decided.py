@@ -10,6 +10,9 @@ from collections.abc import Callable, Hashable, Iterable, Iterator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import pandas as pd
+
+from aerpaw_cmp.common.units import BoolArray
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import InBlocks, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
@@ -106,3 +109,15 @@ def finished(result: ReadResult, streams: Iterable[Stream], *warnings: str) -> R
     back = _frames.steps_back(kept[0].frame) if kept else []
     more = dict.fromkeys([*warnings, *back])
     return blocks.with_warnings(replace(result, streams=kept), without="^time steps back at ", more=tuple(more))
+
+
+def without(frame: pd.DataFrame, where: BoolArray) -> pd.DataFrame:
+    """A frame without some rows; the old one is emptied column by column: one more of a large log is too much."""
+    if not where.any():
+        return frame
+    keep, content = ~where, {}
+    for name in map(str, frame.columns.tolist()):
+        values = frame.pop(name).to_numpy()[keep]
+        content[name] = pd.Series(values, dtype=object, copy=False) if values.dtype == object else values
+    made: pd.DataFrame = pd.DataFrame(content, copy=False)
+    return made

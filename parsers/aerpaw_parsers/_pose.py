@@ -88,10 +88,11 @@ def settled(stream: Stream, decided: _decided.Decided) -> tuple[Stream, list[str
     Rows without a position are left out unless all are; altitudes above sea level are brought to height above the
     first position; angles are degrees unless the column names radians or no yaw of the log is beyond 2 pi.
     """
-    frame, warnings = stream.frame, []
+    frame = stream.frame
+    warnings: list[str] = []
     lost = np.isnan(frame["latitude_deg"].to_numpy())
-    if lost.any() and not lost.all():
-        frame = frame[~lost].reset_index(drop=True)
+    if not lost.all():
+        frame = _decided.without(frame, lost)
     altitude = frame["altitude_m"].to_numpy()
     known = np.flatnonzero(np.isfinite(altitude) & ~np.isnan(frame["latitude_deg"].to_numpy()))
     zero = float(altitude[known[0]]) if len(known) else 0.0

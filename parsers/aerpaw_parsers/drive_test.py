@@ -190,7 +190,8 @@ def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadR
     _carry_on(levels, readings, decided)
     columns = [*ranks, *others, *_beside(sheet, cells, decided)]
     names = [_stream_name(sheet, column) for column in columns]
-    decided.kept["order"] = names
+    if len(sheet):
+        decided.kept["order"] = names
     if len(set(names) | _TAKEN) < len(names) + len(_TAKEN):
         decided.one_piece()  # which of two columns of one name has values all rows say
     streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
@@ -230,28 +231,32 @@ def _carry_on(levels: list[Stream], readings: _cells.Table, decided: _decided.De
 
 
 def _beside(sheet: _sheet.Sheet, cells: list[_Cell], decided: _decided.Decided) -> list[int]:
-    """Columns beside a serving level; marked where values stand in rows of their own: Nemo writes a row per event."""
+    """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
     found = []
     for cell in cells:
-        if cell.rsrp is None or not cell.serving:
+        if cell.rsrp is None or not cell.serving or not len(sheet):
             continue
         silent = np.isnan(sheet.numbers(cell.rsrp))
         for column in cell.beside.values():
-            found.append(column)
-            name = _stream_name(sheet, column)
-            decided.kept.setdefault("beside", set()).add(name)
-            if np.isfinite(sheet.numbers(column)[silent]).any():
-                decided.marks.add(("alone", name))
+            alone = bool(np.isfinite(sheet.numbers(column)[silent]).any())
+            shown = decided.kept.setdefault(("alone", column), alone)
+            if alone and not shown:
+                decided.one_piece()  # the blocks before left it out
+            if shown:
+                found.append(column)
     return found
 
 
 def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
     """What only the whole table says."""
     order: list[str] = decided.kept.get("order", [])
-    beside: set[str] = decided.kept.get("beside", set())
     streams: list[Stream] = []
     warnings: list[str] = []
-    for stream in _cells.settled(result).streams:
+    for stream in result.streams:
+        if "serving" in stream.frame:  # a block may have cut an instant in two
+            twice = np.ones(len(stream.frame), dtype=bool)
+            twice[_cells._once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
+            stream = replace(stream, frame=_decided.without(stream.frame, twice))
         if stream.kind == "telemetry":
             stream, warnings = _pose.settled(stream, decided)
         elif "serving" in stream.frame:
@@ -261,9 +266,8 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
             about |= {"arfcn": int(*numbers)} if len(numbers) == 1 else {}
             columns = [name for name in stream.frame if name not in _cells.BESIDE]
             columns += [name for name in _cells.BESIDE if name in stream.frame and stream.frame[name].notna().any()]
-            stream = replace(stream, attributes=about, frame=stream.frame[columns])
-        elif stream.name in beside and ("alone", stream.name) not in decided.marks:
-            continue
+            frame = stream.frame if list(stream.frame) == columns else stream.frame[columns]  # no copy in vain
+            stream = replace(stream, attributes=about, frame=frame)
         streams.append(stream)
 
     def place(stream: Stream) -> tuple[int, str, int, int]:

@@ -187,13 +187,21 @@ def phone(i: int, pci: str, level: str = "-90", quality: str = "-9", arfcn: str 
     [
         [phone(0, "20"), phone(1, "5", other="20"), phone(2, "", "", "", "", "5"), phone(3, "20", other="5")],
         [phone(0, "7"), phone(1, "7", arfcn="2000"), phone(2, "8")],  # two carriers of one cell
-        [phone(0, "7"), phone(1, "", "", "-12"), phone(2, "7", quality="")],  # a quality in a row of its own
+        [phone(0, "", "", "-12"), phone(1, "7"), phone(2, "7", quality="")],  # a quality in a row of its own
         [phone(0, "7", quality=""), phone(1, "7"), phone(2, "3.5")],
     ],
 )
 def test_cells_of_a_drive_test_in_blocks(rows: list[bytes]) -> None:
     data = PHONE + b"".join(rows)
     same(in_parts("drive_test", data), by_name("drive_test").read(data, OPTIONS))
+
+
+def test_a_quality_that_has_rows_of_its_own_later_sends_the_table_to_be_read_in_one_piece() -> None:
+    rows = [phone(0, "7"), phone(1, "", "", "-12"), phone(2, "7", quality="")]
+    with pytest.raises(blocks.Whole):
+        in_parts("drive_test", PHONE + b"".join(rows))
+    whole = by_name("drive_test").read(PHONE + b"".join(rows), OPTIONS)
+    assert [(stream.name, len(stream.frame)) for stream in whole.streams if stream.kind == "kpi"] == [("rsrq", 2)]
 
 
 def test_the_cell_that_serves_is_known_from_the_block_before() -> None:

@@ -77,6 +77,24 @@ def test_reports_whose_times_are_of_two_forms_are_read_in_one_piece(monkeypatch:
     assert in_blocks(iter([line * 9]), PLAIN).accepted == 9
 
 
+def test_reports_with_times_of_the_day_alone_are_read_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whether midnight has passed the block before tells: those after it were placed a day early."""
+    line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
+    (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
+    data = b"".join(
+        line.replace(epoch, b'"%s"' % time) for time in (b"23:59:58", b"23:59:59", b"00:00:00", b"00:00:01")
+    )
+    options = replace(PLAIN, file_name="gnb_2025-03-02.json")
+    time = by_name("srsran_json").read(data, options).streams[0].frame["time"].to_numpy()
+    assert (time[1:] - time[:-1] == np.timedelta64(1, "s")).all()
+    in_blocks = by_name("srsran_json").in_blocks
+    assert in_blocks is not None
+    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
+    pieces = data.splitlines(keepends=True)
+    with pytest.raises(blocks.Whole):
+        in_blocks(iter(pieces), options)
+
+
 def test_oai_layouts() -> None:
     gnb = read("oai_log", samples.OAI_GNB)
     rank = next(one for one in gnb.streams if one.kind == "rank")

@@ -179,6 +179,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
     """What each row says by itself, and the cell that served before."""
     sheet = _sheet.read(data, is_header)
+    decided.agree("a header among the first lines", sheet is not None)
     rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")

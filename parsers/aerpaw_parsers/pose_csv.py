@@ -43,6 +43,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
     """What each row says by itself."""
     sheet = _sheet.read(data, is_header)
+    decided.agree("a header among the first lines", sheet is not None)
     rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")

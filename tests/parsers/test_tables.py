@@ -175,6 +175,14 @@ def test_blocks_that_decide_otherwise_send_the_table_to_be_read_in_one_piece(row
         in_parts("pose_csv", POSES + b"".join(rows))
 
 
+def test_a_header_far_below_is_none_in_blocks_either() -> None:
+    data = b"a line of talk\n" * 70 + POSES + pose(0) + pose(1)
+    assert by_name("pose_csv").read(data, OPTIONS).accepted == 0
+    lines = data.splitlines(keepends=True)
+    with pytest.raises(blocks.Whole):
+        in_two("pose_csv", [b"".join(lines[:65]), b"".join(lines[65:])], OPTIONS)
+
+
 PHONE = b"Timestamp,LTEPCI,RSRP,RSRQ,EARFCN,NRxRSRP,N1 PCI\n"
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
 
 _AS_ZERO = bytes.maketrans(b"123456789", b"000000000")
+_ZERO_FOR_DIGITS = np.frombuffer(bytes(range(256)).translate(_AS_ZERO), dtype=np.uint8)
 _FEW = 8
 """Fewer texts are sooner read one by one."""
 _MOST_FORMS = 16
@@ -97,17 +98,20 @@ class Cells(Sequence[str]):
         """As :func:`grouped`; None where there are many forms, or where marks or spaces stand around a text."""
         width = self.cells.dtype.itemsize
         table = np.ascontiguousarray(self.cells).view(np.uint8).reshape(len(self), width)
-        forms = np.where((table >= 49) & (table <= 57), np.uint8(48), table)
-        left = np.arange(len(self))
+        forms = np.zeros((len(self), -(-width // 8) * 8), dtype=np.uint8)
+        forms[:, :width] = _ZERO_FOR_DIGITS[table]
+        left, words = np.arange(len(self)), forms.view(np.uint64)
         made: list[Alike] = []
         while len(left):
-            alike = (forms[left] == forms[left[0]]).all(axis=1)
-            at, left = left[alike], left[~alike]
+            alike = np.logical_and.reduce([word == word[0] for word in words.T])
+            at = left[alike]
             first = self[int(at[0])]
             if len(made) == _MOST_FORMS or first != bare(first):
                 return None
             few = len(at) < _FEW or not first
-            made.append(Alike(first, at, np.zeros((0, 0), dtype=np.uint8) if few else table[at, : len(first)]))
+            cells = table if len(at) == len(table) else table[at]
+            made.append(Alike(first, at, np.zeros((0, 0), dtype=np.uint8) if few else cells[:, : len(first)]))
+            left, words = left[~alike], words[~alike]
         return made
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -10,8 +10,10 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _lines, _rows
+from . import _decided, _lines, _rows
 
+RATS = ("", "lte", "nr")
+"""Radio accesses; the first where a log does not say."""
 BESIDE = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
 RANGE_DBM = (-170.0, -1.0)
 """RSRP beyond these is a sentinel (2147483647, 0) or a mistake."""
@@ -26,7 +28,7 @@ class Reading:
     row : int
         Index into the rows.
     rat : str
-        ``lte`` or ``nr``, or an empty text.
+        One of :data:`RATS`.
     pci : float
         Physical cell identity, NaN where unknown.
     arfcn : float
@@ -53,7 +55,8 @@ class Table:
     Parameters
     ----------
     row : int array, shape (n,)
-    rat : object array, shape (n,)
+    rat : int array, shape (n,)
+        Index into :data:`RATS`.
     pci, arfcn, rsrp_dbm : float array, shape (n,)
     serving : bool array, shape (n,)
     beside : float array, shape (4, n)
@@ -67,18 +70,6 @@ class Table:
     serving: BoolArray
     beside: FloatArray
 
-    def take(self, pick: AnyArray) -> Table:
-        """Some of them, by index or mask."""
-        return Table(
-            row=self.row[pick],
-            rat=self.rat[pick],
-            pci=self.pci[pick],
-            arfcn=self.arfcn[pick],
-            rsrp_dbm=self.rsrp_dbm[pick],
-            serving=self.serving[pick],
-            beside=self.beside[:, pick],
-        )
-
 
 def table(readings: Iterable[Reading]) -> Table:
     """Readings, one by one, as columns."""
@@ -86,7 +77,7 @@ def table(readings: Iterable[Reading]) -> Table:
     pci, arfcn, rsrp = (np.array([getattr(one, name) for one in found], dtype=np.float64) for name in _NUMBERS)
     return Table(
         row=np.array([one.row for one in found], dtype=np.int64),
-        rat=np.array([one.rat for one in found], dtype=object),
+        rat=np.array([RATS.index(one.rat) for one in found], dtype=np.int8),
         pci=pci,
         arfcn=arfcn,
         rsrp_dbm=rsrp,
@@ -106,43 +97,59 @@ def joined(tables: Sequence[Table]) -> Table:
     return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
 
 
-def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str) -> list[Stream]:
+def streams(
+    rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str, before: Mapping[str, float] | None = None
+) -> list[Stream]:
     """A stream per radio access and PCI; a cell that is told twice at one time is kept once, as serving.
 
     A cell is serving from the moment that the log says so until it names another of the same radio access.
+
+    Parameters
+    ----------
+    rows : Rows
+    readings : Table or iterable of Reading
+    source : str
+    before : mapping of str to float, optional
+        PCI of the cell that served, by radio access, where these rows begin.
     """
     found = readings if isinstance(readings, Table) else table(readings)
-    found = found.take(np.isfinite(found.rsrp_dbm))
-    found = found.take(np.argsort(found.row, kind="stable"))
-    served = _serving(found)
+    order = np.argsort(found.row, kind="stable")
+    order = order[np.isfinite(found.rsrp_dbm[order])]
+    rats, pci = found.rat[order], found.pci[order]
+    served = _serving(found, order, before or {})
+    key = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
     made: list[Stream] = []
-    for rat in sorted(set(found.rat.tolist())):
-        of_rat = np.flatnonzero(found.rat == rat)
-        pci = found.pci[of_rat]
-        key = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
-        for one in np.unique(key).tolist():
-            pick = of_rat[key == one]
-            made.append(_stream(rows, found.take(pick), served[pick], rat, one, source))
+    for rat in np.unique(rats).tolist():
+        of_rat = np.flatnonzero(rats == rat)
+        cell = key[of_rat]
+        for one in np.unique(cell).tolist():
+            pick = of_rat[cell == one]
+            made.append(_stream(rows, found, order[pick], served[pick], RATS[rat], one, source))
     return made
 
 
-def _serving(found: Table) -> FloatArray:
+def _serving(found: Table, order: IntArray, before: Mapping[str, float]) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
-    served = np.full(len(found.row), np.nan)
-    for rat in set(found.rat.tolist()):
-        mine = np.flatnonzero(found.rat == rat)
-        told = mine[found.serving[mine]]
+    row, rats, pci, serving = (column[order] for column in (found.row, found.rat, found.pci, found.serving))
+    served = np.full(len(order), np.nan)
+    for rat, one in before.items():
+        mine = np.flatnonzero(rats == RATS.index(rat))
+        served[mine] = pci[mine] == one
+    for rat in np.unique(rats[serving]).tolist():
+        mine = np.flatnonzero(rats == rat)
+        told = mine[serving[mine]]
         # all readings of a row at once: the serving one may stand behind its neighbours
-        last = np.searchsorted(found.row[told], found.row[mine], side="right") - 1
+        last = np.searchsorted(row[told], row[mine], side="right") - 1
         known = last >= 0
-        now = found.pci[told][last[known]] if len(told) else np.zeros(0)
         mine = mine[known]
-        served[mine] = (found.serving[mine] | (found.pci[mine] == now)).astype(np.float64)
+        served[mine] = serving[mine] | (pci[mine] == pci[told[last[known]]])
     return served
 
 
 def _once(time: AnyArray, served: FloatArray) -> IntArray:
     """Rows to keep: of two readings of one instant the serving one."""
+    if (time[1:] > time[:-1]).all():
+        return np.arange(len(time))
     order = np.lexsort((-np.nan_to_num(served), time))
     return np.asarray(np.sort(order[np.concatenate(([True], np.diff(time[order]) != np.timedelta64(0)))]))
 
@@ -152,27 +159,35 @@ def settled(result: ReadResult) -> ReadResult:
     streams = []
     for stream in result.streams:
         if stream.kind == "rss" and "serving" in stream.frame:
-            keep = _once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())
-            if len(keep) < len(stream.frame):
-                stream = replace(stream, frame=stream.frame.iloc[keep].reset_index(drop=True))
+            twice = np.ones(len(stream.frame), dtype=bool)
+            twice[_once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
+            stream = replace(stream, frame=_decided.without(stream.frame, twice))
         streams.append(stream)
     return replace(result, streams=tuple(streams))
 
 
-def _stream(rows: _rows.Rows, mine: Table, served: FloatArray, rat: str, pci: float, source: str) -> Stream:
-    keep = _once(rows.time[mine.row], served)
-    mine, served = mine.take(keep), served[keep]
-    flag = rows.flag[mine.row].copy()
-    outside = ~((mine.rsrp_dbm >= RANGE_DBM[0]) & (mine.rsrp_dbm <= RANGE_DBM[1]))
+def _stream(
+    rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, rat: str, pci: float, source: str
+) -> Stream:
+    """Readings of one cell, in the order of the log."""
+    keep = _once(rows.time[found.row[pick]], served)
+    if len(keep) < len(pick):
+        pick, served = pick[keep], served[keep]
+    row, level = found.row[pick], found.rsrp_dbm[pick]
+    flag = rows.flag[row]
+    outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
     _lines.add_flag(flag, outside, "out_of_coverage")
-    values: dict[str, FloatArray] = {"rss_db": np.where(outside, np.nan, mine.rsrp_dbm), "serving": served}
-    for name, column in zip(BESIDE, mine.beside, strict=True):
-        if np.isfinite(column).any():
-            values[name] = column
-    numbers = np.unique(mine.arfcn[np.isfinite(mine.arfcn)])
+    level[outside] = np.nan
+    values: dict[str, FloatArray] = {"rss_db": level, "serving": served}
+    for name, column in zip(BESIDE, found.beside, strict=True):
+        mine = column[pick]
+        if np.isfinite(mine).any():
+            values[name] = mine
+    numbers = np.unique(found.arfcn[pick])
+    numbers = numbers[np.isfinite(numbers)]
     name = "_".join(part for part in (rat, f"pci{int(pci)}" if pci >= 0 else "rsrp") if part)
     made = rows.stream(
-        "rss", name, values, pick=mine.row, flag=flag, channel=rows.options.channel or name,
+        "rss", name, values, pick=row, flag=flag, channel=rows.options.channel or name,
         unit=rows.options.unit or "dBm", quantity="RSRP", rat=rat or None, pci=int(pci) if pci >= 0 else None,
         arfcn=int(numbers[0]) if len(numbers) == 1 else None, source=source,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""What whole columns of a table decide, gathered over its blocks: a table in one piece is one block.
+"""What whole columns of a log decide, gathered over its blocks: a log in one piece is one block.
 
 A block decides for itself where all blocks must decide alike (the form of times); what differs sends the table to be
 read in one piece. The rest is settled when all blocks are there.
@@ -17,7 +17,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import InBlocks, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _frames
+from . import _frames, _json
 
 
 @dataclass
@@ -84,6 +84,16 @@ def in_blocks(read: ReadBlock, settle: Settle, head: Callable[[bytes], int]) -> 
             head=lambda data, _options: head(data),
             settle=lambda result: settle(result, decided),
         )(pieces, options)
+
+    return read_log
+
+
+def json_in_blocks(read: ReadBlock) -> InBlocks:
+    """Reading JSON lines in blocks; each sees the last object of the one before, too, which must change nothing."""
+
+    def read_log(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+        decided = Decided()
+        return blocks.by_lines(lambda data, given: read(data, given, decided), apart=_json.WHOLE)(chunks, options)
 
     return read_log
 

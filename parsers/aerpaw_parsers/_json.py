@@ -65,13 +65,13 @@ def objects(lines: _lines.Lines) -> Objects:
         text = _bare(lines.raw(i))
         if text in (b"[", b"]"):
             continue
-        one = _loaded(text)
-        if one is None and tried < _MOST_TRIED and _goes_on(text):
+        one, goes_on = _loaded(text)
+        if goes_on and tried < _MOST_TRIED:
             ends = _ends(lines) if ends is None else ends
             last = _end_of(lines, i, ends)
             if last >= 0:
                 several = _bare(lines.data[lines.starts[i] : lines.ends[last]])
-                one = _loaded(several)
+                one, _ = _loaded(several)
                 more += range(i + 1, last + 1) if isinstance(one, dict) else ()
                 tried += 0 if isinstance(one, dict) else len(several)
         if isinstance(one, dict):
@@ -86,24 +86,14 @@ def _bare(text: bytes) -> bytes:
     return text.strip().lstrip(b"\xef\xbb\xbf").rstrip(b",")
 
 
-def _goes_on(text: bytes) -> bool:
-    """Whether a line begins an object and nothing in it is wrong: what lacks may stand on the next lines."""
-    if not text.startswith(b"{"):
-        return False
+def _loaded(text: bytes) -> tuple[Any, bool]:
+    """What a text is, None where it is no JSON; and whether it begins an object whose rest may stand on more lines."""
     try:
-        json.loads(text)
+        return json.loads(text), False
     except json.JSONDecodeError as error:
-        return error.pos >= len(error.doc)
+        return None, text.startswith(b"{") and error.pos >= len(error.doc)
     except (ValueError, RecursionError):
-        return False
-    return False
-
-
-def _loaded(text: bytes) -> Any:
-    try:
-        return json.loads(text)
-    except (ValueError, RecursionError):
-        return None
+        return None, False
 
 
 def _indent(line: bytes) -> bytes:
@@ -132,7 +122,7 @@ def first(head: bytes) -> dict[str, Any] | None:
         text = line.strip().lstrip(b"\xef\xbb\xbf").lstrip(b"[").rstrip(b",")
         if not text:
             continue
-        one = _loaded(text)
+        one, _ = _loaded(text)
         if one is None:  # perhaps one over several lines
             place = head.find(b"{")
             try:

@@ -44,9 +44,7 @@ _MOST = 1e9
 
 def has_position(names: list[str]) -> bool:
     """Whether plain names hold a latitude and a longitude."""
-    from re import fullmatch
-
-    return all(any(fullmatch(p, name) for p in form[:1] for name in names) for form in (LATITUDE, LONGITUDE))
+    return all(any(_sheet.matches(name, form[:1]) for name in names) for form in (LATITUDE, LONGITUDE))
 
 
 def from_sheet(
@@ -108,12 +106,12 @@ def settled(stream: Stream, decided: _decided.Decided) -> tuple[Stream, list[str
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
-    """Positions that cannot be (or 0, 0) made NaN, in place; their mask."""
+    """Put NaN for positions that cannot be (or 0, 0) into a dictionary of columns; their mask."""
     latitude, longitude = values["latitude_deg"], values["longitude_deg"]
     lost: AnyArray = np.asarray(
         ~((np.abs(latitude) <= 90) & (np.abs(longitude) <= 180)) | ((latitude == 0) & (longitude == 0))
     )
-    latitude[lost], longitude[lost] = np.nan, np.nan
+    values |= {"latitude_deg": np.where(lost, np.nan, latitude), "longitude_deg": np.where(lost, np.nan, longitude)}
     rows.mark(lost, "no_fix")
     return lost
 

@@ -34,8 +34,8 @@ class Quantity:
 _TABLE: tuple[tuple[str, Quantity], ...] = (
     # the first that fits: 'PDSCH rank' before 'PDSCH throughput', 'RSSNR' before 'RSS'
     (r"\b(pdsch rank|rank indicat(or|ion)|ri|num(ber of)? layers|dl ri|dl layer num)\b", Quantity("rank", "rank", "")),
-    (r"\brs ?rp\b|\bss ?rsrp\b|\brsrp\b", Quantity("rss", "RSRP", "dBm")),
-    (r"\brsrq\b", Quantity("kpi", "RSRQ", "dB")),
+    (r"\brs ?rp\b|\bss ?rsrp\b|\b(nrx)?rsrp\b", Quantity("rss", "RSRP", "dBm")),
+    (r"\b(nrx)?rsrq\b", Quantity("kpi", "RSRQ", "dB")),
     (r"\b(rs ?)?s(i)?nr\b|\brssnr\b", Quantity("kpi", "SINR", "dB")),
     (r"\brssi\b", Quantity("rss", "RSSI", "dBm")),
     (r"\bcqi\b", Quantity("kpi", "CQI", "")),

@@ -10,7 +10,7 @@ import csv
 import re
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 
 import numpy as np
 
@@ -28,11 +28,18 @@ _MOST_TEXTS = 200_000
 _LONGEST_TIME = 64
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
-_FACTORS = {
-    "ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0, "mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6,
-    "kts": 0.514444, "knots": 0.514444, "deg": 1.0, "degrees": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi,
-    "kbps": 1e3, "mbps": 1e6, "kbit/s": 1e3, "mbit/s": 1e6, "bps": 1.0, "bit/s": 1.0,
+_READ_IN = {
+    "m": {"ft": 0.3048, "feet": 0.3048, "m": 1.0, "meters": 1.0},
+    "m/s": {"mph": 0.44704, "m/s": 1.0, "km/h": 1 / 3.6, "kmh": 1 / 3.6, "kts": 0.514444, "knots": 0.514444},
+    "deg": {"deg": 1.0, "degrees": 1.0, "rad": 180 / np.pi, "radians": 180 / np.pi},
+    "bit/s": {
+        "bps": 1.0, "bit/s": 1.0, "kbps": 1e3, "kbit/s": 1e3, "mbps": 1e6, "mbit/s": 1e6, "gbps": 1e9, "gbit/s": 1e9,
+    },
+    "dB": {"db": 1.0},
+    "dBm": {"dbm": 1.0},
 }  # fmt: skip
+"""Units of values as they are read, and what one of each unit that a header may have is in them."""
+_FACTORS = {written: (unit, one) for unit, many in _READ_IN.items() for written, one in many.items()}
 
 IsHeader = Callable[[list[str]], bool]
 
@@ -113,6 +120,8 @@ class Sheet:
         Is a comma in a number its decimal sign?
     foot : bool
         Do words stand below the table?
+    units : dict of int to str
+        Units of columns whose names have none.
     """
 
     lines: _lines.Lines
@@ -126,7 +135,9 @@ class Sheet:
     rejected: list[RejectedLine] = field(default_factory=list)
     comma: bool = False
     foot: bool = False
+    units: dict[int, str] = field(default_factory=dict)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
+    _numbers: dict[int, FloatArray] = field(default_factory=dict)
 
     def __len__(self) -> int:
         """Count the rows."""
@@ -145,21 +156,25 @@ class Sheet:
 
     def find(self, *patterns: str) -> int | None:
         """The first column whose plain name is wholly one of the patterns; earlier patterns are preferred."""
-        for pattern in patterns:
-            for i, name in enumerate(self.plain):
-                if re.fullmatch(pattern, name):
-                    return i
-        return None
+        any_of, *each = _compiled(patterns)
+        names = [(i, name) for i, name in enumerate(self.plain) if any_of.fullmatch(name)]
+        return next((i for pattern in each for i, name in names if pattern.fullmatch(name)), None)
 
     def unit(self, column: int) -> str:
-        """Unit in brackets at the end of a column's name, or an empty text."""
+        """Unit in brackets at the end of a column's name, or the one that is known of it, or an empty text."""
         found = _UNIT.search(self.names[column])
-        return found[1].strip().lower() if found else ""
+        return found[1].strip().lower() if found else self.units.get(column, "")
+
+    def unit_read(self, column: int) -> str:
+        """Unit of :meth:`numbers`."""
+        unit = self.unit(column)
+        return _FACTORS[unit][0] if unit in _FACTORS else unit
 
     def silence(self, where: BoolArray, columns: Iterable[int]) -> None:
         """Read the cells of some rows as empty."""
         for column in columns:
             self._silent[column] = where
+            self._numbers.pop(column, None)
 
     def keep(self, where: BoolArray) -> None:
         """Leave the rows out that a mask does not hold."""
@@ -172,6 +187,7 @@ class Sheet:
         self.slow_at = at[self.slow_at[slow]]
         self.row = self.row[where]
         self._silent = {column: mask[where] for column, mask in self._silent.items()}
+        self._numbers = {}
 
     def texts(self, column: int) -> list[str]:
         """A column as text."""
@@ -203,22 +219,34 @@ class Sheet:
         return self.lines.data.decode("ascii") if self.lines.data.isascii() else None
 
     def numbers(self, column: int) -> FloatArray:
-        """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN."""
-        factor = _FACTORS.get(self.unit(column), 1.0)
-        out = np.full(len(self), np.nan)
-        if len(self.quick.rows) and column < self.quick.ends.shape[1]:
-            out[self.quick_at] = self._quick_numbers(column)
+        """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN. Read only."""
+        if column not in self._numbers:
+            self._numbers[column] = self._parsed(column)
+            self._numbers[column].flags.writeable = False  # the next who asks gets the same
+        return self._numbers[column]
+
+    def _parsed(self, column: int) -> FloatArray:
+        factor = _FACTORS.get(self.unit(column), ("", 1.0))[1]
+        quick = len(self.quick.rows) > 0 and column < self.quick.ends.shape[1]
+        if quick and not self.slow:
+            out = self._quick_numbers(column)
+        else:
+            out = np.full(len(self), np.nan)
+            if quick:
+                out[self.quick_at] = self._quick_numbers(column)
         if self.slow:
             texts = [cells[column] for cells in self.slow]
             known = {text: _number(text.strip()) for text in set(texts)}  # few distinct texts in most columns
             out[self.slow_at] = [known[text] for text in texts]
         if column in self._silent:
             out[self._silent[column]] = np.nan
-        return out * factor
+        return out if factor == 1.0 else out * factor
 
     def _quick_numbers(self, column: int) -> FloatArray:
         begin, end, data = self.quick.start(column), self.quick.ends[:, column], self.lines.data
-        begin = begin + ((end > begin) & (self.lines.buffer[np.minimum(begin, len(data) - 1)] == 32))
+        spaced = self.lines.buffer[np.minimum(begin, len(data) - 1)] == 32
+        if spaced.any():
+            begin = begin + (spaced & (end > begin))
         read = _by_eights.decimals(self._pointed, _table.Fields(self.quick.rows, begin, end[:, None]), [0])
         value, odd = read.value[0], np.flatnonzero(read.odd[0])
         known: dict[bytes, float] = {}
@@ -229,6 +257,17 @@ class Sheet:
                 found = known[cell] = _number(cell.decode(_form(column), "replace").strip())
             value[i] = found
         return value
+
+
+@cache
+def _compiled(patterns: tuple[str, ...]) -> list[re.Pattern[str]]:
+    """Patterns for whole names: all of them as one, and then each."""
+    return [re.compile(text) for text in ("|".join(f"(?:{one})" for one in patterns), *patterns)]
+
+
+def matches(name: str, patterns: tuple[str, ...]) -> bool:
+    """Whether a plain name is wholly one of the patterns."""
+    return _compiled(patterns)[0].fullmatch(name) is not None
 
 
 def _form(column: int) -> str:
@@ -253,20 +292,21 @@ def head_bytes(is_header: IsHeader) -> Callable[[bytes], int]:
     return head
 
 
-def read(data: bytes, is_header: IsHeader) -> Sheet | None:
-    """The table of a file, None where no line is its header."""
-    lines = _lines.split(data)
-    found = header_of([lines.raw(i) for i in range(min(len(lines), TITLES))], is_header)
+def read(data: bytes, is_header: IsHeader, decided: _decided.Decided) -> Sheet | None:
+    """The table of a file or of a block of it, None where no line is its header; all blocks have one, or none has."""
+    found = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
+    decided.agree("a header among the first lines", found is not None)
     if found is None:
         return None
     at, separator, names = found
-    quick = _quick(lines, at, separator, names)
+    lines, fields = _by_eights.table(data, len(names), ord(separator))
+    quick = _quick(lines, fields, at, separator, names)
     left = ~lines.blank
     left[: at + 1] = False
     left[quick.rows] = False
     rest = _rest(lines, np.flatnonzero(left), separator, names)
     number = np.array(rest.number, dtype=np.int64)
-    row = np.sort(np.concatenate((quick.rows, number)))
+    row = np.sort(np.concatenate((quick.rows, number))) if len(number) else quick.rows
     last = int(row[-1]) if len(row) else at
     foot = [line.number - 1 for line in rest.rejected if line.number - 1 > last and separator not in line.text]
     if foot and lines.unterminated and foot[-1] == len(lines) - 1:
@@ -277,7 +317,7 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
         names=names,
         row=row,
         quick=quick,
-        quick_at=np.searchsorted(row, quick.rows),
+        quick_at=np.searchsorted(row, quick.rows) if len(number) else np.arange(len(row)),
         slow=rest.cells,
         slow_at=np.searchsorted(row, number),
         blank_rows=np.array([*range(at + 1), *rest.repeats, *foot], dtype=np.int64),
@@ -287,10 +327,9 @@ def read(data: bytes, is_header: IsHeader) -> Sheet | None:
     )
 
 
-def _quick(lines: _lines.Lines, at: int, separator: str, names: list[str]) -> _table.Fields:
-    """Rows that separators alone divide: as many cells as names, no quote, and no repeated header."""
+def _quick(lines: _lines.Lines, found: _table.Fields, at: int, separator: str, names: list[str]) -> _table.Fields:
+    """Of the lines with as many cells as names the rows that separators alone divide: no quote, no repeated header."""
     width = len(names)
-    found = _table.fields(lines, width, ord(separator))
     if 2 * len(found.rows) < len(lines) - at and len(lines) > at + 1:
         others = [_table.fields(lines, width + 1, ord(separator))]  # a separator at the end of each row
         if not names[-1]:
@@ -398,7 +437,8 @@ def rows(
         extra=sheet.rejected, markup=sheet.blank_rows,
     )  # fmt: skip
     made.warnings += warnings
-    sheet.keep(np.isin(sheet.row, made.row))
+    if len(made.row) < len(sheet.row):
+        sheet.keep(np.isin(sheet.row, made.row))
     return made
 
 

@@ -27,8 +27,6 @@ _DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})
 _OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
-DATELESS = "the times have no date"
-"""How a warning begins where times of the day are read: one before tells which day it is."""
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
@@ -241,13 +239,13 @@ def _of_day(
     seconds = seconds + 86_400.0 * midnights
     date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
-        return "relative_s", seconds, [f"{DATELESS} and the file name has none either"]
+        return "relative_s", seconds, ["the times have no date and the file name has none either"]
     stamps = np.datetime64(date, "us") + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
     cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     cells = np.where(np.isnan(seconds), b"-", cells)
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
     source = "time_origin" if options.time_origin else "the file name"
-    return "wall", cells, [f"{DATELESS}: it is that of {source}, {date}", *warnings]
+    return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
 
 
 def _seconds_of(part: _alike.Alike, found: re.Match[str], texts: Sequence[str]) -> FloatArray:

@@ -12,7 +12,6 @@ rank.
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable
 from typing import Any
 
 import numpy as np
@@ -21,7 +20,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _agreeing, _json, _lines, _rows, _time
+from . import _decided, _json, _lines, _rows, _time
 
 _STAMP = rb"^\[(" + _time.TIME + rb")\] *"
 _TITLE = re.compile(
@@ -92,17 +91,17 @@ def sniff_json(head: bytes) -> bool:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE, cell and answer; one without the time that the others have is rejected."""
-    return _read_answers(data, options, set())
+    return _read_answers(data, options, _decided.Decided())
 
 
-def _read_answers(data: bytes, options: ReadOptions, kinds: set[Hashable]) -> ReadResult:
-    """Answers of a block; ``kinds`` gathers whether they have ``utc``, which no log may change half way."""
+def _read_answers(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
+    """Answers of a block; whether they have ``utc`` no log may change half way."""
     lines = _lines.split(data)
     answers = _json.objects(lines)
     found = answers.found
     has_utc = any("utc" in one for one in found)
     if found:
-        kinds.add(has_utc)
+        decided.agree("utc", has_utc)
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
@@ -141,5 +140,5 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_agreeing.in_blocks(_read_answers),
+    in_blocks=_decided.json_in_blocks(_read_answers),
 )

@@ -45,6 +45,8 @@ _BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss"
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
+_OF_GNETTRACK = {"networktech", "networkmode"}
+"""Columns that it alone has."""
 _GNETTRACK = {
     r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
     r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
@@ -56,7 +58,7 @@ _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 def known(names: list[str]) -> list[str]:
     """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
     given = set(names)
-    if {"level", "qual"} <= given and given & {"networktech", "networkmode"}:
+    if {"level", "qual"} <= given and given & _OF_GNETTRACK:
         table = _GNETTRACK
     elif given >= _sheet.SRSUE:
         table = _SRSUE
@@ -70,7 +72,7 @@ def known(names: list[str]) -> list[str]:
 def is_header(names: list[str]) -> bool:
     """Whether names hold a time and a level, ratio or rank."""
     names = known(names)
-    times = any(re.fullmatch(pattern, name) for pattern in (*_sheet.TIME_NAMES, "date") for name in names)
+    times = any(_sheet.matches(name, (*_sheet.TIME_NAMES, "date")) for name in names)
     return times and any(pose_csv.has_radio(name) for name in names) and len(names) > 2
 
 
@@ -133,7 +135,10 @@ def _put(
 
 
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
-    """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role."""
+    """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role.
+
+    Levels of neighbours that no column names by a PCI are streams of their own, not levels of a cell.
+    """
     for (rat, role), cell in list(cells.items()):
         if cell.rsrp is not None:
             continue
@@ -147,8 +152,11 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             others += [column for key, column in cell.beside.items() if key in home.beside]
             home.beside = {**cell.beside, **home.beside}
             del cells[(rat, role)]
-    others += [column for cell in cells.values() if cell.rsrp is None for column in cell.beside.values()]
-    return [cell for cell in cells.values() if cell.rsrp is not None]
+    for key, cell in list(cells.items()):
+        if cell.rsrp is None or (cell.pci is None and not cell.serving):
+            others += [column for column in (cell.rsrp, *cell.beside.values()) if column is not None]
+            del cells[key]
+    return list(cells.values())
 
 
 def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
@@ -160,7 +168,8 @@ def _readings(sheet: _sheet.Sheet, cells: list[_Cell]) -> _cells.Table:
         pci, arfcn = (_or_nan(sheet, place, len(level))[row] for place in (cell.pci, cell.arfcn))
         beside = np.stack([_or_nan(sheet, cell.beside.get(name), len(level))[row] for name in _cells.BESIDE])
         pci = np.where(pci == np.round(pci), pci, np.nan)  # a fraction is no identity of a cell
-        rat, serving = np.full(len(row), cell.rat, dtype=object), np.full(len(row), cell.serving)
+        rat = np.full(len(row), _cells.RATS.index(cell.rat), dtype=np.int8)
+        serving = np.full(len(row), cell.serving)
         tables.append(
             _cells.Table(row=row, rat=rat, pci=pci, arfcn=arfcn, rsrp_dbm=level[row], serving=serving, beside=beside)
         )
@@ -178,8 +187,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
     """What each row says by itself, and the cell that served before."""
-    sheet = _sheet.read(data, is_header)
-    decided.agree("a header among the first lines", sheet is not None)
+    sheet = _sheet.read(data, is_header, decided)
     rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
@@ -187,8 +195,9 @@ def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadR
     cells, others, ranks = _places(sheet)
     readings = _readings(sheet, cells)
     track = _pose.from_sheet(rows, sheet, decided, name="phone", source="table of a phone")
-    levels = _cells.streams(rows, readings, source="drive test")
-    _carry_on(levels, readings, decided)
+    serving: dict[str, float] = decided.kept.setdefault("serving", {})
+    levels = _cells.streams(rows, readings, source="drive test", before=serving)
+    _carry_on(readings, serving, decided)
     columns = [*ranks, *others, *_beside(sheet, cells, decided)]
     names = [_stream_name(sheet, column) for column in columns]
     if len(sheet):
@@ -209,26 +218,18 @@ def _stream_name(sheet: _sheet.Sheet, column: int) -> str:
     return found[1].upper() if found else re.sub(r"\W+", "_", name)
 
 
-def _carry_on(levels: list[Stream], readings: _cells.Table, decided: _decided.Decided) -> None:
-    """Which cell serves the block before tells until this one does; noted for the next, with the carriers of cells."""
+def _carry_on(readings: _cells.Table, serving: dict[str, float], decided: _decided.Decided) -> None:
+    """Note for the next block which cell serves, and the carriers of cells for the end."""
     known = np.isfinite(readings.rsrp_dbm)
     key = np.where(readings.pci >= 0, readings.pci, -1.0)
     carried = np.flatnonzero(known & np.isfinite(readings.arfcn))
-    columns = (readings.rat[carried].tolist(), key[carried].tolist(), readings.arfcn[carried].tolist())
-    carriers: set[tuple[str, float, float]] = decided.kept.setdefault("carriers", set())
-    carriers |= set(zip(*columns, strict=True))
-    before: dict[str, float] = decided.kept.setdefault("serving", {})
-    for stream in levels:
-        rat, pci = str(stream.attributes.get("rat", "")), stream.attributes.get("pci")
-        if rat in before:
-            served = stream.frame["serving"].to_numpy()
-            stream.frame["serving"] = np.where(np.isnan(served), float(pci == before[rat]), served)
-    for rat in set(readings.rat.tolist()):
-        told = np.flatnonzero(known & readings.serving & (readings.rat == rat))
+    carriers: set[tuple[int, float, float]] = decided.kept.setdefault("carriers", set())
+    carriers.update(zip(*(one[carried].tolist() for one in (readings.rat, key, readings.arfcn)), strict=True))
+    for code, rat in enumerate(_cells.RATS):
+        told = np.flatnonzero(known & readings.serving & (readings.rat == code))
         if len(told):
-            before[rat] = float(readings.pci[told[np.argmax(readings.row[told])]])
-            if before[rat] < 0:
-                decided.one_piece()
+            last = told[readings.row[told] == readings.row[told].max()][-1]
+            serving[rat] = float(readings.pci[last])
 
 
 def _beside(sheet: _sheet.Sheet, cells: list[_Cell], decided: _decided.Decided) -> list[int]:
@@ -253,15 +254,11 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
     order: list[str] = decided.kept.get("order", [])
     streams: list[Stream] = []
     warnings: list[str] = []
-    for stream in result.streams:
-        if "serving" in stream.frame:  # a block may have cut an instant in two
-            twice = np.ones(len(stream.frame), dtype=bool)
-            twice[_cells._once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
-            stream = replace(stream, frame=_decided.without(stream.frame, twice))
+    for stream in _cells.settled(result).streams:
         if stream.kind == "telemetry":
             stream, warnings = _pose.settled(stream, decided)
         elif "serving" in stream.frame:
-            cell = (stream.attributes.get("rat", ""), stream.attributes.get("pci", -1))
+            cell = (_cells.RATS.index(str(stream.attributes.get("rat", ""))), stream.attributes.get("pci", -1))
             numbers = {arfcn for *one, arfcn in decided.kept["carriers"] if tuple(one) == cell}
             about = {key: value for key, value in stream.attributes.items() if key != "arfcn"}
             about |= {"arfcn": int(*numbers)} if len(numbers) == 1 else {}
@@ -282,8 +279,10 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
-    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only."""
+    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only, its bit rates are in kbit/s."""
     words = known(sheet.plain)
+    if not _OF_GNETTRACK.isdisjoint(words):
+        sheet.units |= {i: "kbit/s" for i, name in enumerate(words) if name in ("dl bitrate", "ul bitrate")}
     if words != sheet.plain and "level" in sheet.plain:
         places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find("networktech", "networkmode")
         if tech is not None:
@@ -312,7 +311,7 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     name = sheet.plain[column]
     if found := _TOWER_SNR.fullmatch(name):
         return _rows.snr(rows, found[1].upper(), values)
-    return _quantities.stream(rows, name, values, unit=sheet.unit(column), where=np.isfinite(values))
+    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values))
 
 
 def _distinct(streams: list[Stream | None]) -> list[Stream | None]:

@@ -39,8 +39,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
     """What each row says by itself."""
-    sheet = _sheet.read(data, is_header)
-    decided.agree("a header among the first lines", sheet is not None)
+    sheet = _sheet.read(data, is_header, decided)
     if sheet is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
     column = sheet.find("time utc")

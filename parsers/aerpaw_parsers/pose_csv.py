@@ -24,9 +24,7 @@ def has_radio(name: str) -> bool:
 
 
 def _has_time(names: list[str]) -> bool:
-    from re import fullmatch
-
-    return any(fullmatch(pattern, name) for pattern in _sheet.TIME_NAMES for name in names)
+    return any(_sheet.matches(name, _sheet.TIME_NAMES) for name in names)
 
 
 def sniff(head: bytes) -> bool:
@@ -42,8 +40,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
     """What each row says by itself."""
-    sheet = _sheet.read(data, is_header)
-    decided.agree("a header among the first lines", sheet is not None)
+    sheet = _sheet.read(data, is_header, decided)
     rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")

@@ -11,7 +11,7 @@ gives no rank.
 from __future__ import annotations
 
 import re
-from collections.abc import Hashable, Iterator
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -20,7 +20,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _agreeing, _json, _lines, _rows, _stamps, _time
+from . import _decided, _json, _lines, _rows, _stamps, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
@@ -80,20 +80,20 @@ def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
-    return _read_reports(data, options, set())
+    return _read_reports(data, options, _decided.Decided())
 
 
-def _read_reports(data: bytes, options: ReadOptions, forms: set[Hashable]) -> ReadResult:
-    """Reports of a block; ``forms`` gathers how times were understood, which all blocks must agree on."""
+def _read_reports(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
+    """Reports of a block; how times are understood all blocks must agree on."""
     lines = _lines.split(data)
     reports = _json.objects(lines)
     row, found = reports.row, reports.found
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
-    clock, time, warnings = _stamps.read(texts, options)
+    course: _stamps.Course = decided.kept.setdefault("times", _stamps.Course())
+    clock, time, warnings = _stamps.read(texts, options, course=course)
     if texts:
-        dateless = any(text.startswith(_stamps.DATELESS) for text in warnings)
-        forms.add((clock, *warnings, texts[0] if dateless else ""))  # a day more is known of the whole log alone
+        decided.agree("times", (clock, course.day_first, *warnings))
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines,
@@ -132,5 +132,5 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_agreeing.in_blocks(_read_reports),
+    in_blocks=_decided.json_in_blocks(_read_reports),
 )

@@ -66,6 +66,37 @@ def test_nemo_times_of_the_day_take_the_date_of_the_file_name() -> None:
     assert nobody.streams[0].attributes["clock"] == "relative"
 
 
+def test_a_neighbour_that_nobody_names_is_no_level_of_the_serving_cell() -> None:
+    """G-NetTrack's NRxRSRP as public data sets have it: it was left out, and N1 RSRP filled the gaps of RSRP."""
+    for name in (b"NRxRSRP", b"N1 RSRP"):
+        data = (
+            b"Timestamp,NetworkMode,RSRP," + name + b"\n2025.03.02_10.00.00,LTE,-90,-99\n2025.03.02_10.00.01,LTE,,-98\n"
+        )
+        result = read("drive_test", data)
+        assert stream(result, "rsrp").frame["rss_db"].tolist() == [-90.0]
+        other = stream(result, name.decode().lower().replace(" ", "_"))
+        assert (other.kind, other.frame["rss_db"].tolist()) == ("rss", [-99.0, -98.0])
+
+
+@pytest.mark.parametrize(
+    ("name", "unit", "value"),
+    [
+        ("LTE PDSCH throughput (Mbit/s)", "bit/s", 3e6),
+        ("LTE PDSCH throughput [kbps]", "bit/s", 3e3),
+        ("LTE PDSCH throughput", "bit/s", 3.0),
+        ("DL_bitrate", "bit/s", 3e3),  # G-NetTrack's
+        ("LTE BLER [%]", "%", 3.0),
+        ("LTE SINR [dB]", "dB", 3.0),
+        ("LTE RSSI [dBm]", "dBm", 3.0),
+    ],
+)
+def test_values_are_in_the_unit_that_their_stream_says(name: str, unit: str, value: float) -> None:
+    """A throughput in Mbit/s was given in bit/s and called mbit/s."""
+    result = read("drive_test", f"Time,NetworkTech,NR-PCI,NR RSRP,{name}\n2025-03-02 10:00:00,LTE,1,-80,3\n".encode())
+    (one,) = (one for one in result.streams if "pci1" not in one.name)
+    assert (one.attributes["unit"], one.frame["value" if one.kind == "kpi" else "rss_db"][0]) == (unit, value)
+
+
 def test_xcal_semicolons_and_decimal_commas() -> None:
     result = read("drive_test", samples.XCAL)
     cell = stream(result, "nr_pci7")
@@ -183,8 +214,8 @@ def test_quectel_console_names_the_cells_by_their_tables() -> None:
     ("name", "quantity"),
     [
         ("RSRP (NR SpCell)", "RSRP"), ("NR5G SS-RSRP[0]", "RSRP"), ("RS SNR", "SINR"), ("SINR (LTE pcell)", "SINR"),
-        ("WB CQI (NR)", "CQI"), ("PDSCH rank (NR)", "rank"), ("5G KPI PCell RF RI", "rank"),
-        ("Application throughput downlink", "throughput"), ("PDSCH throughput (NR)", "throughput"), ("E-UTRAN carrier RSSI", "RSSI"),
+        ("WB CQI (NR)", "CQI"), ("LTE PDSCH rank (NR)", "rank"), ("5G KPI PCell RF RI", "rank"),
+        ("Application throughput downlink", "throughput"), ("LTE PDSCH throughput (NR)", "throughput"), ("E-UTRAN carrier RSSI", "RSSI"),
     ],
 )  # fmt: skip
 def test_names_of_quantities(name: str, quantity: str) -> None:

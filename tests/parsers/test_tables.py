@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import by_name
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_parsers import _alike, _sheet, _stamps
+from aerpaw_parsers import _alike, _decided, _sheet, _stamps
 from tests.logs.test_blocks import in_two, same
 from tests.parsers.samples import OPTIONS
 
@@ -48,7 +48,7 @@ def test_quoted_cells_are_read_as_bare_ones(rows: list[tuple[str, str]], separat
         quoted.append(separator.join(f'"{cell}"' for cell in cells))
     head = separator.join(("time", "lat", "lon"))
     found = [
-        _sheet.read(("\n".join([head, *lines]) + "\n").encode(), lambda names: "lat" in names)
+        _sheet.read(("\n".join([head, *lines]) + "\n").encode(), lambda names: "lat" in names, _decided.Decided())
         for lines in (bare, quoted)
     ]
     quick, slow = found
@@ -78,7 +78,7 @@ def test_rows_of_other_widths(rows: list[bytes], accepted: int) -> None:
 
 
 def test_cells_of_rows_that_do_not_count_are_empty() -> None:
-    sheet = _sheet.read(b'time;a;b\n1;2;3\n2;"4";5\n3;6;7\n', lambda names: "a" in names)
+    sheet = _sheet.read(b'time;a;b\n1;2;3\n2;"4";5\n3;6;7\n', lambda names: "a" in names, _decided.Decided())
     assert sheet is not None
     sheet.silence(np.array([False, True, True]), [1])
     np.testing.assert_array_equal(sheet.numbers(1), [2, np.nan, np.nan])
@@ -183,7 +183,7 @@ def test_a_header_far_below_is_none_in_blocks_either() -> None:
         in_two("pose_csv", [b"".join(lines[:65]), b"".join(lines[65:])], OPTIONS)
 
 
-PHONE = b"Timestamp,LTEPCI,RSRP,RSRQ,EARFCN,NRxRSRP,N1 PCI\n"
+PHONE = b"Timestamp,LTEPCI,RSRP,RSRQ,EARFCN,N1 LTE RSRP,N1 LTE PCI\n"
 
 
 def phone(i: int, pci: str, level: str = "-90", quality: str = "-9", arfcn: str = "1300", other: str = "") -> bytes:
@@ -217,6 +217,14 @@ def test_the_cell_that_serves_is_known_from_the_block_before() -> None:
     rows = [b"2025-03-02 10:00:00,5,-90,20,-99\n", b"2025-03-02 10:00:01,,,5,-90\n", b"2025-03-02 10:00:02,,,20,-90\n"]
     streams = {stream.name: stream.frame for stream in in_parts("drive_test", head + b"".join(rows)).streams}
     assert {name: frame["serving"].tolist() for name, frame in streams.items()} == {"pci5": [1, 1], "pci20": [0, 0]}
+
+
+def test_a_cell_told_twice_at_one_instant_behind_a_cut() -> None:
+    """Which of the two counts the cell that serves decides, and that the block before tells."""
+    cut = [PHONE + phone(0, "5"), phone(1, "", "", "", "", "5") + phone(1, "5")]
+    whole = by_name("drive_test").read(b"".join(cut), OPTIONS)
+    assert [stream.frame["rss_db"].tolist() for stream in whole.streams] == [[-90, -99]]
+    same(in_two("drive_test", cut, OPTIONS), whole)
 
 
 def test_exports_read_back_in_blocks() -> None:

@@ -55,13 +55,19 @@ TARGETS: dict[str, tuple[str, ...]] = {
     "aerpaw_cmp/flight/clock.py": ("tests/flight/test_clock.py",),
     "aerpaw_cmp/flight/lag.py": ("tests/flight/test_lag.py", "tests/flight/test_clock.py"),
     "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py",),
-    "parsers/aerpaw_parsers/_lines.py": ("tests/parsers/test_law.py", "tests/parsers/test_formats.py"),
+    "parsers/aerpaw_parsers/_lines.py": (
+        "tests/parsers/test_law.py", "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py",
+        "tests/parsers/test_rows.py", "tests/parsers/test_lines.py", "parsers/aerpaw_parsers/_lines.py",
+    ),
     "parsers/aerpaw_parsers/_rows.py": (
         "tests/parsers/test_rows.py", "tests/parsers/test_formats.py", "tests/parsers/test_base_stations.py",
         "tests/parsers/test_phones.py",
     ),
     "parsers/aerpaw_parsers/_time.py": ("tests/parsers/test_time.py", "tests/parsers/test_formats.py"),
-    "parsers/aerpaw_parsers/vehicle_out.py": ("tests/parsers/test_formats.py", "tests/parsers/test_law.py"),
+    "parsers/aerpaw_parsers/vehicle_out.py": (
+        "tests/parsers/test_formats.py", "tests/parsers/test_law.py", "tests/parsers/test_two_ways.py",
+        "tests/logs/test_blocks.py",
+    ),
     "parsers/aerpaw_parsers/sounder_log.py": (
         "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py", "tests/parsers/test_law.py"
     ),

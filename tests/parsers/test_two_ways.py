@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -84,6 +86,36 @@ def test_a_row_without_voltage_is_one_by_both(sample: str, old: bytes, new: byte
     fast, slow = (read(data.replace(old, new, 1)) for read in (by_the_fast_way, by_the_slow_vehicle))
     assert fast.accepted == by_the_fast_way(data).accepted
     assert_same(fast, slow)
+
+
+@pytest.mark.parametrize(
+    ("sample", "needed"),
+    [("ten_fields", (0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 11, 12, 13)), ("nine_fields", (0, 1, 2, 3, 6, 7, 8)),
+     ("eight_fields", (0, 1, 2, 3, 5, 6, 7)), ("eleven_fields", (0, 1, 2, 3, 4, 5, 6, 8, 9, 10))],
+)  # fmt: skip
+def test_a_row_with_an_empty_cell_that_it_needs_is_rejected_by_both(sample: str, needed: tuple[int, ...]) -> None:
+    data = SAMPLES["vehicle_out"][sample][0]
+    first, rest = data.split(b"\n", 1)
+    for place in needed:
+        cells = first.split(b",")
+        cells[place] = re.sub(rb"[^\"()\r]", b"", cells[place])
+        fast, slow = (read(b",".join(cells) + b"\n" + rest) for read in (by_the_fast_way, by_the_slow_vehicle))
+        assert fast.accepted == by_the_fast_way(data).accepted - 1, place
+        assert_same(fast, slow)
+
+
+@pytest.mark.parametrize("sample", ["ten_fields", "nine_fields", "eight_fields", "eleven_fields"])
+def test_why_a_row_of_a_vehicle_is_rejected(sample: str) -> None:
+    data = SAMPLES["vehicle_out"][sample][0]
+    first, rest = data.split(b"\n", 1)
+    for bad, words in (
+        (first.replace(b"2025-03-02 ", b""), "no time stamp"),
+        (first.replace(b"35.73", b"35:73"), "a field is not of the form"),
+        (first.replace(b"35.73", b"35\0.73"), "NUL bytes"),
+        (first + b",1,2,3,4", "fields where 8, 9, 10 or 11"),
+    ):
+        (rejected,) = by_the_fast_way(rest + bad + b"\n").rejected
+        assert words in rejected.reason
 
 
 def by_the_fast_way(data: bytes) -> ReadResult:

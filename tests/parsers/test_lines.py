@@ -1,0 +1,55 @@
+"""Lines as byte ranges: what is blank, what is cut, what is taken at once."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aerpaw_parsers import _lines
+
+
+@pytest.mark.parametrize("space", [b" ", b"\t", b"\x0b", b"\x0c", b"\r \r", b" \t \x0b"])
+def test_a_line_of_any_white_space_is_blank(space: bytes) -> None:
+    lines = _lines.split(b"a\n" + space + b"\n" + space + b"b\n\n" + space)
+    assert lines.blank.tolist() == [False, True, False, True, True]
+
+
+def test_lines_of_equal_length_and_others_between() -> None:
+    lines = _lines.split(b"abc\ndef\nlonger\nghi\n\njkl")
+    assert [bytes(row) for row in lines.fixed(np.array([0, 1]), 3)] == [b"abc", b"def"]
+    assert [bytes(row) for row in lines.fixed(np.array([0, 1, 3, 5]), 3)] == [b"abc", b"def", b"ghi", b"jkl"]
+    assert [bytes(row) for row in lines.fixed(np.array([1, 3]), 3)] == [b"def", b"ghi"]
+    assert [bytes(row) for row in lines.fixed(np.array([5]), 3)] == [b"jkl"]
+    assert lines.fixed(np.array([], dtype=np.int64), 3).shape == (0, 3)
+
+
+@pytest.mark.parametrize(
+    ("head", "lines"),
+    [
+        (b"", []),
+        (b"a", [b"a"]),  # a file of one line without an end
+        (b"a\nb", [b"a"]),  # the last may be cut
+        (b"a\nb\nc", [b"a", b"b"]),
+        (b"a\r\n\n b\n", [b"a", b" b"]),
+        (b"x" * 20_000, []),
+        (b"a\n" + b"x" * 20_000 + b"\n", [b"a"]),
+    ],
+)
+def test_sniffers_judge_by_whole_lines(head: bytes, lines: list[bytes]) -> None:
+    assert _lines.first_lines(head) == lines
+
+
+def test_sniffers_judge_by_forty_lines() -> None:
+    assert len(_lines.first_lines(b"a\n" * 100)) == 40
+
+
+@pytest.mark.parametrize(("data", "unterminated"), [(b"", False), (b"a", True), (b"a\n", False), (b"a\r", True)])
+def test_whether_the_last_line_has_its_end(data: bytes, unterminated: bool) -> None:
+    assert _lines.split(data).unterminated is unterminated
+
+
+def test_rejected_lines_are_kept_to_a_length_and_numbered_from_one() -> None:
+    lines = _lines.split(b"a\n" + b"\xff" + b"x" * 4000 + b"\n")
+    (rejected,) = lines.reject_all(np.array([1]), "why")
+    assert (rejected.number, rejected.reason) == (2, "why")
+    assert rejected.text == "\ufffd" + "x" * (_lines.TEXT_LIMIT - 1)

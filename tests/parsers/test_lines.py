@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -31,6 +33,7 @@ def test_lines_of_equal_length_and_others_between() -> None:
         (b"a\nb", [b"a"]),  # the last may be cut
         (b"a\nb\nc", [b"a", b"b"]),
         (b"a\r\n\n b\n", [b"a", b" b"]),
+        (b"x" * 16_384, [b"x" * 16_384]),
         (b"x" * 20_000, []),
         (b"a\n" + b"x" * 20_000 + b"\n", [b"a"]),
     ],
@@ -41,6 +44,19 @@ def test_sniffers_judge_by_whole_lines(head: bytes, lines: list[bytes]) -> None:
 
 def test_sniffers_judge_by_forty_lines() -> None:
     assert len(_lines.first_lines(b"a\n" * 100)) == 40
+
+
+@pytest.mark.parametrize(
+    ("head", "most"), [(b"1\n2\na\n", True), (b"1\na\n", False), (b"a\n1\n2\n", True), (b"", False)]
+)
+def test_most_of_the_first_lines_are_more_than_half(head: bytes, most: bool) -> None:
+    assert _lines.mostly(head, re.compile(rb"\d")) is most
+    assert _lines.mostly(b"title\n" + head, re.compile(rb"\d"), skip=1) is most
+
+
+def test_numbers_of_cells_and_of_none() -> None:
+    assert _lines.numbers(np.zeros(0, dtype="S5")).tolist() == []
+    np.testing.assert_array_equal(_lines.numbers(np.array([b"", b"1e3", b"-2.5"])), [np.nan, 1000, -2.5])
 
 
 @pytest.mark.parametrize(("data", "unterminated"), [(b"", False), (b"a", True), (b"a\n", False), (b"a\r", True)])

@@ -54,6 +54,40 @@ def test_velocity_is_north_east_down() -> None:
     assert first[names].tolist() == [1.0, 2.0, -0.5]
 
 
+@pytest.mark.parametrize(
+    ("longitude", "latitude", "altitude", "fix", "flag"),
+    [
+        ("180.0", "90.0", "99999", "2", ""),
+        ("-180.0", "-90.0", "-998.5", "3", ""),  # the sentinel is -999
+        ("180.01", "35", "1", "3", "position_out_of_range"),
+        ("-78", "90.01", "1", "3", "position_out_of_range"),
+        ("-78", "35", "100000", "3", "position_out_of_range"),
+        ("-78", "35", "-998.6", "3", "no_fix"),
+        ("-901", "35", "1", "3", "no_fix"),
+        ("-78", "35", "1", "1", "no_fix"),
+    ],
+)
+def test_limits_of_a_vehicles_position(longitude: str, latitude: str, altitude: str, fix: str, flag: str) -> None:
+    row = f"0,{longitude},{latitude},{altitude},48.1,2025-03-02 10:00:00.250000,{fix},12\n"
+    result = by_name("vehicle_out").read(row.encode(), OPTIONS)
+    (stream,) = result.streams
+    assert stream.frame["flag"].tolist() == [flag]
+    assert np.isnan(stream.frame["altitude_m"][0]) == bool(flag)
+    told = [text for text in result.warnings if "no position fix" in text]
+    assert told == (
+        ["1 rows have no position fix; their positions are NaN, flagged no_fix"] if flag == "no_fix" else []
+    )
+
+
+@pytest.mark.parametrize(
+    ("index", "fix", "rows"), [("999999999999", "999", 1), ("1000000000000", "3", 0), ("1", "1000", 0)]
+)
+def test_counts_of_a_vehicle_have_their_digits(index: str, fix: str, rows: int) -> None:
+    good = "2,-78,35,1,48.1,2025-03-02 10:00:00.250000,3,12\n"
+    row = f"{index},-78,35,1,48.1,2025-03-02 10:00:00.250000,{fix},12\n"
+    assert by_name("vehicle_out").read((good + row).encode(), OPTIONS).accepted == 1 + rows
+
+
 def test_no_fix_is_flagged_and_has_no_position() -> None:
     row = read("vehicle_out", samples.VEHICLE_10).streams[0].frame.iloc[1]
     assert row["flag"] == "no_fix"

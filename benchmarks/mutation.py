@@ -69,7 +69,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         "tests/logs/test_blocks.py",
     ),
     "parsers/aerpaw_parsers/sounder_log.py": (
-        "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py", "tests/parsers/test_law.py"
+        "tests/parsers/test_formats.py", "tests/parsers/test_sounder.py", "tests/parsers/test_law.py"
     ),
 }  # fmt: skip
 PRELOADED = (

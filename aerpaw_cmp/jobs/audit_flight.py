@@ -8,18 +8,20 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 
+from ..common.forked import ahead
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, FloatArray
 from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.losses import path_loss, reflecting_crowns
-from ..flight.replay import Replayed, attitude_rotation, part_of
+from ..flight.replay import Replayed, attitude_rotation, may_share, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
@@ -41,6 +43,9 @@ from ..propagation.reference import (
 )
 from ..site.site import Site
 
+FEWEST_AUDITS = 2
+"""Series below which a further process does not pay."""
+
 ATTITUDE_ROWS = 200
 """Logged attitudes that are turned into rotations a second time."""
 
@@ -50,7 +55,10 @@ ATTITUDE_TOLERANCE_RAD = 1e-6
 REFERENCE_LINKS_AT_MOST = 64
 """Of all series together, at least three each: some 0.1 s apiece."""
 
-TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
+TIMES = (
+    "The time of the engine is its share for the audited links; that of the reference includes its start-up, and where "
+    "several processes share the series, that of each."
+)
 
 NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
@@ -97,36 +105,25 @@ def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, ob
 
 def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) -> AuditResult | None:
     """One audit over all series: links are shared out in proportion to their poses."""
-    rt, ks = data.settings.rt, data.settings.rank.k
+    ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
-    parts: list[Audit] = []
+    named: list[tuple[str, int]] = []
+    calls: list[Callable[[], Audit]] = []
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
-        links = min(count, max(math.ceil(rt.audit_links * count / max(total, 1)), 1))
-        if links == 0:
-            continue
-        progress(f"audit {replayed.replay.towers[0]}: {links} links")
-        parts.append(
-            audit(
-                site,
-                replayed.link,
-                replayed.poses,
-                replayed.replay,
-                links=links,
-                max_depth=rt.max_depth,
-                samples=rt.samples,
-                batch=rt.batch,
-                loss=path_loss(site, rt, replayed.link.carrier_hz),
-                crowns=reflecting_crowns(site.trees, rt),
-                cache_dir=None if rt.cache else "",
-                ks=ks,
-                expected=expected,
-                power_cut_db=rt.power_cut_db,
-                reference_links=int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS)),
-            )
-        )
-    if not parts:
+        links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
+        if links:
+            named.append((replayed.replay.towers[0], links))
+            few = int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS))
+            calls.append(partial(_of_series, data, site, replayed, expected, links=links, reference_links=few))
+    if not calls:
         return None
+    parts: list[Audit] = []
+    # the processes that share the series load the other engine: this one stays free to share its drawings afterwards
+    with ahead(calls, None if may_share(data) else 1, fewest=FEWEST_AUDITS) as found_by:
+        for tower, links in named:
+            progress(f"audit {tower}: {links} links")
+            parts.append(next(found_by))
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     found = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
@@ -141,6 +138,30 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         reference_seconds=sum(p.reference_seconds for p in parts),
         note=" ".join([TIMES, *_rays(parts)]),
         fields=dataclasses.replace(found, not_covered=(*found.not_covered, *NOT_COVERED)),
+    )
+
+
+def _of_series(
+    data: FlightData, site: Site, replayed: Replayed, expected: Expected, *, links: int, reference_links: int
+) -> Audit:
+    """The audit of one series, as the settings ask for it."""
+    rt = data.settings.rt
+    return audit(
+        site,
+        replayed.link,
+        replayed.poses,
+        replayed.replay,
+        links=links,
+        max_depth=rt.max_depth,
+        samples=rt.samples,
+        batch=rt.batch,
+        loss=path_loss(site, rt, replayed.link.carrier_hz),
+        crowns=reflecting_crowns(site.trees, rt),
+        cache_dir=None if rt.cache else "",
+        ks=data.settings.rank.k,
+        expected=expected,
+        power_cut_db=rt.power_cut_db,
+        reference_links=reference_links,
     )
 
 

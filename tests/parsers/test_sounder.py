@@ -132,7 +132,7 @@ def test_a_foot_at_the_beginning_of_a_file_is_one(offset: int) -> None:
         ([sample(0, 0), sample(1, 4), star(2)], 3, "or an offset after it"),
         ([sample(0, 0), star(1), star(2), sample(4, 16)], 3, "a second '*' in one run"),
         ([sample(0, 0), sample(1, 4), star(2), star(2), sample(4, 16)], 4, "a second '*' in one run"),
-        ([sample(0, 16), star(1), sample(4, 0)], 2, "do not bound a run of believable length"),
+        ([sample(0, 8), star(1), sample(4, 0)], 2, "do not bound a run of believable length"),
         ([sample(0, 0), star(1), sample(4, 4 * 5_000_002)], 2, "do not bound a run of believable length"),
     ],
 )
@@ -140,6 +140,22 @@ def test_stars_that_say_no_length(lines: list[str], number: int, words: str) -> 
     result = read(*lines)
     assert [(one.number, words in one.reason) for one in result.rejected] == [(number, True)]
     assert result.lines == result.accepted + result.blank + len(result.rejected)
+
+
+def test_a_foot_at_offset_zero_bounds_no_run() -> None:
+    result = read(sample(0, 8), star(1), line(2, "0000000"))
+    assert "do not bound a run" in next(one.reason for one in result.rejected if one.number == 2)
+
+
+def test_a_star_that_stands_for_no_sample_is_accepted() -> None:
+    result = read(sample(0, 0), star(1), sample(2, 4))
+    assert (result.accepted, seconds(result)) == (3, [0, 2])
+
+
+def test_offsets_of_two_widths_stay_in_the_order_of_the_file() -> None:
+    """A second run in one file begins anew with seven digits."""
+    result = read(sample(0, 0o10000000), sample(1, 0), sample(2, 0o10000000), sample(3, 0))
+    assert seconds(result) == [0, 1, 2, 3]
 
 
 def test_offsets_that_jump_are_lost_samples() -> None:

@@ -22,6 +22,7 @@ from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
+from .heights import at_height, lacks_height
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
 from .track import Track, TrackPoses, good_positions
 
@@ -242,7 +243,7 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
         raise InputError("there is no such log", expected=f"the positions of towers.{name}", path=path)
     options = log.options(timezone)
     (file,) = ingest([path], options=options, reader=log.reader)
-    for stream in file.result.streams:
+    for stream in at_height(log, file).result.streams:
         if stream.name in log.skip or not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
             continue
         frame = stream.frame.loc[~flagged(stream.frame)]
@@ -322,6 +323,7 @@ def gather(
         No position, no row that may be compared, a flight far from every tower.
     """
     warnings: list[str] = []
+    files = [at_height(log, file) for log, file in zip(settings.logs, files, strict=True)]
     site, nodes = ground_nodes(choose_site(settings.site, folder), settings, logs_root or folder, warnings)
     telemetry: list[tuple[str, Stream]] = []
     rss: list[tuple[str, RssSeries]] = []
@@ -408,6 +410,13 @@ def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings
     track = Track(
         frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m
     )  # fmt: skip
+    if not len(track) and lacks_height(stream):
+        raise InputError(
+            f"none of the {len(stream.frame)} telemetry rows has an altitude",
+            expected="'height_m: H' beside its path, the height above take-off [m] in all of it, or another track",
+            cause="a phone or a drive-test program that writes latitude and longitude alone",
+            path=path,
+        )
     if not len(track):
         raise InputError(
             f"none of the {len(stream.frame)} telemetry rows holds a position that can be",

@@ -18,6 +18,7 @@ from ..logs.ingest import IngestedFile
 from ..logs.records import Stream, has_wall_clock
 from .data import is_ratio
 from .grouping import flights
+from .heights import height_in_name, lacks_height
 from .settings import FlightFile, LogSettings
 from .time_origin import Origin, origin_of
 
@@ -237,6 +238,10 @@ class _Entries:
     samples: int = 0
     """Of RSS and rank, in all logs."""
 
+    @property
+    def _track(self) -> Stream | None:
+        return None if self.flown is None else self.flown[0]
+
     def leads(self, file: IngestedFile) -> bool:
         """Whether the track is in this file."""
         return self.flown is not None and any(s is self.flown[0] for s in file.result.streams)
@@ -280,6 +285,11 @@ class _Entries:
             entry |= self.mapping
         if refused:
             entry["skip"] = sorted(refused)
+        if any(lacks_height(s) for s in kept if s is self._track or _has_positions(s)):
+            height = height_in_name(path)
+            entry |= {} if height is None else {"height_m": height}
+            told = "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
+            asked += f" {told}" if asked else f"  # {told}"
         levels = [
             s for s in kept if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
         ]  # whole decibels repeat

@@ -137,7 +137,7 @@ def _put(
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
     """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role.
 
-    Levels of neighbours that no column names by a PCI are streams of their own, not levels of a cell.
+    Levels of neighbours that no column names by a PCI are no levels of a cell: they become KPIs.
     """
     for (rat, role), cell in list(cells.items()):
         if cell.rsrp is not None:
@@ -311,7 +311,13 @@ def _other(rows: _rows.Rows, sheet: _sheet.Sheet, column: int) -> Stream | None:
     name = sheet.plain[column]
     if found := _TOWER_SNR.fullmatch(name):
         return _rows.snr(rows, found[1].upper(), values)
-    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=np.isfinite(values))
+    known = np.isfinite(values)
+    meaning = _quantities.quantity(name)
+    if meaning is not None and meaning.kind == "rss" and _NEIGHBOUR.search(name):  # of a cell that nobody names
+        return rows.stream(
+            "kpi", re.sub(r"\W+", "_", name), {"value": values}, where=known, unit=meaning.unit, quantity=meaning.name
+        )
+    return _quantities.stream(rows, name, values, unit=sheet.unit_read(column), where=known)
 
 
 def _distinct(streams: list[Stream | None]) -> list[Stream | None]:

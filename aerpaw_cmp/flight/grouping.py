@@ -42,7 +42,8 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
 
     Telemetry begins a flight; a radio log belongs to the flight that it shares most time with. Logs with relative
     times go to the flight on whose track their positions lie, else to that whose files lie in their folder; where
-    that says nothing, to the only flight, or to one of their own.
+    that says nothing, to the only flight, or to one of their own. Of several that hold both levels and positions, and
+    no clock beside them, each is a flight.
 
     Parameters
     ----------
@@ -121,15 +122,17 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
 
 def _home(file: IngestedFile, found: list[Flight]) -> Flight:
     """The flight of a file without a wall clock; a new one is added to ``found``."""
+    # what holds both levels and positions is a flight by itself: with another in its own time it shares none
+    known = [flight for flight in found if flight.span is not None or not Flight([file]).complete]
     by_track = [
-        (origin.distance_m, i) for i, flight in enumerate(found) if (origin := _origin(file, flight)) is not None
+        (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
     ]
     if by_track:
-        return found[min(by_track)[1]]
+        return known[min(by_track)[1]]
     folder = Path(file.path).parent
-    near = [flight for flight in found if any(Path(other.path).parent == folder for other in flight.files)]
+    near = [flight for flight in known if any(Path(other.path).parent == folder for other in flight.files)]
     if len(near) != 1:
-        near = found if len(found) == 1 else []
+        near = known if len(known) == 1 else []
     if not near:
         found.append(Flight())
         near = found[-1:]

@@ -9,6 +9,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.grouping import flights
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.time_origin import origin_of
@@ -79,6 +80,36 @@ def test_relative_logs_find_the_flight_on_whose_track_they_lie(tmp_path: Path) -
     assert "2025-03-02T17:00:07.3" in text
     assert "the same flight?" in text
     assert "phone.csv" not in target.read_text()
+
+
+def _phone_without_date(path: Path, hour: int) -> None:
+    """Levels and positions with times of the day alone, as the urban LTE flights have them."""
+    rows = [f"{hour}:00:{i:02d},{35.7275 + 1e-5 * i},{-78.696 + 2e-5 * i},{-70 - i % 5}" for i in range(40)]
+    path.write_text("\n".join(["Time,Latitude,Longitude,RSRP", *rows]) + "\n", encoding="utf-8")
+
+
+def test_phones_that_know_no_date_are_a_flight_each(tmp_path: Path) -> None:
+    """One draft named both, the second without its track."""
+    (tmp_path / "logs").mkdir()
+    _phone_without_date(tmp_path / "logs" / "60m.csv", 11)
+    _phone_without_date(tmp_path / "logs" / "120m.csv", 13)
+    target = tmp_path / "flight.yaml"
+    assert main(["ingest", str(tmp_path / "logs"), "--timezone", ZONE, "--draft", str(target)]) == 0
+    drafts = [target, tmp_path / "flight_2.yaml"]
+    named = [[log.path for log in load_flight(draft).logs] for draft in drafts]
+    assert sorted(named) == [["logs/120m.csv"], ["logs/60m.csv"]]
+    for draft in drafts:
+        settings = load_flight(draft)
+        data = gather(settings, tmp_path, read_logs(settings, tmp_path))
+        assert data.track is not None
+        assert len(data.rss) == 1
+
+
+def test_a_phone_that_knows_no_date_goes_with_the_flight_in_its_folder(tmp_path: Path) -> None:
+    write_flight(tmp_path / "day", "2025-03-02T15:00:00")
+    _phone_without_date(tmp_path / "day" / "60m.csv", 10)
+    (found,) = flights(ingest(tmp_path, options=OPTIONS))
+    assert "60m.csv" in {Path(file.path).name for file in found.files}
 
 
 def stream_of(frame: pd.DataFrame) -> Stream:

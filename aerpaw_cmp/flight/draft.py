@@ -149,7 +149,8 @@ def drafts(
     list of Draft
         At least one; its remarks say what is left to check.
     """
-    found = [flight for flight in flights(files) if flight.complete]
+    every = [flight for flight in flights(files) if flight.measured]
+    found = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
     options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
     groups = [flight.files for flight in found] if len(found) > 1 else [list(files)]
     made = []

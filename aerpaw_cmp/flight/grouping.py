@@ -29,11 +29,15 @@ class Flight:
     place: tuple[float, float] | None = None
 
     @property
+    def measured(self) -> list[Stream]:
+        """What can be compared."""
+        return [stream for file in self.files for stream in file.result.streams if stream.kind in ("rss", "rank")]
+
+    @property
     def complete(self) -> bool:
         """Whether it holds something to compare, and positions to compare it at."""
-        streams = [stream for file in self.files for stream in file.result.streams]
-        measured = [stream for stream in streams if stream.kind in ("rss", "rank")]
-        tracked = any(stream.kind == "telemetry" for stream in streams)
+        measured = self.measured
+        tracked = any(_has_track(file) for file in self.files)
         return bool(measured) and (tracked or any("latitude_deg" in stream.frame for stream in measured))
 
 

@@ -105,6 +105,18 @@ def test_phones_that_know_no_date_are_a_flight_each(tmp_path: Path) -> None:
         assert len(data.rss) == 1
 
 
+def test_radio_logs_of_two_days_without_any_track_are_two_drafts(tmp_path: Path) -> None:
+    for name in ("a", "b"):
+        day = write_flight(tmp_path / "logs" / name, f"2025-03-0{2 + (name == 'b')}T15:00:00")
+        assert len(day)
+        for telemetry in (tmp_path / "logs" / name).glob("*vehicleOut*"):
+            telemetry.unlink()
+    target = tmp_path / "flight.yaml"
+    assert main(["ingest", str(tmp_path / "logs"), "--timezone", ZONE, "--draft", str(target)]) == 0
+    for draft, name in ((target, "a"), (tmp_path / "flight_2.yaml", "b")):
+        assert {Path(log.path).parent.name for log in load_flight(draft).logs} == {name}
+
+
 def test_a_phone_that_knows_no_date_goes_with_the_flight_in_its_folder(tmp_path: Path) -> None:
     write_flight(tmp_path / "day", "2025-03-02T15:00:00")
     _phone_without_date(tmp_path / "day" / "60m.csv", 10)

@@ -82,7 +82,9 @@ def _of_stream(decided: _decided.Decided, name: str, *about: str) -> None:
 
 def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
     place = sheet.find(name)
-    return np.array([] if place is None else sheet.texts(place), dtype=object)
+    texts = [] if place is None else sheet.texts(place)
+    # NumPy compares an array of objects with a text whose last NULs it has taken off
+    return np.array([text.replace("\0", "\ufffd") for text in texts], dtype=object)
 
 
 def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]

@@ -236,3 +236,16 @@ def test_exports_read_back_in_blocks() -> None:
     assert [stream.name for stream in whole.streams] == ["LW3_USRP1", "LW2_USRP1", "LW1_USRP1"]
     assert [stream.attributes["unit"] for stream in whole.streams] == ["dBm", "dB", "dB"]
     assert [stream.name for stream in in_parts("own_csv", data).streams] == ["LW3_USRP1", "LW2_USRP1", "LW1_USRP1"]
+
+
+@pytest.mark.parametrize("kind", ["rss", "rank"])
+def test_a_name_that_ends_in_nul_loses_no_row(kind: str) -> None:
+    """NumPy takes the last NULs off a text that it compares with: a table of levels ended in an IndexError."""
+    head, cells = {
+        "rss": (b"time_utc,time_s,tower,channel,unit,measured_db", b"LW\0,USRP1\0,dBm,-81.5"),
+        "rank": (b"time_utc,time_s,tower,measured_rank", b"LW\0,2"),
+    }[kind]
+    data = head + b"\n2025-03-02T15:00:00Z,0," + cells + b"\n2025-03-02T15:00:01Z,1," + cells + b"\n"
+    result = by_name("own_csv").read(data, OPTIONS)
+    assert result.accepted == 2
+    assert [len(stream.frame) for stream in result.streams] == [2]

@@ -20,6 +20,7 @@ def test_lines_of_equal_length_and_others_between() -> None:
     lines = _lines.split(b"abc\ndef\nlonger\nghi\n\njkl")
     assert [bytes(row) for row in lines.fixed(np.array([0, 1]), 3)] == [b"abc", b"def"]
     assert [bytes(row) for row in lines.fixed(np.array([0, 1, 3, 5]), 3)] == [b"abc", b"def", b"ghi", b"jkl"]
+    assert [bytes(row) for row in lines.fixed(np.array([0, 1, 3]), 3)] == [b"abc", b"def", b"ghi"]
     assert [bytes(row) for row in lines.fixed(np.array([1, 3]), 3)] == [b"def", b"ghi"]
     assert [bytes(row) for row in lines.fixed(np.array([5]), 3)] == [b"jkl"]
     assert lines.fixed(np.array([], dtype=np.int64), 3).shape == (0, 3)

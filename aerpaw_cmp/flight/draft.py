@@ -245,7 +245,7 @@ class _Entries:
 
     def leads(self, file: IngestedFile) -> bool:
         """Whether the track is in this file."""
-        return self.flown is not None and any(s is self.flown[0] for s in file.result.streams)
+        return any(s is self._track for s in file.result.streams)
 
     def sort(self, files: Sequence[IngestedFile]) -> None:
         """Lines in the order of the files, telemetry first."""
@@ -281,7 +281,7 @@ class _Entries:
             entry["time_origin"] = self.time_origin
         elif origin is not None:
             entry["time_origin"] = f"{origin.time.astype('datetime64[ms]')}Z"
-            asked += f"{'' if asked else '  #'} time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?"
+            asked = _also(asked, f"time_origin by tracks {origin.distance_m:.1f} m apart: the same flight?")
         if file.result.reader == "generic_csv":
             entry |= self.mapping
         if refused:
@@ -290,15 +290,17 @@ class _Entries:
             height = height_in_name(path)
             entry |= {} if height is None else {"height_m": height}
             told = "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
-            asked += f" {told}" if asked else f"  # {told}"
+            asked = _also(asked, told)
         levels = [
             s for s in kept if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
         ]  # whole decibels repeat
         if (floor := receiver_floor_db(levels)) is not None:
             entry["floor_db"] = round(floor + 0.01, 2)  # at the floor is below it
-            asked += f" floor of the receiver at {floor:.1f} dB?" if asked else f"  # receiver floor {floor:.1f} dB?"
+            asked = _also(
+                asked, f"floor of the receiver at {floor:.1f} dB?" if asked else f"receiver floor {floor:.1f} dB?"
+            )
         if any(is_ratio(s) for s in kept):
-            asked += " a ratio to the noise as a level?" if asked else "  # a ratio to the noise as a level?"
+            asked = _also(asked, "a ratio to the noise as a level?")
         self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
         self.kinds |= {s.kind for s in kept}
         self.samples += sum(len(s.frame) for s in kept if s.kind in ("rss", "rank"))
@@ -450,6 +452,11 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
     if (radio := _RADIO.findall(path)) and len(need) == 1 and need[0].kind == "rss":
         entry["channel"] = f"USRP{radio[-1]}"
     return entry, "" if near else "  # which tower?"
+
+
+def _also(asked: str, question: str) -> str:
+    """The comment behind a line of ``logs:`` with one more question."""
+    return f"{asked} {question}" if asked else f"  # {question}"
 
 
 def _flow(entry: dict[str, Any]) -> str:

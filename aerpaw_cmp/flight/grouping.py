@@ -127,7 +127,8 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
 def _home(file: IngestedFile, found: list[Flight]) -> Flight:
     """The flight of a file without a wall clock; a new one is added to ``found``."""
     # what holds both levels and positions is a flight by itself: with another in its own time it shares none
-    known = [flight for flight in found if flight.span is not None or not Flight([file]).complete]
+    alone = Flight([file]).complete
+    known = [flight for flight in found if flight.span is not None] if alone else found
     by_track = [
         (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
     ]

@@ -6,9 +6,8 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
-
 from ..common.errors import UsageError
+from ..logs.blocks import with_warnings
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from .settings import LogSettings
@@ -45,19 +44,19 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
     """
     if log.height_m is None:
         return file
-    streams = file.result.streams
-    if not any(lacks_height(stream) for stream in streams):
+    streams = [
+        replace(s, frame=s.frame.assign(altitude_m=float(log.height_m))) if lacks_height(s) else s
+        for s in file.result.streams
+    ]
+    if all(one is other for one, other in zip(streams, file.result.streams, strict=True)):
         raise UsageError(
             f"{log.path}: 'height_m' acts on nothing",
             expected="a log with positions and no altitude",
             cause="the log has altitudes of its own, or no positions",
         )
-    set_ = tuple(
-        replace(s, frame=s.frame.assign(altitude_m=np.float64(log.height_m))) if lacks_height(s) else s for s in streams
-    )
     said = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
-    warnings = tuple(text for text in file.result.warnings if not text.startswith("the log has no altitude"))
-    return replace(file, result=replace(file.result, streams=set_, warnings=(*warnings, said)))
+    result = replace(file.result, streams=tuple(streams))
+    return replace(file, result=with_warnings(result, without="^the log has no altitude", more=(said,)))
 
 
 def height_in_name(path: str) -> float | None:
@@ -68,5 +67,5 @@ def height_in_name(path: str) -> float | None:
     >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
     (60.0, 120.0, None)
     """
-    found = {float(text) for text in _IN_NAME.findall(re.sub(r"_", " ", Path(path).stem))}
+    found = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
     return found.pop() if len(found) == 1 else None

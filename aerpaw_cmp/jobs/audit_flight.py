@@ -43,9 +43,6 @@ from ..propagation.reference import (
 )
 from ..site.site import Site
 
-FEWEST_AUDITS = 2
-"""Series below which a further process does not pay."""
-
 ATTITUDE_ROWS = 200
 """Logged attitudes that are turned into rotations a second time."""
 
@@ -107,23 +104,23 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
     """One audit over all series: links are shared out in proportion to their poses."""
     ks = data.settings.rank.k
     total = sum(len(r.poses) for r in replays)
-    named: list[tuple[str, int]] = []
+    few = int(np.clip(REFERENCE_LINKS_AT_MOST // max(len(replays), 1), 3, REFERENCE_LINKS))
+    named: list[str] = []
     calls: list[Callable[[], Audit]] = []
     for site, replayed, expected in standing(data, replays):
         count = len(replayed.poses)
         links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
         if links:
-            named.append((replayed.replay.towers[0], links))
-            few = int(np.clip(REFERENCE_LINKS_AT_MOST // len(replays), 3, REFERENCE_LINKS))
+            named.append(f"audit {replayed.replay.towers[0]}: {links} links")
             calls.append(partial(_of_series, data, site, replayed, expected, links=links, reference_links=few))
     if not calls:
         return None
     parts: list[Audit] = []
     # the processes that share the series load the other engine: this one stays free to share its drawings afterwards
-    with ahead(calls, None if may_share(data) else 1, fewest=FEWEST_AUDITS) as found_by:
-        for tower, links in named:
-            progress(f"audit {tower}: {links} links")
-            parts.append(next(found_by))
+    with ahead(calls, None if may_share(data) else 1) as audits:
+        for text in named:
+            progress(text)
+            parts.append(next(audits))
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     found = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))

@@ -372,6 +372,7 @@ class ModemSimulator:
         self._random = random.Random(self.settings.faults.seed)
         self._master = -1
         self._lock = threading.RLock()
+        self._speaking = threading.Lock()
         self._stop = threading.Event()
         self._unplugged = threading.Event()
         self._answered = 0
@@ -504,7 +505,11 @@ class ModemSimulator:
             return b""
 
     def _write(self, data: bytes) -> bool:
-        """Write all of it unless the cable is pulled meanwhile."""
+        """Write all of it unless the cable is pulled meanwhile; another thread's bytes stand before or behind."""
+        with self._speaking:
+            return self._write_out(data)
+
+    def _write_out(self, data: bytes) -> bool:
         while data and not self._stop.is_set():
             with self._lock:
                 if self._master < 0:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import os
+import threading
 from pathlib import Path
 
 import numpy as np
@@ -94,6 +95,22 @@ def test_nothing_to_replay(tmp_path, content):
         load_source(path)
     with pytest.raises(InputError):
         load_source(tmp_path / "missing.txt")
+
+
+def test_what_two_threads_say_at_once_comes_one_behind_the_other():
+    """Longer than the system's buffer of a terminal, so that each writer has to wait in the middle."""
+    said = [letter * 200_000 + b"\n" for letter in (b"a", b"b")]
+    with ModemSimulator() as modem, modem.port.open("rb", buffering=0) as reader:
+        threads = [threading.Thread(target=modem._write, args=(text,)) for text in said]
+        for thread in threads:
+            thread.start()
+        threads[0].join(0.1)  # both wait for the reader by now
+        heard = b""
+        while len(heard) < sum(map(len, said)):
+            heard += reader.read(4096)
+        for thread in threads:
+            thread.join()
+    assert sorted(heard.splitlines(keepends=True)) == said
 
 
 def test_simulator_cleans_up(tmp_path):

@@ -45,28 +45,38 @@ _BESIDE = {"RSRQ": "rsrq_db", "RSSI": "rssi_dbm", "SINR": "sinr_db", "path loss"
 _TOWER_SNR = re.compile(r"snr (lw\d)")
 
 
-_OF_GNETTRACK = {"networktech", "networkmode"}
+_OF_GNETTRACK = ("networktech", "networkmode")
 """Columns that it alone has."""
 _GNETTRACK = {
     r"level": "rsrp", r"qual": "rsrq", r"psc": "pci", r"nrxlev(\d)": r"rsrp neighbour \1",
     r"nqual(\d)": r"rsrq neighbour \1", r"ncell(\d)": r"pci neighbour \1", r"narfcn(\d)": r"arfcn neighbour \1",
+    r"lterssi": "rssi",
 }  # fmt: skip
 _SRSUE = {r"pl": "path loss"}
+_BARE = {r"rank": "rank indicator"}
+"""By itself the word may be that of any list; beside a level of a cell it is the channel's."""
 _TECH = re.compile(r"(?i)4g|5g|lte|nr")
 
 
 def known(names: list[str]) -> list[str]:
     """Plain names, those that only one program uses in the words of all: G-NetTrack Pro's, srsUE's metrics file's."""
     given = set(names)
-    if {"level", "qual"} <= given and given & _OF_GNETTRACK:
+    if {"level", "qual"} <= given and not given.isdisjoint(_OF_GNETTRACK):
         table = _GNETTRACK
     elif given >= _sheet.SRSUE:
         table = _SRSUE
+    elif "rank" in given and any(_is_level(name) for name in names):
+        table = _BARE
     else:
         return names
     for pattern, word in table.items():
         names = [re.sub(f"^{pattern}$", word, name) for name in names]
     return names
+
+
+def _is_level(name: str) -> bool:
+    meaning = _quantities.quantity(name)
+    return meaning is not None and meaning.kind == "rss"
 
 
 def is_header(names: list[str]) -> bool:
@@ -137,7 +147,8 @@ def _put(
 def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_Cell]:
     """Cells with a level; what stands without a radio access, or beside none, is that of the only one of its role.
 
-    Levels of neighbours that no column names by a PCI are no levels of a cell: they become KPIs.
+    Neighbours whose names tell no radio access are of that of the table, where it names one alone. Levels of neighbours
+    that no column names by a PCI are no levels of a cell: they become KPIs.
     """
     for (rat, role), cell in list(cells.items()):
         if cell.rsrp is not None:
@@ -152,7 +163,10 @@ def _completed(cells: dict[tuple[str, str], _Cell], others: list[int]) -> list[_
             others += [column for key, column in cell.beside.items() if key in home.beside]
             home.beside = {**cell.beside, **home.beside}
             del cells[(rat, role)]
+    named = {cell.rat for cell in cells.values()} - {""}
     for key, cell in list(cells.items()):
+        if len(named) == 1 and not cell.serving:
+            cell.rat = cell.rat or next(iter(named))
         if cell.rsrp is None or (cell.pci is None and not cell.serving):
             others += [column for column in (cell.rsrp, *cell.beside.values()) if column is not None]
             del cells[key]
@@ -279,16 +293,21 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
-    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only, its bit rates are in kbit/s."""
+    """Names in common words; G-NetTrack's ``Level`` is an RSRP on 4G and 5G only, its bit rates are in kbit/s.
+
+    Its ``LTERSSI`` is in dBm, from older phones in steps from 0 that are no level.
+    """
     words = known(sheet.plain)
-    if not _OF_GNETTRACK.isdisjoint(words):
+    if not set(words).isdisjoint(_OF_GNETTRACK):
         sheet.units |= {i: "kbit/s" for i, name in enumerate(words) if name in ("dl bitrate", "ul bitrate")}
     if words != sheet.plain and "level" in sheet.plain:
-        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find("networktech", "networkmode")
+        places, tech = [sheet.plain.index(name) for name in ("level", "qual")], sheet.find(*_OF_GNETTRACK)
         if tech is not None:
             texts = sheet.texts(tech)
             other = {text for text in set(texts) if not _TECH.search(text)}
             sheet.silence(np.array([text in other for text in texts], dtype=bool), places)
+        if (rssi := sheet.find("lterssi")) is not None:
+            sheet.silence(sheet.numbers(rssi) >= 0, [rssi])
     sheet.plain = words
 
 

@@ -11,7 +11,7 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult, Stream
-from aerpaw_parsers import _quantities, _stamps
+from aerpaw_parsers import _quantities, _stamps, drive_test
 from tests.parsers import samples
 from tests.parsers.samples import OPTIONS
 
@@ -55,6 +55,28 @@ def test_nemo_wide_table_gives_cells_by_pci() -> None:
     assert stream(result, "lte_pci22").frame["serving"].tolist() == [0.0]
     assert stream(result, "rs_snr").frame["value"].tolist() == [19.0], "a row of its own"
     assert len(stream(result, "phone").frame) == 3
+
+
+def test_neighbours_are_of_the_radio_access_that_the_table_names_alone() -> None:
+    """A cell that was a neighbour and served later was two streams, ``pci6`` and ``lte_pci6``."""
+    rows = b"2025-03-02 10:00:00,5,-90,6,-99\n2025-03-02 10:00:01,6,-91,5,-98\n"
+    one = read("drive_test", b"Time,LTEPCI,RSRP,N1 PCI,N1 RSRP\n" + rows)
+    assert {cell.name: cell.frame["rss_db"].tolist() for cell in one.streams} == {
+        "lte_pci5": [-90.0, -98.0], "lte_pci6": [-99.0, -91.0],
+    }  # fmt: skip
+    assert stream(one, "lte_pci6").frame["serving"].tolist() == [0.0, 1.0]
+    two = read(
+        "drive_test", b"Time,LTE PCI,LTE RSRP,NR PCI,NR RSRP,N1 PCI,N1 RSRP\n2025-03-02 10:00:00,5,-90,6,-80,7,-99\n"
+    )
+    assert {cell.name for cell in two.streams} == {"lte_pci5", "nr_pci6", "pci7"}, "of which of two, nobody says"
+
+
+def test_a_bare_rank_beside_a_level_is_the_rank_of_the_channel() -> None:
+    result = read("drive_test", b"Time,PCI,RSRP,Rank\n2025-03-02 10:00:00,5,-90,2\n2025-03-02 10:00:01,5,-91,0\n")
+    rank = stream(result, "rank_indicator")
+    assert (rank.kind, rank.frame["flag"].tolist()) == ("rank", ["", "no_csi"])
+    assert rank.frame["rank"][0] == 2.0
+    assert not drive_test.sniff(b"Time,Rank,Latitude,Longitude\n2025-03-02 10:00:00,5,35.7,-78.7\n"), "a list's"
 
 
 def test_nemo_times_of_the_day_take_the_date_of_the_file_name() -> None:
@@ -119,6 +141,14 @@ def test_g_nettrack_neighbours_are_not_the_serving_cell() -> None:
     serving = next(one for one in result.streams if one.attributes.get("pci") == 42)
     assert serving.frame["rss_db"].tolist() == [-95.0, -96.0]
     assert serving.frame["time"][0] == pd.Timestamp("2025-03-02T15:00:00")
+
+
+def test_g_nettrack_pro_rssi_is_beside_its_level_and_steps_are_none() -> None:
+    rows = samples.GNETTRACK_PRO.splitlines(keepends=True)
+    result = read("drive_test", b"".join([*rows[:2], rows[1].replace(b"|-70|", b"|17|").replace(b"00.00|", b"00.02|")]))
+    (cell,) = (one for one in result.streams if one.name == "pci42")
+    assert cell.frame["rssi_dbm"].tolist()[:1] == [-70.0]
+    assert np.isnan(cell.frame["rssi_dbm"].to_numpy()[1:]).all(), "older phones: steps from 0, no level"
 
 
 @pytest.mark.parametrize("columns", [lambda names: names[::-1], lambda names: names[3:] + names[:3]])

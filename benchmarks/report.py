@@ -25,7 +25,9 @@ from pathlib import Path
 import yaml
 
 ROOT = Path(__file__).parents[1]
-IMPORTS = "import sionna.rt, matplotlib.pyplot, pandas"
+IMPORTS = (
+    "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let(); import sionna.rt, matplotlib.pyplot, pandas"
+)
 LIGHT = "import matplotlib.pyplot, pandas"
 
 

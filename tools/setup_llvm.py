@@ -30,6 +30,10 @@ def main() -> int:
         say(f"{trial.library.label if trial.library else ''}: {trial.reason or 'works'}")
     if trials and trials[-1].ok:
         return 0
+    if llvm.sionna_fails(trials):
+        say(f"{llvm.explain(trials)}. Please remove .venv and run the same make command again, if need be with another")
+        say("Python: make PYTHON=python3.12 report")
+        return 1
     if not trials or trials[-1].blames_library or trials[-1].missing:
         say(f"{llvm.explain(trials)}. Installing what is missing, if this user may.")
         installed = llvm.install(say)

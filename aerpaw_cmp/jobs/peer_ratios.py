@@ -119,7 +119,8 @@ def report_cold_and_warm() -> dict[str, float]:
             return seconds("-m", "aerpaw_cmp", "report", str(flight), "-o", str(folder / out))
 
         cold, warm = report("cold"), report("warm")
-        imports = seconds("-c", "import sionna.rt, matplotlib.pyplot, pandas")
+        loads = "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let()"
+        imports = seconds("-c", f"{loads}; import sionna.rt, matplotlib.pyplot, pandas")
     return {"seconds_cold": cold, "seconds_warm": warm, "seconds_imports": imports}
 
 

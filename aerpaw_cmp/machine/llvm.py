@@ -63,6 +63,8 @@ try:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
 except (ImportError, ValueError, OSError):
     pass
+import typing, typing_extensions
+typing.__dict__.setdefault("Self", typing_extensions.Self)
 import drjit, mitsuba
 mitsuba.set_variant(sys.argv[1])
 import numpy
@@ -274,7 +276,8 @@ def try_variant(variant: str, *, python: str = sys.executable, timeout_s: float 
 
 def _verdict(library: Library | None, reason: str) -> Trial:
     missing = _missing_library(reason) if reason.startswith("Dr.Jit cannot be loaded") else ""
-    return Trial(library, not reason, reason, not missing and "No module named" not in reason, missing)
+    blameless = missing or "ModuleNotFoundError" in reason or "ImportError" in reason
+    return Trial(library, not reason, reason, not blameless, missing)
 
 
 def first_that_works(libraries: Iterable[Library], attempt: Callable[[Library], Trial] | None = None) -> list[Trial]:
@@ -362,13 +365,37 @@ def prepare_llvm() -> Path:
     """
     path = llvm_library()
     if path is None:
-        raise CheckError(f"{explain(_trials())}. Mend it with: {install_line()}")
+        line = INSTALL_AGAIN if sionna_fails(_trials()) else install_line()
+        raise CheckError(f"{explain(_trials())}. Mend it with: {line}")
     os.environ[LIBRARY_VARIABLE] = str(path)
     return path
 
 
+def let_sionna_load() -> None:
+    """Put ``Self`` into ``typing`` where Python 3.10 has none.
+
+    Sionna RT 2.2.0 says that it runs there, and imports it from there; other names of 3.11 it takes from
+    typing_extensions.
+    """
+    import typing
+
+    import typing_extensions
+
+    vars(typing).setdefault("Self", typing_extensions.Self)
+
+
+INSTALL_AGAIN = "pip install --force-reinstall sionna-rt"
+
+
+def sionna_fails(trials: Sequence[Trial]) -> bool:
+    """Whether it is Sionna RT or a package that it needs which cannot be loaded, not an LLVM."""
+    return bool(trials) and not trials[-1].ok and not trials[-1].blames_library and not trials[-1].missing
+
+
 def explain(trials: Sequence[Trial]) -> str:
     """One sentence on why none of the tried libraries serves."""
+    if sionna_fails(trials):
+        return f"Sionna RT cannot be loaded, whatever the LLVM ({trials[-1].reason})"
     if not trials:
         return f"Dr.Jit needs LLVM {MINIMUM_MAJOR} or newer, and no libLLVM was found"
     tried = "; ".join(f"{trial.library.label if trial.library else 'GPU'}: {trial.reason}" for trial in trials)

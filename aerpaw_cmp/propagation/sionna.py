@@ -28,7 +28,7 @@ import numpy as np
 
 from ..common.errors import CheckError, UsageError
 from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
-from ..machine.llvm import prepare_llvm
+from ..machine.llvm import let_sionna_load, prepare_llvm
 from ..site.materials import material
 from .arrays import Array, Link, Poses
 from .faces import inside, triangles
@@ -81,6 +81,7 @@ def load_variant(prefer: str | None = None) -> str:
     CheckError
         If no LLVM serves.
     """
+    let_sionna_load()
     kinds = (prefer,) if prefer else ("cuda", "llvm")
     without_llvm: CheckError | None = None
     if "llvm" in kinds:

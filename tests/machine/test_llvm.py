@@ -111,10 +111,22 @@ def test_a_bad_end_is_reported_and_blames_the_library(program: str, reason: str)
     assert re.search(reason, trial.reason), trial.reason
 
 
-def test_missing_sionna_is_not_the_librarys_fault() -> None:
-    trial = llvm.try_library(llvm.Library(Path("libLLVM.so"), (19,)), program="import no_such_engine")
+@pytest.mark.parametrize("program", ["import no_such_engine", "from typing import no_such_name"])
+def test_a_sionna_that_cannot_be_loaded_is_not_the_librarys_fault(program: str) -> None:
+    """Python 3.10 had no ``typing.Self``: make installed one LLVM after the other and asked for a newer one."""
+    trial = llvm.try_library(llvm.Library(Path("libLLVM.so"), (19,)), program=program)
     assert not trial.ok
     assert not trial.blames_library
+    assert llvm.sionna_fails([trial])
+    assert "whatever the LLVM" in llvm.explain([trial])
+    assert "no_such" in llvm.explain([trial])
+
+
+def test_what_sionna_wants_of_typing_is_there() -> None:
+    import typing
+
+    llvm.let_sionna_load()
+    assert hasattr(typing, "Self")
 
 
 def test_what_drjit_itself_lacks_is_named_and_installed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

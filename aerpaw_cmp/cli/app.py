@@ -16,7 +16,7 @@ import functools
 import inspect
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Optional, TypeVar, get_type_hints
+from typing import Annotated, Any, Optional, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
 
@@ -98,6 +98,12 @@ class Interrupted(BaseException):
         self.error = error
 
 
+def _bare(hint: Any) -> Any:
+    """A hint without the ``Optional`` that Python 3.10 puts around options whose default is None."""
+    inner = get_args(hint)[:1]
+    return inner[0] if get_origin(hint) is Union and get_origin(inner[0]) is Annotated else hint
+
+
 def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
     """The function with the option ``--quiet`` and an interrupt that reaches :func:`aerpaw_cmp.cli.main`."""
 
@@ -109,7 +115,8 @@ def _with_quiet(function: Callable[..., Any]) -> Callable[..., Any]:
         except KeyboardInterrupt as error:
             raise Interrupted(error) from None  # typer would make a silent exit code of it
 
-    hints = get_type_hints(function, include_extras=True) | {"quiet": Quiet}
+    hints = {name: _bare(hint) for name, hint in get_type_hints(function, include_extras=True).items()}
+    hints["quiet"] = Quiet
     kind = inspect.Parameter.KEYWORD_ONLY
     parameters = [
         *inspect.signature(function).parameters.values(),

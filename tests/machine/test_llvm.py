@@ -268,6 +268,7 @@ def test_every_system_gets_a_line(family: str, line: str, monkeypatch: pytest.Mo
 
 @pytest.mark.sionna
 def test_this_machines_llvm_traces_two_paths() -> None:
+    llvm.let_sionna_load()
     pytest.importorskip("sionna", reason="Sionna RT is not installed")
     trials = llvm.first_that_works(llvm.candidates())
     assert trials, llvm.install_line()

@@ -8,7 +8,9 @@ Horizontal distances within 3 km differ from the geodesic by less than 1 mm.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -48,13 +50,29 @@ class SiteFrame:
         """East and north [m] of WGS84 positions [deg]; NaN stays NaN."""
         latitude = np.asarray(latitude_deg, dtype=np.float64)
         longitude = np.asarray(longitude_deg, dtype=np.float64)
-        east, north = self._projection(longitude, latitude)
+        east, north = in_shape(self._projection, longitude, latitude)
         bad = ~(np.isfinite(latitude) & np.isfinite(longitude))
         return np.where(bad, np.nan, east), np.where(bad, np.nan, north)
 
     def to_geographic(self, east_m: ArrayLike, north_m: ArrayLike) -> tuple[FloatArray, FloatArray]:
         """WGS84 latitude and longitude [deg] of local positions [m]."""
-        longitude, latitude = self._projection(
-            np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64), inverse=True
-        )
-        return np.asarray(latitude), np.asarray(longitude)
+        longitude, latitude = in_shape(partial(self._projection, inverse=True), east_m, north_m)
+        return latitude, longitude
+
+
+def in_shape(transform: Callable[[Any, Any], Any], x: ArrayLike, y: ArrayLike) -> tuple[FloatArray, FloatArray]:
+    """What pyproj makes of coordinates, in their common shape; up to 3.7.1 it takes an array of one for a number.
+
+    Parameters
+    ----------
+    transform : callable
+    x, y : (...)
+        In pyproj's order.
+    """
+    first, second = np.broadcast_arrays(np.asarray(x, dtype=np.float64), np.asarray(y, dtype=np.float64))
+    if first.size == 1:
+        made = transform(float(first.reshape(-1)[0]), float(second.reshape(-1)[0]))
+    else:
+        made = transform(first, second)
+    one, other = (np.asarray(values, dtype=np.float64).reshape(first.shape) for values in made)
+    return one, other

@@ -164,12 +164,15 @@ def _type(column: pd.Series[Any]) -> str:
 
 def _write_column(group: Any, name: str, column: pd.Series[Any], kind: str) -> None:
     import numpy as np
-    import pandas as pd
 
     if kind == "text":
-        codes, words = pd.factorize(column.astype(object))
-        _write_json(group, f"{name}.words", [str(word) for word in words])
-        values = codes.astype(np.int32)  # -1: no text at all
+        # not by pandas: up to 2.3 its factorize ends a text at a NUL
+        missing = column.isna().to_numpy()
+        texts = [None if gone else str(text) for text, gone in zip(column.tolist(), missing.tolist(), strict=True)]
+        words = [text for text in dict.fromkeys(texts) if text is not None]
+        _write_json(group, f"{name}.words", words)
+        number = {None: -1} | {word: i for i, word in enumerate(words)}  # -1: no text at all
+        values = np.array([number[text] for text in texts], dtype=np.int32)
     elif kind == "time":
         values = column.to_numpy().astype("datetime64[ns]").astype(np.int64)
     else:

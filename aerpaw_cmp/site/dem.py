@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike
 
 from ..common.errors import InputError, UsageError
 from ..common.files import read_bounded
-from ..common.geodesy import SiteFrame
+from ..common.geodesy import SiteFrame, in_shape
 from ..common.units import BoolArray, FloatArray
 
 EARTH_RADIUS_M = 6_371_000.0
@@ -92,7 +92,7 @@ class Dem:
         x, y = np.asarray(east_m, dtype=np.float64), np.asarray(north_m, dtype=np.float64)
         if self._to_grid is not None:
             latitude, longitude = self.frame.to_geographic(x, y)
-            x, y = (np.asarray(value) for value in self._to_grid.transform(longitude, latitude))
+            x, y = in_shape(self._to_grid.transform, longitude, latitude)
         return (x - self.west) / self.step_x, (y - self.south) / self.step_y
 
     def absolute_m(self, east_m: ArrayLike, north_m: ArrayLike) -> FloatArray:

@@ -35,6 +35,19 @@ def test_every_dependency_has_its_reason() -> None:
     assert named - {"package", "---", "hatchling"} <= needed, "a reason for something that is not there"
 
 
+def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> None:
+    known = pytest.importorskip("trove_classifiers", reason="it comes with hatchling").classifiers
+    given = PROJECT["classifiers"]
+    assert set(given) <= known
+    versions = [line.rsplit(" ", 1)[1] for line in given if re.search(r":: 3\.\d+$", line)]
+    searched = re.findall(
+        r"python(3\.\d+)", (ROOT / "tools/setup_venv").read_text().partition("for name in")[2].partition("do")[0]
+    )
+    assert versions == sorted(searched, key=lambda one: int(one[2:]))
+    assert PROJECT["requires-python"] == f">={versions[0]}"
+    assert (ROOT / "aerpaw_cmp/py.typed").is_file()
+
+
 def test_the_readme_names_every_command() -> None:
     text = (ROOT / "README.md").read_text()
     rows = [line for line in text.splitlines() if line.startswith("| `")]

@@ -116,7 +116,7 @@ def test_the_sphere_as_netcdf_is_that_of_the_csv(folder: Path, metrics: dict, cf
             assert found["gain"].dims == ("elevation", "azimuth")
             assert found["gain"].attrs["ancillary_variables"] == "gain_sd"
             assert float(found["frequency"]) == pytest.approx(3.3e9)
-            flat = found.to_dataframe().reset_index()
+            flat = found.to_dataframe(dim_order=["elevation", "azimuth"]).reset_index()
         np.testing.assert_allclose(flat["azimuth"], table["azimuth_deg"], atol=1e-9)
         np.testing.assert_allclose(flat["elevation"], table["elevation_deg"], atol=1e-9)
         np.testing.assert_allclose(flat["gain"], table["gain_dbi"], atol=6e-4)

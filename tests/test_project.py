@@ -6,6 +6,7 @@ import ast
 import functools
 import itertools
 import re
+import runpy
 import stat
 import subprocess
 import sys
@@ -46,6 +47,12 @@ def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> 
     assert versions == sorted(searched, key=lambda one: int(one[2:]))
     assert PROJECT["requires-python"] == f">={versions[0]}"
     assert (ROOT / "aerpaw_cmp/py.typed").is_file()
+
+
+def test_every_dependency_has_a_lowest_version() -> None:
+    lowest = runpy.run_path(str(ROOT / "tools/lowest_versions.py"))["lowest"](PROJECT["dependencies"])
+    assert len(lowest) == len(PROJECT["dependencies"])
+    assert [line for line in lowest if not re.fullmatch(r"[\w.-]+==\d[\w.]*", line)] == []
 
 
 def test_the_readme_names_every_command() -> None:

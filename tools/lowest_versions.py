@@ -1,0 +1,31 @@
+"""The lowest versions that pyproject.toml allows, as constraints for pip: what somebody with older packages has.
+
+``python tools/lowest_versions.py > lowest.txt``, then ``pip install -c lowest.txt -e .`` in an environment of its own.
+"""
+
+from __future__ import annotations
+
+import re
+import sys
+from pathlib import Path
+
+if sys.version_info >= (3, 11):
+    import tomllib
+else:
+    import tomli as tomllib
+
+
+def lowest(dependencies: list[str]) -> list[str]:
+    """Each requirement at its lowest version.
+
+    Examples
+    --------
+    >>> lowest(["numpy>=2.0", "sionna-rt==2.2.0"])
+    ['numpy==2.0', 'sionna-rt==2.2.0']
+    """
+    return [re.sub(r"^([\w.-]+)>=([\w.]+)$", r"\1==\2", line) for line in dependencies]
+
+
+if __name__ == "__main__":
+    project = tomllib.loads((Path(__file__).resolve().parents[1] / "pyproject.toml").read_text())["project"]
+    print("\n".join(lowest(project["dependencies"])))

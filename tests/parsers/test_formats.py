@@ -29,6 +29,24 @@ def utc(text: str) -> pd.Timestamp:
 
 
 @pytest.mark.parametrize(
+    ("first", "said"),
+    [
+        ((1, 2, 3, 4, 5), None),
+        ((1, 2, 3, 7, 8), 1),
+        ((1, 2, 9, 1, 2), 2),
+        ((5, 4, 3, 2, 1), 4),
+        ((0, 1, 2, 3, 4), None),
+    ],
+)
+def test_a_row_index_that_jumps_is_told_once_per_place(first: tuple[int, ...], said: int | None) -> None:
+    rest = samples.VEHICLE_10.splitlines()[0].split(b",", 1)[1].decode()
+    rows = [f"{n},{rest.replace('00.250000', f'0{i}.250000')}\n" for i, n in enumerate(first)]
+    warnings = [text for text in read("vehicle_out", "".join(rows).encode()).warnings if "index" in text]
+    expected = [f"the row index jumps at {said} places: rows are missing or files were joined"] if said else []
+    assert warnings == expected
+
+
+@pytest.mark.parametrize(
     "data",
     [samples.VEHICLE_10, samples.VEHICLE_9, samples.VEHICLE_8, samples.VEHICLE_11, samples.VEHICLE_UTC],
     ids=["10", "9", "8", "11", "utc"],

@@ -57,6 +57,21 @@ def test_a_terminal_gets_one_bar_with_the_time_left(
     assert "page" in err
 
 
+def test_a_bar_goes_on_where_the_terminal_is_hidden_behind_it(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """While a bar is drawn, rich stands in the place of standard error, and up to 13.7 it says that it is no terminal."""
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
+    progress = shown.ProgressLines()
+    progress("maps", 0.25)
+    monkeypatch.setattr(sys.stderr, "isatty", lambda: False, raising=False)
+    progress("maps", 0.75)
+    assert progress._bar.tasks[0].percentage == 75
+    progress.end()
+    assert "maps 75 %" not in capsys.readouterr().err
+
+
 def test_quiet_leaves_warnings(capsys: pytest.CaptureFixture[str]) -> None:
     progress = shown.ProgressLines()
     progress.quiet = True

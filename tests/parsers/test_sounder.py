@@ -172,3 +172,22 @@ def test_samples_of_both_ways_come_in_the_order_of_the_file() -> None:
     assert result.streams[0].frame["time"].tolist() == [
         pd.Timestamp("2025-03-02 15:00") + pd.Timedelta(seconds=i) for i in range(3)
     ]
+
+
+@pytest.mark.parametrize(
+    ("value", "kept"), [("          2e-05", True), ("         2e-05", False), ("          2e-0", False)]
+)
+def test_a_last_line_without_its_end_counts_where_it_has_its_whole_width(value: str, kept: bool) -> None:
+    """An exponent is not read at once; one character less may be a number cut short."""
+    result = read(sample(1, 0), line(2, f"0000004 {value}").rstrip("\n"))
+    assert result.accepted == 1 + kept
+    assert [reject.number for reject in result.rejected] == ([] if kept else [2])
+    if kept:
+        assert result.streams[0].frame["flag"].tolist() == ["", _lines.UNTERMINATED]
+
+
+def test_a_level_at_the_floor_is_out_of_coverage_and_one_above_is_not() -> None:
+    floor = OPTIONS.floor_db
+    frame = read(sample(1, 0, floor), sample(2, 4, floor + 1e-4), sample(3, 8, floor - 1e-4)).streams[0].frame
+    assert frame["flag"].tolist() == ["out_of_coverage", "", "out_of_coverage"]
+    assert frame["rss_db"].isna().tolist() == [True, False, True]

@@ -140,7 +140,8 @@ def _library(path: Path) -> Library | None:
     versions = [version_in_name(name) for name in (path.resolve().name, path.name)]
     if versions == [None, None]:
         return None
-    return Library(path.resolve(), next((version for version in versions if version), ()))
+    # of two names the one with the release: 'libLLVM.so.1' says the revision of an interface
+    return Library(path.resolve(), max((version for version in versions if version), default=()))
 
 
 def _system_paths() -> list[Path]:
@@ -178,7 +179,9 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
         paths = [path for folder in folders.split(os.pathsep) for path in Path(folder).glob("libLLVM*")]
     else:
         paths = _system_paths()
-    found = {library.path: library for path in paths if (library := _library(path))}
+    found: dict[Path, Library] = {}
+    for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
+        found[library.path] = max(found.get(library.path, library), library, key=lambda one: one.version)
     return sorted(found.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
 
 
@@ -424,19 +427,28 @@ def apt_packages(search_output: str) -> list[str]:
     return [name for _, name in new_enough]
 
 
-def _offered_by_apt() -> list[str]:
+def _known_to_apt() -> str:
+    """What apt's lists say of LLVM runtimes of any version; nothing where there are no lists."""
     apt_cache = shutil.which("apt-cache")
     if apt_cache is None:
-        return []
+        return ""
     command = [apt_cache, "search", "--names-only", "^libllvm[0-9]+(t64)?$"]
-    return apt_packages(subprocess.run(command, capture_output=True, text=True, check=False).stdout)
+    return subprocess.run(command, capture_output=True, text=True, check=False).stdout
+
+
+def _offered_by_apt() -> list[str]:
+    return apt_packages(_known_to_apt())
 
 
 def install_line() -> str:
     """The one line that installs an LLVM on this machine."""
     families = _os_families()
     if families & {"debian", "ubuntu"}:
-        package = next(iter(_offered_by_apt()), "libllvm19")
+        known = _known_to_apt()
+        if known and not apt_packages(known):  # Ubuntu 22.04 ends at 15: the project's own packages
+            fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
+            return f"{fetch} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"
+        package = next(iter(apt_packages(known)), "libllvm19")
         return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
     if families & {"fedora", "rhel", "centos"}:
         return "sudo dnf install -y llvm-libs libatomic"

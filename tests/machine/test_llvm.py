@@ -203,7 +203,7 @@ def test_prepare_without_any_gives_the_line_that_mends_it(tmp_path: Path, monkey
     monkeypatch.setenv(llvm.FOLDERS_VARIABLE, str(tmp_path))
     monkeypatch.delenv(llvm.LIBRARY_VARIABLE, raising=False)
     monkeypatch.setattr(llvm, "_os_families", lambda: {"debian"})
-    monkeypatch.setattr(llvm, "_offered_by_apt", lambda: ["libllvm19"])
+    monkeypatch.setattr(llvm, "_known_to_apt", lambda: "libllvm19 - x\n")
     llvm._trials.cache_clear()
     with pytest.raises(CheckError, match=r"no libLLVM was found.*apt-get install -y libllvm19") as caught:
         llvm.prepare_llvm()
@@ -264,6 +264,30 @@ def test_install_refuses_without_root(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_every_system_gets_a_line(family: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(llvm, "_os_families", lambda: {family})
     assert line in llvm.install_line()
+
+
+@pytest.mark.parametrize(
+    ("known", "line"),
+    [
+        ("libllvm18 - x\nlibllvm19 - x\n", "install -y libllvm19 libatomic1"),
+        ("libllvm14 - x\nlibllvm15 - x\n", "apt.llvm.org/llvm.sh"),  # Ubuntu 22.04
+        ("", "install -y libllvm19 libatomic1"),  # no lists yet: a new container
+    ],
+)
+def test_the_line_of_a_debian_names_what_can_be_had(known: str, line: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(llvm, "_os_families", lambda: {"ubuntu"})
+    monkeypatch.setattr(llvm, "_known_to_apt", lambda: known)
+    assert line in llvm.install_line()
+    assert ("apt.llvm.org" in llvm.install_line()) == ("apt.llvm.org" in line)
+
+
+def test_a_library_that_is_called_by_its_interface_has_the_version_of_its_other_name(tmp_path: Path) -> None:
+    """As the project's own packages have it: libLLVM-19.so.1 leads to libLLVM.so.1."""
+    (tmp_path / "libLLVM.so.1").touch()
+    for name in ("libLLVM-19.so.1", "libLLVM.so", "libLLVM-19.so"):
+        (tmp_path / name).symlink_to("libLLVM.so.1")
+    found = llvm.candidates({llvm.FOLDERS_VARIABLE: str(tmp_path)})
+    assert [one.version for one in found] == [(19,)]
 
 
 @pytest.mark.sionna

@@ -24,10 +24,9 @@ from pathlib import Path
 
 import yaml
 
+from aerpaw_cmp.jobs.peer_ratios import IMPORTS
+
 ROOT = Path(__file__).parents[1]
-IMPORTS = (
-    "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let(); import sionna.rt, matplotlib.pyplot, pandas"
-)
 LIGHT = "import matplotlib.pyplot, pandas"
 
 

@@ -33,7 +33,7 @@ class ProgressLines:
             return
         if fraction is None:
             self.warn(text)
-        elif self._bar is not None or sys.stderr.isatty():  # while a bar stands, rich up to 13 says that it is none
+        elif self._bar is not None or sys.stderr.isatty():  # while a bar stands, rich 13.7 says that it is none
             self._draw(text, fraction)
         else:
             name, _, tail = text.partition("\t")

@@ -91,6 +91,12 @@ def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, 
     }
 
 
+IMPORTS = (
+    "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let(); import sionna.rt, matplotlib.pyplot, pandas"
+)
+"""What every report has to load, as a program."""
+
+
 def report_cold_and_warm() -> dict[str, float]:
     """Wall time of a report as a process: the first with empty caches, and the next; and of the imports it is made of.
 
@@ -119,8 +125,7 @@ def report_cold_and_warm() -> dict[str, float]:
             return seconds("-m", "aerpaw_cmp", "report", str(flight), "-o", str(folder / out))
 
         cold, warm = report("cold"), report("warm")
-        loads = "from aerpaw_cmp.machine.llvm import let_sionna_load as let; let()"
-        imports = seconds("-c", f"{loads}; import sionna.rt, matplotlib.pyplot, pandas")
+        imports = seconds("-c", IMPORTS)
     return {"seconds_cold": cold, "seconds_warm": warm, "seconds_imports": imports}
 
 

@@ -436,19 +436,16 @@ def _known_to_apt() -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stdout
 
 
-def _offered_by_apt() -> list[str]:
-    return apt_packages(_known_to_apt())
-
-
 def install_line() -> str:
     """The one line that installs an LLVM on this machine."""
     families = _os_families()
     if families & {"debian", "ubuntu"}:
         known = _known_to_apt()
-        if known and not apt_packages(known):  # Ubuntu 22.04 ends at 15: the project's own packages
+        offered = apt_packages(known)
+        if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             return f"{fetch} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"
-        package = next(iter(apt_packages(known)), "libllvm19")
+        package = next(iter(offered), "libllvm19")
         return f"sudo apt-get update && sudo apt-get install -y {package} {APT_RUNTIME}"
     if families & {"fedora", "rhel", "centos"}:
         return "sudo dnf install -y llvm-libs libatomic"
@@ -511,7 +508,7 @@ def install(say: Callable[[str], None], attempt: Callable[[Library], Trial] | No
     apt_get("update", "-qq")  # old lists name packages that the mirror no longer has
     # an LLVM is there and only Dr.Jit's own need is missing, or else the distribution's LLVMs, newest first
     wanted: list[tuple[str, ...]] = [(APT_RUNTIME,)] if candidates() else []
-    wanted += [(package, APT_RUNTIME) for package in _offered_by_apt()]
+    wanted += [(package, APT_RUNTIME) for package in apt_packages(_known_to_apt())]
     last: Trial | None = None
     for packages in wanted:
         last = apt_install(*packages) or last

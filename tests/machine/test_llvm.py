@@ -299,6 +299,24 @@ def test_this_machines_llvm_traces_two_paths() -> None:
     assert trials[-1].ok, trials
 
 
+def test_setup_script_installs_no_llvm_where_a_package_is_what_fails(tmp_path: Path) -> None:
+    """The real script beside a Dr.Jit that asks typing for a name that is not there, as Sionna RT did on Python 3.10."""
+    import subprocess
+
+    (tmp_path / "drjit").mkdir()
+    (tmp_path / "drjit/__init__.py").write_text("from typing import no_such_name\n")
+    (tmp_path / "libLLVM.so.19.1").touch()
+    root = Path(__file__).resolve().parents[2]
+    environ = {**os.environ, "PYTHONPATH": str(tmp_path), llvm.FOLDERS_VARIABLE: str(tmp_path)}
+    environ.pop(llvm.LIBRARY_VARIABLE, None)
+    command = [sys.executable, str(root / "tools/setup_llvm.py")]
+    done = subprocess.run(command, cwd=root, env=environ, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "whatever the LLVM" in done.stderr
+    assert "no_such_name" in done.stderr
+    assert "apt-get" not in done.stderr
+
+
 @pytest.mark.sionna
 def test_setup_script_prints_the_one_line_when_nothing_can_be_installed(tmp_path: Path) -> None:
     """The real script, told that there is no library anywhere and no way to become root."""

@@ -29,7 +29,7 @@ def utc(text: str) -> pd.Timestamp:
 
 
 @pytest.mark.parametrize(
-    ("first", "said"),
+    ("indices", "said"),
     [
         ((1, 2, 3, 4, 5), None),
         ((1, 2, 3, 7, 8), 1),
@@ -38,9 +38,9 @@ def utc(text: str) -> pd.Timestamp:
         ((0, 1, 2, 3, 4), None),
     ],
 )
-def test_a_row_index_that_jumps_is_told_once_per_place(first: tuple[int, ...], said: int | None) -> None:
+def test_a_row_index_that_jumps_is_told_once_per_place(indices: tuple[int, ...], said: int | None) -> None:
     rest = samples.VEHICLE_10.splitlines()[0].split(b",", 1)[1].decode()
-    rows = [f"{n},{rest.replace('00.250000', f'0{i}.250000')}\n" for i, n in enumerate(first)]
+    rows = [f"{n},{rest.replace('00.250000', f'0{i}.250000')}\n" for i, n in enumerate(indices)]
     warnings = [text for text in read("vehicle_out", "".join(rows).encode()).warnings if "index" in text]
     expected = [f"the row index jumps at {said} places: rows are missing or files were joined"] if said else []
     assert warnings == expected

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import ast
+import email
 import functools
 import itertools
 import re
 import runpy
+import shutil
 import stat
 import subprocess
 import sys
@@ -47,6 +49,37 @@ def test_classifiers_are_known_and_name_every_python_that_set_up_looks_for() -> 
     assert versions == sorted(searched, key=lambda one: int(one[2:]))
     assert PROJECT["requires-python"] == f">={versions[0]}"
     assert (ROOT / "aerpaw_cmp/py.typed").is_file()
+
+
+@pytest.mark.parametrize("source", ["", "https://forge.example/lab/aerpaw-cmp/"], ids=["no address", "an address"])
+def test_the_readme_of_a_package_index_needs_no_file_of_ours(source: str, tmp_path: Path) -> None:
+    """Without a public address the README is as it stands; with one, no link is left that leads nowhere there."""
+    pytest.importorskip("hatchling", reason="hatchling is not installed")
+    for name in ("README.md", "LICENSE", "aerpaw_cmp/__init__.py", "tools/readme_links.py"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        shutil.copy(ROOT / name, tmp_path / name)
+    text = (ROOT / "pyproject.toml").read_text()
+    assert text.count("[project.urls]\n") == 1
+    line = f'Source = "{source}"\n' if source else ""
+    (tmp_path / "pyproject.toml").write_text(text.replace("[project.urls]\n", f"[project.urls]\n{line}"))
+    code = "from hatchling.build import prepare_metadata_for_build_wheel as make; print(make('.'))"
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    told = email.message_from_bytes((tmp_path / done.stdout.strip() / "METADATA").read_bytes())
+    assert told["Description-Content-Type"] == "text/markdown"
+    assert "Paper, https://arxiv.org/abs/2502.10324" in told.get_all("Project-URL")
+    readme, shown = (ROOT / "README.md").read_text(), told.get_payload()
+    if not source:
+        assert shown.strip() == readme.strip()
+        return
+    links = re.findall(r"(!?)\[[^\]\[]*\]\(([^)]+)\)", readme)
+    seen = re.findall(r"(!?)\[[^\]\[]*\]\(([^)]+)\)", shown)
+    tag = f"v{told['Version']}"
+    for (image, target), (also, address) in zip(links, seen, strict=True):
+        kind = "raw" if image else "blob"
+        own = f"https://forge.example/lab/aerpaw-cmp/{kind}/{tag}/{target}"
+        assert (also, address) == (image, target if "://" in target else own)
+    assert sum(bool(image) for image, _ in links) >= 3
 
 
 def test_every_dependency_has_a_lowest_version() -> None:

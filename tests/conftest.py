@@ -62,6 +62,28 @@ DEAREST = (
     "jobs/test_calibrate.py",
     "test_cli_commands.py",
     "live/test_benchmarks.py",
+    "logs/test_blocks.py",
+    "common/test_output_faults.py",
+    "report/test_report.py",
+    "logs/test_flight_file.py",
+    "report/test_exports.py",
+    "propagation/test_interactions.py",
+    "compare/test_receiver.py",
+    "jobs/test_outcomes.py",
+    "parsers/test_two_ways.py",
+    "report/test_maps.py",
+    "maps/test_netcdf.py",
+    "jobs/test_live_prediction.py",
+    "test_cli_manners.py",
+    "compare/test_direction_gain.py",
+    "logs/test_fuzz_inputs.py",
+    "test_round_trip.py",
+    "jobs/test_outputs_of_commands.py",
+    "jobs/test_plan.py",
+    "maps/test_kriging.py",
+    "compare/test_calibration.py",
+    "compare/test_gain_choice.py",
+    "test_project.py",
 )
 """Files that take 5 s and more, the longest first."""
 
@@ -78,7 +100,11 @@ def pytest_unconfigure() -> None:
 
 @pytest.hookimpl(optionalhook=True)
 def pytest_xdist_auto_num_workers() -> int | None:
-    """``-n auto`` starts a worker per core: one for two threads of a core, and as many as the host has in a container."""
+    """Workers for ``-n auto``, which would count cores: one for two threads, and those of the host in a container.
+
+    On few threads one more than there are: tests of the tap, of pages and of commands wait for others a good part of
+    their time.
+    """
     if os.environ.get("PYTEST_XDIST_AUTO_NUM_WORKERS") or not hasattr(os, "sched_getaffinity"):
         return None
     threads = len(os.sched_getaffinity(0))
@@ -87,7 +113,7 @@ def pytest_xdist_auto_num_workers() -> int | None:
         granted = max(1, int(quota) // int(period))
     except (OSError, ValueError):  # no control group, or no limit
         granted = threads
-    return granted if granted < threads else 2 if threads in (2, 3) else None
+    return granted + 1 if granted in (2, 3) else granted if granted < threads else None
 
 
 @pytest.hookimpl(trylast=True)

@@ -173,17 +173,18 @@ class OutputFile:
         self._place: _Place | None = None
 
     def __enter__(self) -> OutputFile:
-        if not self.target.parent.is_dir():
-            raise UsageError(
-                "there is no such folder", expected="a file name in a folder that exists", path=self.named.parent
-            )
-        self._refuse()
+        with explained_os_errors(self.named):
+            if not self.target.parent.is_dir():
+                raise UsageError(
+                    "there is no such folder", expected="a file name in a folder that exists", path=self.named.parent
+                )
+            self._refuse()
         self._place = _Place(self.target, self.named, folder=False)
         return self
 
     def _refuse(self) -> None:
         """UsageError unless the target may be written."""
-        if not os.path.lexists(self.target):
+        if not _taken(self.target):
             return
         if not self.target.is_file():
             raise UsageError("what has this name is no ordinary file", expected="a file name", path=self.named)
@@ -338,7 +339,7 @@ class OutputFolder(_SeveralFiles):
 
     def _refuse_shape(self) -> None:
         """UsageError for a name that no folder of results can have."""
-        if os.path.lexists(self.target) and not self.target.is_dir():
+        if _taken(self.target) and not self.target.is_dir():
             raise UsageError("a file is in the way", expected="the name of a folder", path=self.named)
         if self.target.is_dir():
             here = Path.cwd().resolve()
@@ -859,6 +860,15 @@ _REMEDIES = {
     errno.ENOENT: "the folder was removed while the run went on: run again",
 }
 _WRONG_NAMES = (errno.ENOTDIR, errno.EEXIST, errno.EISDIR, errno.ENAMETOOLONG, errno.ELOOP, errno.EINVAL)
+
+
+def _taken(path: Path) -> bool:
+    """Whether anything has the name; OSError where nothing can have it, which ``lexists`` takes for a free one."""
+    try:
+        path.lstat()
+    except FileNotFoundError:
+        return False
+    return True
 
 
 @contextlib.contextmanager

@@ -198,6 +198,14 @@ def test_folders_that_cannot_be_exchanged_are_told_first(tmp_path: Path, monkeyp
             pass
 
 
+def test_files_whose_name_cannot_be_are_told_first(tmp_path: Path) -> None:
+    (tmp_path / "file").write_text("")
+    for name in ("x" * 300, "file/table.csv", "x" * 300 + "/table.csv", "missing/table.csv"):
+        with pytest.raises(UsageError), OutputFile(tmp_path / name, own=lambda _: True):
+            pytest.fail("the work begins")
+    assert [path.name for path in tmp_path.iterdir()] == ["file"]
+
+
 def test_a_failure_leaves_the_old_set_and_no_rest(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     target = tmp_path / "new" / "report"
     fail = lambda *_: (_ for _ in ()).throw(OSError(errno.ENOSPC, "No space left on device"))  # noqa: E731

@@ -178,14 +178,19 @@ def test_two_taps_in_one_process(modem, tap, tmp_path):
     session.end()
 
 
+def modem_manager(node):
+    """A process that holds a port, under the name by which the kernel shows it."""
+    code = "import time\nopen('/proc/self/comm', 'w').write('ModemManager')\nprint(1, flush=True)\ntime.sleep(30)"
+    process = subprocess.Popen([sys.executable, "-W", "ignore", "-c", code], stdin=node, stdout=subprocess.PIPE)
+    with process.stdout as said:
+        assert said.readline() == b"1\n"
+    return process
+
+
 def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_path):
     sim = modem()
-    # a copy of 'sleep' under its name: holders are shown by the kernel's name of the process
-    program = tmp_path / "ModemManager"
-    program.write_bytes(Path(os.path.realpath("/bin/sleep")).read_bytes())
-    program.chmod(0o755)
     with sim.node.open("rb", buffering=0) as node:
-        process = subprocess.Popen([program, "30"], stdin=node)
+        process = modem_manager(node)
     try:
         until = time.monotonic() + 10
         while not any(h.pid == process.pid and h.name == "ModemManager" for h in holders(sim.node)):
@@ -201,14 +206,11 @@ def test_modem_manager_is_named_with_the_line_that_frees_the_port(modem, tmp_pat
 
 
 @pytest.mark.skipif(os.geteuid() != 0, reason="dropping privileges needs root")
-def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem, tmp_path):
+def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem):
     import fcntl
     import termios
 
     sim = modem()
-    program = tmp_path / "ModemManager"
-    program.write_bytes(Path(os.path.realpath("/bin/sleep")).read_bytes())
-    program.chmod(0o755)
     sim.node.chmod(0o666)
     code = (
         "import os, sys\nfrom pathlib import Path\nfrom aerpaw_cmp.live.ports import SerialPort\n"
@@ -218,7 +220,7 @@ def test_modem_manager_is_named_to_a_user_who_may_not_see_its_files(modem, tmp_p
     environment = os.environ | {"PYTHONPATH": str(Path(__file__).resolve().parents[2])}
     with sim.node.open("rb", buffering=0) as node:
         fcntl.ioctl(node, termios.TIOCEXCL)  # as ModemManager does
-        process = subprocess.Popen([program, "30"], stdin=node)
+        process = modem_manager(node)
         try:
             done = subprocess.run(
                 [sys.executable, "-c", code, sim.node], env=environment, text=True, capture_output=True, check=False

@@ -443,7 +443,7 @@ def install_line() -> str:
         known = _known_to_apt()
         offered = apt_packages(known)
         if known and not offered:  # Ubuntu 22.04 ends at 15: packages of the LLVM project
-            needs = "wget gnupg lsb-release software-properties-common"  # of that script; a small system has none of them
+            needs = "wget gnupg lsb-release software-properties-common"  # what that script calls
             fetch = "wget https://apt.llvm.org/llvm.sh && sudo bash llvm.sh 19"
             first = f"sudo apt-get update && sudo apt-get install -y {needs} && {fetch}"
             return f"{first} && sudo apt-get install -y libllvm19 {APT_RUNTIME}"

@@ -85,7 +85,7 @@ DEAREST = (
     "compare/test_gain_choice.py",
     "test_project.py",
 )
-"""Files that take 5 s and more, the longest first."""
+"""Files that take 3 s and more, the longest first by and large."""
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:

@@ -1,8 +1,8 @@
 """The README as a package index shows it: a link into this project must name its whole address there.
 
 Hatchling runs this where metadata are made. The address is that of ``Source`` under ``[project.urls]``, the links are
-those of the version's tag, ``/raw/`` for images and ``/blob/`` for pages (GitHub's and Gitea's way). Without a
-``Source`` the README stays as it is.
+those of the version's tag, ``/raw/`` for images and ``/blob/`` for pages, GitHub's way. Without a ``Source``
+the README stays as it is.
 """
 
 from __future__ import annotations

@@ -198,6 +198,14 @@ def test_folders_that_cannot_be_exchanged_are_told_first(tmp_path: Path, monkeyp
             pass
 
 
+def test_a_folder_is_told_first_where_is_dir_hides_every_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """From Python 3.14 on ``Path.is_dir`` is as silent as ``os.path.isdir``."""
+    monkeypatch.setattr(Path, "is_dir", lambda path, **_: os.path.isdir(path))  # noqa: PTH112 - the one that is silent
+    with pytest.raises(UsageError, match="name too long"), OutputFolder(tmp_path / ("x" * 300), job="report"):
+        pytest.fail("the work begins")
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_files_whose_name_cannot_be_are_told_first(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     for name in ("x" * 300, "file/table.csv", "x" * 300 + "/table.csv", "missing/table.csv"):

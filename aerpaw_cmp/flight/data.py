@@ -17,12 +17,12 @@ from numpy.typing import NDArray
 from ..common.errors import InputError, UsageError
 from ..common.units import MINIMUM_HEIGHT_M, BoolArray, FloatArray, IntArray
 from ..logs.ingest import IngestedFile, ingest, read_log
-from ..logs.limits import UNSCORED, flagged
 from ..logs.records import Stream
 from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
 from .heights import at_height, lacks_height
+from .scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
 from .track import Track, TrackPoses, good_positions
 
@@ -246,7 +246,7 @@ def _node_positions(name: str, log: LogSettings, path: Path, timezone: str | Non
     for stream in at_height(log, file).result.streams:
         if stream.name in log.skip or not {"latitude_deg", "longitude_deg"} <= set(stream.frame.columns):
             continue
-        frame = stream.frame.loc[~flagged(stream.frame)]
+        frame = stream.frame.loc[~unscored(stream.frame)]
         latitude, longitude = (frame[key].to_numpy(np.float64) for key in ("latitude_deg", "longitude_deg"))
         frame = frame.loc[good_positions(latitude, longitude, np.zeros(len(frame)))]
         if len(frame):
@@ -406,7 +406,7 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
 
 
 def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings: list[str]) -> Track:
-    frame, _ = _scored(stream, path)
+    frame, _ = scored_rows(stream, path)
     track = Track(
         frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m
     )  # fmt: skip
@@ -426,29 +426,6 @@ def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings
         )
     warnings += [f"{path}: {text}" for text in track.account.warnings]
     return track
-
-
-def _scored(stream: Stream, path: str) -> tuple[pd.DataFrame, dict[str, int]]:
-    """The rows that may be compared, and how many the others are per flag.
-
-    Raises
-    ------
-    InputError
-        If no row is left.
-    """
-    frame = stream.frame
-    void = flagged(frame)
-    if not void.any():
-        return frame, {}
-    words = Counter(w for text in frame["flag"][void] for w in str(text).split(";") if w in UNSCORED)
-    if void.all():
-        raise InputError(
-            f"every row of {stream.kind} {stream.name!r} is flagged {', '.join(words)}",
-            expected="values that can be, see docs/formats.md",
-            cause="another unit, or exchanged columns",
-            path=path,
-        )
-    return frame[~void], dict(words)
 
 
 FAR_M = 30_000.0
@@ -556,7 +533,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
     noise_dbm, link = _noise(stream, _link_of(settings.link, log, stream))
-    frame, left_out = _scored(stream, log.path)
+    frame, left_out = scored_rows(stream, log.path)
     return RssSeries(
         tower=tower,
         channel=channel,
@@ -575,7 +552,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
 
 def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | None) -> RankSeries:
     home = _known_tower(tower, log, site)
-    frame, left_out = _scored(stream, log.path)
+    frame, left_out = scored_rows(stream, log.path)
     position = None
     if {"latitude_deg", "longitude_deg", "altitude_m"} <= set(frame.columns) and frame["latitude_deg"].notna().any():
         east, north = site.frame.to_local(frame["latitude_deg"], frame["longitude_deg"])

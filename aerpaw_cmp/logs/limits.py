@@ -73,7 +73,7 @@ FEW_ROWS = 3
 """At most this share, or this many, are "a few"."""
 
 UNSCORED = ("level_out_of_range", "time_out_of_range", "rank_above_ports", "no_number")
-"""Flags of rows that no comparison scores. (The other flags void the doubtful value itself.)"""
+"""Flags of rows that no comparison scores (`flight/scored.py`). The other flags void the doubtful value itself."""
 
 
 def check(result: ReadResult) -> ReadResult:
@@ -92,15 +92,6 @@ def check(result: ReadResult) -> ReadResult:
     warnings: list[str] = []
     streams = tuple(_checked(stream, warnings) for stream in result.streams)
     return replace(result, streams=streams, warnings=(*result.warnings, *warnings)) if warnings else result
-
-
-def flagged(frame: pd.DataFrame, reasons: tuple[str, ...] = UNSCORED) -> BoolArray:
-    """Rows (n,) that carry one of the flags."""
-    flag = frame["flag"].to_numpy(dtype=object)
-    out = np.zeros(len(flag), dtype=np.bool_)
-    for i in np.flatnonzero(flag != ""):
-        out[i] = any(word in reasons for word in str(flag[i]).split(";"))
-    return out
 
 
 def _checked(stream: Stream, warnings: list[str]) -> Stream:

@@ -6,7 +6,8 @@ import numpy as np
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.logs.limits import UNSCORED, check, flagged
+from aerpaw_cmp.flight.scored import unscored
+from aerpaw_cmp.logs.limits import UNSCORED, check
 from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
 
 
@@ -30,7 +31,7 @@ def test_absurd_levels_are_flagged_and_void(value: float, unit: str) -> None:
     frame = result.streams[0].frame
     assert frame["flag"].tolist() == ["", "level_out_of_range", "", "", ""]
     assert np.isnan(frame["rss_db"][1])
-    assert flagged(frame).tolist() == [False, True, False, False, False]
+    assert unscored(frame).tolist() == [False, True, False, False, False]
     assert "1 row is flagged level_out_of_range" in result.warnings[0]
     assert "line 2" in result.warnings[0]
 
@@ -83,7 +84,7 @@ def test_a_few_stamps_days_from_all_others_are_flagged(stamp: str) -> None:
     frame = frame_of("rss", 10, rss_db=np.full(10, -80.0))
     frame.loc[4, "time"] = pd.Timestamp(stamp)
     result = check(ReadResult("r", (Stream("rss", "s", frame, {"unit": "dBm"}),), 10, 10, 0))
-    assert flagged(result.streams[0].frame).nonzero()[0].tolist() == [4]
+    assert unscored(result.streams[0].frame).nonzero()[0].tolist() == [4]
 
 
 def test_two_flights_in_one_file_are_no_damaged_stamps() -> None:

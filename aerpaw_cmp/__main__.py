@@ -112,11 +112,11 @@ def _message(error: BaseException) -> tuple[str, int]:
 
 def _notes(error: BaseException | None) -> list[str]:
     """What is kept, by the exception or those that it came of."""
-    found: list[str] = []
+    notes: list[str] = []
     while error is not None:
-        found += [note for note in getattr(error, "__notes__", ()) if note not in found]
+        notes += [note for note in getattr(error, "__notes__", ()) if note not in notes]
         error = error.__cause__ or error.__context__
-    return found
+    return notes
 
 
 def _run(arguments: list[str]) -> int:

@@ -274,7 +274,7 @@ def real_table(root: Path) -> list[dict[str, object]]:
         path = Path(__file__).parents[1] / "tests" / "field" / f"{name}.yaml"
         settings = load_flight(path)
         data = gather(settings, path.parent, read_logs(settings, path.parent, root), root)
-        clock = next(c for c in estimate_clocks(data) if c is not None).found
+        clock = next(c for c in estimate_clocks(data) if c is not None).result
         rows.append({
             "flight": name, "model": "its flight file", "planted_s": 0.0, "verdict": clock.verdict,
             "found_s": clock.radio_minus_telemetry_s, "explained": clock.checks.get("explained"),

@@ -88,7 +88,7 @@ FAULTS = (
     Fault("crowns as cylinders", f"{P}.foliage", "CrownIndex.__init__", "self.shape: Shape = shape", "self.shape: Shape = 'cylinder'"),
     Fault("one segment of a path without foliage", f"{P}.foliage", "foliage_depth_m", "for k in range(last, -2, -1):", "for k in range(last, -1, -1):"),
     Fault("paths of two reflections dropped", f"{P}.image", "find_paths", "for level in tree:", "for level in tree[:2]:"),
-    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(found, max_depth, faces, in_order=in_order)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(found, max_depth, faces))"),
+    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(pieces_of_towers, max_depth, faces, in_order=in_order)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(pieces_of_towers, max_depth, faces))"),
     Fault("direct paths dropped", f"{P}.image", "find_paths", "for level in tree:", "for level in tree[1:]:"),
     Fault("nothing hides", f"{P}.solids", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
     Fault("walls 5 m longer than they are", f"{P}.faces", "inside", "faces.upper[index] + tolerance_m", "faces.upper[index] + 5.0"),

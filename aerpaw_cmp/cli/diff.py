@@ -33,35 +33,35 @@ def diff(
     from ..jobs.diff_reports import run_diff
     from ..report.diff_html import diff_metrics
 
-    found = run_diff(first, second, out=out, tolerance_db=tolerance, force=force)
+    comparison = run_diff(first, second, out=out, tolerance_db=tolerance, force=force)
     if as_json:
-        print_json(diff_metrics(found))
+        print_json(diff_metrics(comparison))
     else:
-        _print_diff(found)
+        _print_diff(comparison)
         if out is not None:
             print(f"page: {out / 'diff.html'}")
-    return 1 if strict and found.differences else 0
+    return 1 if strict and comparison.differences else 0
 
 
 _SHOWN = 20
 """Changes of one kind that are printed."""
 
 
-def _print_diff(found: Any) -> None:
+def _print_diff(comparison: Any) -> None:
     from ..report.diff_data import verdict
 
-    print(verdict(found))
-    for text in found.remarks:
+    print(verdict(comparison))
+    for text in comparison.remarks:
         say.warn(f"warning: {one_line(text)}")
-    for title, items in (("setting", found.settings), ("version", found.versions)):
+    for title, items in (("setting", comparison.settings), ("version", comparison.versions)):
         for one in items[:_SHOWN]:
             print(one_line(f"{title} {one.key}: {_value(one.first)} -> {_value(one.second)}"))
         if len(items) > _SHOWN:
             print(f"and {len(items) - _SHOWN} more {title}s")
-    for one in found.inputs:
+    for one in comparison.inputs:
         print(one_line(f"input {one.path} ({one.role}): {one.what}"))
-    _print_numbers(found)
-    for name, texts in (("second", found.new_warnings), ("first", found.gone_warnings)):
+    _print_numbers(comparison)
+    for name, texts in (("second", comparison.new_warnings), ("first", comparison.gone_warnings)):
         for text in texts:
             print(one_line(f"warning only in the {name}: {text}"))
 
@@ -74,13 +74,13 @@ def _bounds(value: tuple[float, float]) -> str:
     return "-" if value[0] != value[0] else f"{value[0]:+.3f} .. {value[1]:+.3f}"
 
 
-def _print_numbers(found: Any) -> None:
+def _print_numbers(comparison: Any) -> None:
     rows = [
         [f"{d.tower} {d.channel}", f"{d.samples.common} of {d.samples.first}, {d.samples.second}",
          number(d.rmse.other_rmse_db, "{:.3f}"), number(d.rmse.rmse_db, "{:.3f}"),
          number(d.rmse.difference_db, "{:+.3f}"), _bounds(d.rmse.difference_ci95_db), d.rmse.verdict,
          number(d.offset_db.difference, "{:+.1f}"), number(d.simulated_max_db, "{:.3f}")]
-        for d in found.levels
+        for d in comparison.levels
     ]  # fmt: skip
     if rows:
         heads = ["link", "common samples", "RMSE first dB", "second", "change", "95 %", "second is", "offset", "replay"]
@@ -89,7 +89,7 @@ def _print_numbers(found: Any) -> None:
         [d.tower, d.k, f"{d.samples.common} of {d.samples.first}, {d.samples.second}", str(d.n_changed),
          number(d.agreement.difference, "{:+.3f}"), _bounds(d.agreement.ci95),
          number(d.kappa.difference, "{:+.3f}"), _bounds(d.kappa.ci95)]
-        for d in found.ranks
+        for d in comparison.ranks
     ]  # fmt: skip
     if rows:
         heads = ["tower", "K", "common samples", "ranks changed", "agreement", "95 %", "kappa", "95 %"]

@@ -37,22 +37,25 @@ def explain(
     """List every path of a link at an instant, term by term."""
     from ..jobs.explain import run_explain
 
-    found = run_explain(
+    explanation = run_explain(
         flight, time=time, tower=tower, channel=channel, engine=engine, logs_root=logs_root, progress=say
     )
     if as_json:
-        print_json(found.as_dict())
+        print_json(explanation.as_dict())
     else:
-        _print(found)
+        _print(explanation)
     return 0
 
 
-def _print(found: Any) -> None:
-    east, north, up = found.position_m
-    print(f"{found.flight}: {found.tower} {found.channel} at {found.time_utc} ({found.time_s:.1f} s)")
-    print(f"UAV at {east:.2f} m east, {north:.2f} m north, {up:.2f} m up; {found.carrier_hz / 1e9:g} GHz")
+def _print(explanation: Any) -> None:
+    east, north, up = explanation.position_m
+    print(
+        f"{explanation.flight}: {explanation.tower} {explanation.channel} at {explanation.time_utc} "
+        f"({explanation.time_s:.1f} s)"
+    )
+    print(f"UAV at {east:.2f} m east, {north:.2f} m north, {up:.2f} m up; {explanation.carrier_hz / 1e9:g} GHz")
     rows = []
-    for path in found.paths:
+    for path in explanation.paths:
         rows.append(
             [
                 path.words,
@@ -66,40 +69,40 @@ def _print(found: Any) -> None:
         )
     heads = ["path", "m", "ns", "departure az / el deg", "arrival az / el deg", "dBm", "phase deg"]
     if rows:
-        table(heads, rows, f"{len(rows)} paths by engine {found.engine}")
-        deepest_first = sorted(found.paths, key=lambda path: -path.depth)
+        table(heads, rows, f"{len(rows)} paths by engine {explanation.engine}")
+        deepest_first = sorted(explanation.paths, key=lambda path: -path.depth)
         names = list(dict.fromkeys(name for path in deepest_first for name in path.terms_db))
-        power = f"{found.transmit_power_dbm:+.2f}"
+        power = f"{explanation.transmit_power_dbm:+.2f}"
         terms = [
             [p.words, power, *(number(p.terms_db.get(name), "{:+.2f}") for name in names), f"{p.level_dbm:.2f}"]
-            for p in found.paths
+            for p in explanation.paths
         ]
         table(["path", "transmitted dBm", *(f"{name} dB" for name in names), "level dBm"], terms, "Terms")
     bounces = [
         [path.words, b.face, b.material, f"{b.incidence_deg:.1f}", f"{b.te_db:.2f}", f"{b.tm_db:.2f}"]
-        for path in found.paths
+        for path in explanation.paths
         for b in path.bounces
     ]
     if bounces:
         table(["path", "face", "material", "incidence deg", "|TE| dB", "|TM| dB"], bounces, "Reflections")
-    levels = [number(level, "{:.2f}") for level in (found.level_dbm, found.power_sum_dbm)]
+    levels = [number(level, "{:.2f}") for level in (explanation.level_dbm, explanation.power_sum_dbm)]
     print(f"coherent sum {levels[0]} dBm, sum of powers {levels[1]} dBm")
-    if (other := found.other_interactions) is not None:
+    if (other := explanation.other_interactions) is not None:
         power, level = number(other.power_dbm, "{:.2f}"), number(other.level_dbm, "{:.2f}")
         kinds = ", ".join(f"{count} {kind}" for kind, count in other.kinds.items()) or "none found"
         print(
             f"{' and '.join(other.interactions)} by Sionna: {kinds}; {power} dBm together, level with them {level} dBm"
         )
-    if found.measured_db is not None:
-        print(f"measured {number(found.measured_db, '{:.2f}')} {found.unit}, before any offset")
-    for path, reason in found.absent:
+    if explanation.measured_db is not None:
+        print(f"measured {number(explanation.measured_db, '{:.2f}')} {explanation.unit}, before any offset")
+    for path, reason in explanation.absent:
         print(f"not there: {path}: {reason}")
-    if found.differences is not None:
-        if not found.differences:
+    if explanation.differences is not None:
+        if not explanation.differences:
             print("both engines have the same paths")
-        for one in found.differences:
+        for one in explanation.differences:
             other = "sionna" if one.found_by == "image" else "image"
             level = number(one.level_dbm, "{:.2f}")
             print(f"{one.found_by} has and {other} has not: {one.path} ({level} dBm): {one.reason}")
-    for note in found.notes:
+    for note in explanation.notes:
         print(f"note: {note}")

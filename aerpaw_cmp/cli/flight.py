@@ -114,14 +114,14 @@ def audit(
     if as_json:
         print_json(outcome.metrics)
         return _verdict(outcome, strict)
-    found = (outcome.metrics["rt"] or {}).get("audit")
-    if found is None:
+    recorded = (outcome.metrics["rt"] or {}).get("audit")
+    if recorded is None:
         print("nothing to audit: no link was replayed")
     else:
-        field = found["field"] or {}
+        field = recorded["field"] or {}
         print(
-            f"audit: {found['links']} links against {found['reference']}, {found['missing_paths']} paths missing, "
-            f"{found['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
+            f"audit: {recorded['links']} links against {recorded['reference']}, {recorded['missing_paths']} paths "
+            f"missing, {recorded['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
         )
     print(f"report: {outcome.folder / 'report.html'}")
     return _verdict(outcome, strict)

@@ -623,9 +623,9 @@ class OutputSet(_SeveralFiles):
         if whole:
             for name in (self._listing, *old):
                 file = self.folder / name
-                found = file_digest(file) if file.is_file() else None
-                replaced = name == self._listing or found == old.get(name)
-                if found is not None and replaced and found != new.get(name):
+                now = file_digest(file) if file.is_file() else None
+                replaced = name == self._listing or now == old.get(name)
+                if now is not None and replaced and now != new.get(name):
                     file.unlink()
             for name in sorted(new, key=lambda name: name == self._listing):
                 if self._new(name).exists():

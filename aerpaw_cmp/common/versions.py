@@ -12,10 +12,10 @@ PACKAGES = ("numpy", "scipy", "pandas", "pyproj", "shapely", "sionna-rt", "mitsu
 
 def versions() -> dict[str, str]:
     """Versions by name; "not installed" where a package is not."""
-    found = {"aerpaw-cmp": __version__, "python": platform.python_version()}
+    numbers = {"aerpaw-cmp": __version__, "python": platform.python_version()}
     for name in PACKAGES:
         try:
-            found[name] = version(name)
+            numbers[name] = version(name)
         except PackageNotFoundError:
-            found[name] = "not installed"
-    return found
+            numbers[name] = "not installed"
+    return numbers

@@ -71,8 +71,8 @@ def nearest(name: object, choices: Iterable[str]) -> str | None:
     True
     """
     by_lower = {choice.lower(): choice for choice in choices}
-    found = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
-    return by_lower[found[0]] if found else None
+    matches = difflib.get_close_matches(str(name).lower(), by_lower, n=1, cutoff=0.5)
+    return by_lower[matches[0]] if matches else None
 
 
 def load_yaml(path: str | Path, model: type[ModelT]) -> ModelT:

@@ -243,10 +243,10 @@ def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: boo
         some = np.unique(np.linspace(0, len(gain) - 1, min(len(gain), SPREAD_SAMPLES)).round().astype(np.int64))
         sd = learned.predict(o.samples.part(some))[1]
         whole[some] = np.sqrt(sd**2 + model.own_sd_db**2 + model.noise_sd_db**2)
-    found = score(o, gain, whole)
-    if found is None:
+    fitted = score(o, gain, whole)
+    if fitted is None:
         return None
-    return dataclasses.replace(found, rmse_shared_offset_db=math.hypot(found.rmse_db, found.offset_db - offset_db))
+    return dataclasses.replace(fitted, rmse_shared_offset_db=math.hypot(fitted.rmse_db, fitted.offset_db - offset_db))
 
 
 MOST_SCORED = 6

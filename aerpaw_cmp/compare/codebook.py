@@ -36,7 +36,7 @@ def precoders(layers: int) -> ComplexArray:
     if not 1 <= layers <= PORTS:
         raise ValueError(f"a rank of 1 to {PORTS}, found {layers}")
     beams = 2 * OVERSAMPLING
-    found = []
+    matrices = []
     for beam in range(beams):
         v = np.array([1.0, np.exp(2j * np.pi * beam / beams)])
         for shift in {1: (0,), 2: (0, OVERSAMPLING)}.get(layers, (OVERSAMPLING,)):
@@ -50,8 +50,8 @@ def precoders(layers: int) -> ComplexArray:
                     3: [plus_v, plus_w, minus_v],
                     4: [plus_v, plus_w, minus_v, minus_w],
                 }[layers]
-                found.append(np.stack(columns, axis=1) / np.sqrt(layers * PORTS))
-    return np.asarray(found, dtype=np.complex128)
+                matrices.append(np.stack(columns, axis=1) / np.sqrt(layers * PORTS))
+    return np.asarray(matrices, dtype=np.complex128)
 
 
 def codebook_rates(h: ArrayLike, sinr_db: ArrayLike, *, order: tuple[int, ...] = CROSS_POLAR_ORDER) -> FloatArray:

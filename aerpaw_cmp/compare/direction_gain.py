@@ -381,11 +381,11 @@ def _series_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamp
     if key in _kept:
         _kept.move_to_end(key)
         return _kept[key]
-    found = _made_equations(dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0), own, samples)
-    _kept[key] = found
+    equations = _made_equations(dataclasses.replace(model, own_sd_db=_ratio(model), noise_sd_db=1.0), own, samples)
+    _kept[key] = equations
     while len(_kept) > 1 and sum(one.gram.nbytes for one in _kept.values()) > KEPT_MIB << 20:
         _kept.popitem(last=False)
-    return found
+    return equations
 
 
 def _made_equations(model: GainModel, own: Sequence[_Block], samples: LinkSamples) -> _SeriesEquations:
@@ -764,12 +764,12 @@ def binned_series(series: Sequence[LinkSamples], bin_s: float) -> list[LinkSampl
 
 
 def _seen(binned: Sequence[LinkSamples]) -> dict[str, FloatArray]:
-    found = {}
+    directions = {}
     for antenna in dict.fromkeys(s.antenna for s in binned):
         own = [s for s in binned if s.antenna == antenna]
-        found[f"body.{antenna}"] = np.concatenate([s.at_uav for s in own])
-        found[f"mast.{antenna}"] = np.concatenate([s.at_tower for s in own])
-    return found
+        directions[f"body.{antenna}"] = np.concatenate([s.at_uav for s in own])
+        directions[f"mast.{antenna}"] = np.concatenate([s.at_tower for s in own])
+    return directions
 
 
 def column_forms(

@@ -84,8 +84,13 @@ class FieldAudit:
 
     def as_dict(self) -> dict[str, object]:
         """For ``metrics.json``."""
-        found: dict[str, object] = {name: getattr(self, name) for name in self.__slots__}
-        return {**found, "failed": self.failed, "failures": list(self.failures), "not_covered": list(self.not_covered)}
+        content: dict[str, object] = {name: getattr(self, name) for name in self.__slots__}
+        return {
+            **content,
+            "failed": self.failed,
+            "failures": list(self.failures),
+            "not_covered": list(self.not_covered),
+        }
 
 
 def _rms(n: int, one: float, m: int, two: float) -> float:

@@ -130,17 +130,19 @@ def fit_held_out(
     least = score(best)
     if not np.isfinite(least):
         raise ValueError("no combination of parameters gave a residual on every flight to fit on")
-    found = np.asarray(best, dtype=np.float64)
+    optimum = np.asarray(best, dtype=np.float64)
     if refine and any(len(v) > 1 for v in values):
         round_ = np.array([name in circular for name in names])
-        found = _simplex(score, found, least, values, tolerance, round_)
-    fitted = {name: float(value) for name, value in zip(names, found, strict=True)}
+        optimum = _simplex(score, optimum, least, values, tolerance, round_)
+    fitted = {name: float(value) for name, value in zip(names, optimum, strict=True)}
     first = dict(start) if start else {n: float(v[len(v) // 2]) for n, v in zip(names, values, strict=True)}
     flights = (*train, *test)
     calls += 2 * len(flights)
     after = {flight: rmse(objective(fitted, flight)) for flight in flights}
     edge = [
-        n for n, x, v in zip(names, found, values, strict=True) if len(v) > 1 and n not in circular and _at_bound(x, v)
+        n
+        for n, x, v in zip(names, optimum, values, strict=True)
+        if len(v) > 1 and n not in circular and _at_bound(x, v)
     ]
     return HeldOutFit(
         parameters=fitted,
@@ -170,7 +172,7 @@ def _at_bound(value: float, values: FloatArray) -> bool:
 
 def _simplex(
     score: Callable[[FloatArray], float],
-    found: FloatArray,
+    start: FloatArray,
     least: float,
     values: list[FloatArray],
     tolerance: float,
@@ -186,11 +188,11 @@ def _simplex(
     around = circular[free]
 
     def point(unit: FloatArray) -> FloatArray:
-        full = found.copy()
+        full = start.copy()
         full[free] = low[free] + span[free] * np.where(around, unit % 1.0, unit)
         return np.asarray(full, dtype=np.float64)
 
-    origin = (found[free] - low[free]) / span[free]
+    origin = (start[free] - low[free]) / span[free]
     corners = origin + np.vstack([np.zeros(len(step)), np.diag(np.where(origin < 0.5, step, -step))])
     corners = np.where(around, corners, np.clip(corners, 0.0, 1.0))
     result = minimize(
@@ -200,4 +202,4 @@ def _simplex(
         bounds=[(-1.0, 2.0) if turns else (0.0, 1.0) for turns in around],
         options={"initial_simplex": corners, "xatol": tolerance, "fatol": 1e-6, "maxfev": 200 * len(step)},
     )
-    return point(np.asarray(result.x)) if result.fun < least else found
+    return point(np.asarray(result.x)) if result.fun < least else start

@@ -78,8 +78,8 @@ def fit_installed(
     errors = {order: _left_out_rmse(residual_db, angles, order) for order in orders}
     order = min(errors, key=lambda o: errors[o])
     design, target, _ = _system(residual_db, angles, order)
-    found = _ridge(design, target, len(channels))[len(channels) :]
-    pieces = found.reshape(len(channels) + 1, 2 * order)
+    coefficients = _ridge(design, target, len(channels))[len(channels) :]
+    pieces = coefficients.reshape(len(channels) + 1, 2 * order)
     tower = {c: tuple(map(float, piece)) for c, piece in zip(channels, pieces[1:], strict=True)}
     return InstalledFit(order, tuple(map(float, pieces[0])), tower, errors)
 
@@ -117,6 +117,6 @@ def _left_out_rmse(residual_db: Mapping[str, FloatArray], angles: Mapping[str, L
     square = 0.0
     for block in range(BLOCKS):
         out = part == block
-        found = _ridge(design[~out], target[~out], len(residual_db))
-        square += float(((target[out] - design[out] @ found) ** 2).sum())
+        coefficients = _ridge(design[~out], target[~out], len(residual_db))
+        square += float(((target[out] - design[out] @ coefficients) ** 2).sum())
     return float(np.sqrt(square / len(target)))

@@ -198,15 +198,17 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicate
     rows = []
     for index, rung in enumerate(ladder.rungs):
         error = ladder.error_db[index][series]
-        found = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
+        against_best = (
+            None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
+        )
         rows.append(
             LadderRow(
                 model=rung.model,
                 tower=name[0],
                 channel=name[1],
                 rmse_heldout_db=_rmse(error),
-                difference_to_best_db=float("nan") if found is None else found.difference_db,
-                difference_to_best_ci95_db=NO_INTERVAL if found is None else found.difference_ci95_db,
+                difference_to_best_db=float("nan") if against_best is None else against_best.difference_db,
+                difference_to_best_ci95_db=NO_INTERVAL if against_best is None else against_best.difference_ci95_db,
                 n=int(np.isfinite(error).sum()),
                 seconds=rung.seconds,
                 recommended=index == ladder.recommended,
@@ -260,8 +262,8 @@ def compared(error_db: FloatArray, best_db: FloatArray, replicates: int = REPLIC
 
 
 def _as_good(error: FloatArray, best: FloatArray, replicates: int) -> bool:
-    found = compared(error, best, replicates)
-    return bool(found.difference_db <= found.standard_error_db)
+    against_best = compared(error, best, replicates)
+    return bool(against_best.difference_db <= against_best.standard_error_db)
 
 
 def _covers(measured: Sequence[FloatArray], rung: Rung) -> bool:

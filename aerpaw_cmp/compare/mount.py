@@ -94,9 +94,9 @@ def fit_mounts(
     span = np.arange(-20.0, 21.0, 5.0) if tilt else np.zeros(1)
     tilts = [(float(p), float(r)) for p in span for r in span]
     tilted = {name: [(float(grid[chosen[name]]), p, r) for p, r in tilts] for name in patterns}
-    found, weight = _best_together(_quadratic_forms(series, model, patterns, rotation, tilted))
+    tilt_index, weight = _best_together(_quadratic_forms(series, model, patterns, rotation, tilted))
     return {
-        name: _mount(grid, probability[name], tilted[name][found[name]], weight[name], np.asarray(tilts))
+        name: _mount(grid, probability[name], tilted[name][tilt_index[name]], weight[name], np.asarray(tilts))
         for name in patterns
     }
 

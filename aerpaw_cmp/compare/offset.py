@@ -509,7 +509,7 @@ def read_reference_powers(path: str | Path) -> list[ReferencePower]:
         frequencies = np.array([round(float(name[5:-3]) * 1e9) for name in carriers], dtype=np.float64)
     except ValueError:
         raise InputError(f"unreadable carrier in {carriers}", expected="Freq_3.30GHz", path=path, line=1) from None
-    found = []
+    powers = []
     for line, row in enumerate(rows[1:], start=2):
         if not row:
             continue
@@ -520,7 +520,7 @@ def read_reference_powers(path: str | Path) -> list[ReferencePower]:
             amplifier, gain = bool(int(row[3])), float(row[4])
         except (ValueError, IndexError) as error:
             raise InputError(f"unreadable row: {error}", expected="numbers", path=path, line=line) from None
-        found.append(
+        powers.append(
             ReferencePower(
                 node=row[0].lower(),
                 category=row[1].lower(),
@@ -531,7 +531,7 @@ def read_reference_powers(path: str | Path) -> list[ReferencePower]:
                 power_dbm=levels,
             )
         )
-    return found
+    return powers
 
 
 def reference_power_dbm(

@@ -193,7 +193,7 @@ class PassTable:
         rule = radius_m, heading_within_deg
         for i, first in enumerate(names):
             for second in names[i + 1 :] if first in chosen else ():
-                found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
+                known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]] = {}
                 shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]] = {}
                 partners: dict[str, list[tuple[int, _Prepared]]] = {}
                 for number, entry in self._flights[second]:
@@ -206,7 +206,7 @@ class PassTable:
                             second=other,
                             there=there,
                             places=self._places,
-                            found=found,
+                            known=known,
                             shared=shared,
                             rule=rule,
                         )
@@ -293,12 +293,12 @@ def cell_means(
         Means over the samples of each square.
     """
     cells = np.floor(position_m[good, :2] / cell_m).astype(np.int64)
-    found, which = np.unique(cells, axis=0, return_inverse=True)
+    cell, which = np.unique(cells, axis=0, return_inverse=True)
     which = which.reshape(-1)
-    count = np.maximum(np.bincount(which, minlength=len(found)), 1)
-    residual = np.bincount(which, weights=residual_db[good], minlength=len(found)) / count
-    height = np.bincount(which, weights=position_m[good, 2], minlength=len(found)) / count
-    return found, residual, height
+    count = np.maximum(np.bincount(which, minlength=len(cell)), 1)
+    residual = np.bincount(which, weights=residual_db[good], minlength=len(cell)) / count
+    height = np.bincount(which, weights=position_m[good, 2], minlength=len(cell)) / count
+    return cell, residual, height
 
 
 def _pair(
@@ -307,14 +307,14 @@ def _pair(
     second: int,
     there: _Prepared,
     places: dict[bytes, _Places],
-    found: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]],
+    known: dict[tuple[bytes, bytes], tuple[IntArray, IntArray]],
     shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
     rule: tuple[float, float | None],
 ) -> PassPair:
     def difference(one: bytes, two: bytes, a: FloatArray, b: FloatArray) -> FloatArray:
-        if (one, two) not in found:
-            found[one, two] = places[one].partners(places[two], *rule)
-        i, j = found[one, two]
+        if (one, two) not in known:
+            known[one, two] = places[one].partners(places[two], *rule)
+        i, j = known[one, two]
         return b[j] - a[i]
 
     level = difference(here.level, there.level, here.one.level_db, there.one.level_db)

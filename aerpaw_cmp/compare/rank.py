@@ -801,12 +801,12 @@ def compare_rank(
 def _histogram_intervals(rank: FloatArray, replicates: int, seed: int) -> list[Interval]:
     if len(rank) < 2:
         return [NO_INTERVAL] * MAX_RANK
-    found, whole = [], autocorrelation(rank)
+    intervals, whole = [], autocorrelation(rank)
     for bar in _indicators(rank).T:
         known = autocorrelation(bar) if np.ptp(bar) else whole  # a rank never seen says nothing about its own memory
         drawn = bootstrap_means(bar[:, None], known.block_length, replicates=replicates, seed=seed)
-        found.append(share_interval(float(bar.mean()), float(drawn.std()), known))
-    return found
+        intervals.append(share_interval(float(bar.mean()), float(drawn.std()), known))
+    return intervals
 
 
 def compare_ranks(
@@ -974,17 +974,17 @@ def _pair_intervals(
         return [NO_INTERVAL] * 4
     equal, one, two = (a == b).astype(np.float64), _indicators(a), _indicators(b)
     columns = np.column_stack([equal, one, two])
-    found: list[Interval] = []
+    intervals: list[Interval] = []
     for influence, statistic, bounds in _pair_statistics(equal, one, two):
         known = autocorrelation(influence)
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
-        value = values[len(found)]
-        found.append(
+        value = values[len(intervals)]
+        intervals.append(
             share_interval(value, float(drawn.std()), known)
-            if not found
+            if not intervals
             else interval(value, drawn, known, bounds=bounds)
         )
-    return found
+    return intervals
 
 
 def _pair_statistics(

@@ -404,15 +404,15 @@ def _kappa_weights(probability: FloatArray, rank: IntArray) -> FloatArray:
     """
     commonest = int(np.bincount(rank).argmax())
     exponents = sorted(np.arange(-3, 13) / 10.0, key=abs)
-    best, found = -np.inf, np.ones(MAX_RANK)
+    best, weights = -np.inf, np.ones(MAX_RANK)
     ranks = np.arange(1, MAX_RANK + 1)
     for below in exponents:
         for above in exponents:
             weight = np.exp(np.where(ranks < commonest, below, np.where(ranks > commonest, above, 0.0)))
             kappa = cohen_kappa(rank, decide(probability, weight))
             if np.isfinite(kappa) and kappa > best + 1e-9:
-                best, found = kappa, weight
-    return found
+                best, weights = kappa, weight
+    return weights
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -629,17 +629,17 @@ def fit_thresholds(ratio_db: FloatArray, rank: ArrayLike, *, sweeps: int = 3) ->
     good = (ri >= 1) & np.isfinite(ratio_db).all(axis=1)
     y, ratio = ri[good], ratio_db[good]
     grid = -20.0 * np.log10(k_grid(1.25, 100.0))
-    found = [-20.0] * ratio.shape[1]
+    thresholds = [-20.0] * ratio.shape[1]
     for _ in range(sweeps):
-        before = list(found)
-        for stream in range(len(found)):
-            trials = [[*found[:stream], float(g), *found[stream + 1 :]] for g in grid]
+        before = list(thresholds)
+        for stream in range(len(thresholds)):
+            trials = [[*thresholds[:stream], float(g), *thresholds[stream + 1 :]] for g in grid]
             kappas = [cohen_kappa(y, rank_by_thresholds(ratio, trial)) for trial in trials]
             if np.isfinite(kappas).any():
-                found[stream] = float(grid[int(np.nanargmax(kappas))])
-        if found == before:
+                thresholds[stream] = float(grid[int(np.nanargmax(kappas))])
+        if thresholds == before:
             break
-    return tuple(found)
+    return tuple(thresholds)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -453,21 +453,21 @@ def link_geometry(
     """
     place = np.asarray(position_m, dtype=np.float64)
     ray = place - np.asarray(tower_m, dtype=np.float64)
-    found = {
+    columns = {
         "distance_m": np.linalg.norm(ray, axis=1),
         "elevation_deg": np.degrees(np.arctan2(ray[:, 2], np.hypot(ray[:, 0], ray[:, 1]))),
         "azimuth_deg": np.degrees(np.arctan2(ray[:, 0], ray[:, 1])) % 360.0,
         "height_m": place[:, 2],
     }
     seen = ray @ (np.eye(3) if tower_mount is None else tower_mount)
-    found["tower_azimuth_deg"], found["tower_elevation_deg"] = _direction_deg(seen)
+    columns["tower_azimuth_deg"], columns["tower_elevation_deg"] = _direction_deg(seen)
     if rotation is not None:
         body = np.einsum("nji,nj->ni", rotation, -ray)
-        found["uav_azimuth_deg"], found["uav_elevation_deg"] = _direction_deg(
+        columns["uav_azimuth_deg"], columns["uav_elevation_deg"] = _direction_deg(
             body @ (np.eye(3) if uav_mount is None else uav_mount)
         )
-        found["heading_deg"] = np.degrees(np.arctan2(rotation[:, 0, 0], rotation[:, 1, 0])) % 360.0
-    return found
+        columns["heading_deg"] = np.degrees(np.arctan2(rotation[:, 0, 0], rotation[:, 1, 0])) % 360.0
+    return columns
 
 
 def _direction_deg(vector: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -656,13 +656,13 @@ def error_spans(
     bounds = np.concatenate([[0], np.flatnonzero(cut) + 1, [len(t)]])
     where = {name: np.asarray(values)[ok] for name, values in (context or {}).items()}
     place = None if position_m is None else np.asarray(position_m, dtype=np.float64)[ok]
-    found = []
+    spans = []
     for a, b in pairwise(bounds):  # per span, not per sample
         if sign[a] == 0:
             continue
         part = r[a:b]
         centre = () if place is None else tuple(float(v) for v in place[a:b].mean(axis=0))
-        found.append(
+        spans.append(
             ErrorSpan(
                 start_s=float(t[a]),
                 end_s=float(t[b - 1]),
@@ -674,8 +674,8 @@ def error_spans(
                 geometry={name: _typical(values[a:b]) for name, values in where.items()},
             )
         )
-    found.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
-    return found[:largest]
+    spans.sort(key=lambda span: -abs(span.mean_db) * np.sqrt(span.end_s - span.start_s + 1e-3))
+    return spans[:largest]
 
 
 def _likely_cause(context: Mapping[str, Any], span: slice, mean_db: float) -> str:

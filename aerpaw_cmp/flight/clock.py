@@ -253,13 +253,13 @@ def judge_clock(
         name: fit_lag(s.t, s.measured_db, s.prediction, lags, limit_s, drifting) for name, s in sampled_channels.items()
     }
     pooled = combine_lags(list(own.values()), limit_s=limit_s)
-    found = _estimate(pooled, start, model, {name: fit.radio_minus_telemetry_s for name, fit in own.items()})
+    estimate = _estimate(pooled, start, model, {name: fit.radio_minus_telemetry_s for name, fit in own.items()})
     if pooled.verdict == "failed":
-        return found
-    found = replace(found, explained=_explained_share(list(sampled_channels.values()), found))
+        return estimate
+    estimate = replace(estimate, explained=_explained_share(list(sampled_channels.values()), estimate))
     if pooled.verdict == "ambiguous":
-        return found
-    return _checked(found, channels, sampled_channels, own, lags, limit_s)
+        return estimate
+    return _checked(estimate, channels, sampled_channels, own, lags, limit_s)
 
 
 def _timed(times: ArrayLike) -> AnyArray:
@@ -290,7 +290,7 @@ def _estimate(fit: LagFit, start: int, model: str, channels: Mapping[str, float]
 
 
 def _checked(
-    found: ClockEstimate,
+    estimate: ClockEstimate,
     channels: Sequence[ClockChannel],
     sampled_channels: Mapping[str, Sampled],
     own: Mapping[str, LagFit],
@@ -300,37 +300,37 @@ def _checked(
     """The estimate after every check; the first that fails gives the verdict."""
 
     def doubt(reason: str, **more: Any) -> ClockEstimate:
-        return replace(found, verdict="ambiguous", reason=reason, **more)
+        return replace(estimate, verdict="ambiguous", reason=reason, **more)
 
-    if found.explained < EXPLAINED:
+    if estimate.explained < EXPLAINED:
         return doubt(
-            f"the model explains {100 * max(found.explained, 0.0):.0f} % of the level's variance; "
+            f"the model explains {100 * max(estimate.explained, 0.0):.0f} % of the level's variance; "
             f"{100 * EXPLAINED:.0f} % are wanted before its lag is believed"
         )
-    if abs(found.drift_s_per_s) > 0.95 * DRIFT_LIMIT:
+    if abs(estimate.drift_s_per_s) > 0.95 * DRIFT_LIMIT:
         return doubt("the best drift lies at the edge of the search")
-    lag = found.radio_minus_telemetry_s
+    lag = estimate.radio_minus_telemetry_s
     for name, fit in own.items():
         if not _near(fit, lag):
             return doubt(f"channel {name} alone gives {fit.radio_minus_telemetry_s:+.1f} s")
-    halves = _halves(list(sampled_channels.values()), found, lags, limit_s)
-    found = replace(found, halves_s=tuple(half.radio_minus_telemetry_s for half in halves))
+    halves = _halves(list(sampled_channels.values()), estimate, lags, limit_s)
+    estimate = replace(estimate, halves_s=tuple(half.radio_minus_telemetry_s for half in halves))
     for name, half in zip(("first", "second"), halves, strict=True):
         if not _near(half, lag):
             return doubt(f"the {name} half of the flight alone gives {half.radio_minus_telemetry_s:+.1f} s")
-    free = _with_free_patterns(channels, sampled_channels, found, limit_s)
+    free = _with_free_patterns(channels, sampled_channels, estimate, limit_s)
     if free is not None:
-        found = replace(found, free_patterns_s=free.radio_minus_telemetry_s)
+        estimate = replace(estimate, free_patterns_s=free.radio_minus_telemetry_s)
         if not _near(free, lag):
             return doubt(f"with the antennas' patterns free it is {free.radio_minus_telemetry_s:+.1f} s")
-    held_out = _held_out(list(sampled_channels.values()), found, lags)
-    found = replace(found, held_out=held_out)
-    low, high = found.ci95_s
+    held_out = _held_out(list(sampled_channels.values()), estimate, lags)
+    estimate = replace(estimate, held_out=held_out)
+    low, high = estimate.ci95_s
     none = low <= 0.0 <= high or abs(lag) <= _NOT_RESOLVED_S
     if held_out.better and not none:
-        return found
+        return estimate
     if none or abs(lag) <= _NO_MATTER_S:
-        return replace(found, verdict="agree", reason="no difference that matters: nothing to correct")
+        return replace(estimate, verdict="agree", reason="no difference that matters: nothing to correct")
     return doubt(
         f"correcting it lowers the error of {held_out.improved} of {held_out.blocks} blocks kept out, by "
         f"{-held_out.paired.difference_db:.2f} dB in all"
@@ -354,7 +354,7 @@ def _near(fit: LagFit, lag: float) -> bool:
 
 
 def _halves(
-    sampled_channels: Sequence[Sampled], found: ClockEstimate, lags: FloatArray, limit_s: float
+    sampled_channels: Sequence[Sampled], estimate: ClockEstimate, lags: FloatArray, limit_s: float
 ) -> tuple[LagFit, LagFit]:
     """Pooled fits to the first and the second half, without a drift of their own."""
     middle = 0.5 * (min(s.t[0] for s in sampled_channels) + max(s.t[-1] for s in sampled_channels))
@@ -365,7 +365,7 @@ def _halves(
             part = side(s.t)
             if part.sum() >= FEWEST:
                 t = s.t[part]
-                moved = t - found.drift_s_per_s * (t - found.reference_s)
+                moved = t - estimate.drift_s_per_s * (t - estimate.reference_s)
                 fits.append(fit_lag(moved, s.measured_db[part], s.prediction, lags, limit_s, False))
         nothing = no_lag("too few samples", 0, float(lags[-1]), lags)
         return combine_lags(fits, limit_s=limit_s) if fits else nothing
@@ -374,18 +374,18 @@ def _halves(
 
 
 def _with_free_patterns(
-    channels: Sequence[ClockChannel], sampled_channels: Mapping[str, Sampled], found: ClockEstimate, limit_s: float
+    channels: Sequence[ClockChannel], sampled_channels: Mapping[str, Sampled], estimate: ClockEstimate, limit_s: float
 ) -> LagFit | None:
     """Pooled fit with free terms of direction beside the prediction; None where no terms were given."""
-    lags = symmetric(found.window_s, _FREE_STEP_S)
+    lags = symmetric(estimate.window_s, _FREE_STEP_S)
     fits = []
     for channel in channels:
         if channel.terms is None or channel.name not in sampled_channels:
             continue
         s = sampled_channels[channel.name]
-        free = s.prediction.beside(channel.terms(_instants(channel.times, found.start_ns, s.prediction.times())))
+        free = s.prediction.beside(channel.terms(_instants(channel.times, estimate.start_ns, s.prediction.times())))
         few = slice(None, None, -(-len(s.t) // _FREE_WITH))
-        moved = s.t[few] - found.drift_s_per_s * (s.t[few] - found.reference_s)
+        moved = s.t[few] - estimate.drift_s_per_s * (s.t[few] - estimate.reference_s)
         fits.append(fit_lag(moved, s.measured_db[few], free, lags, limit_s, False))
     return combine_lags(fits, limit_s=limit_s) if fits else None
 
@@ -396,11 +396,11 @@ def _instants(like: AnyArray, start_ns: int, seconds: FloatArray) -> AnyArray:
     return np.asarray(stamp.astype("datetime64[ns]") if np.asarray(like).dtype.kind not in "fiu" else stamp * 1e-9)
 
 
-def _explained_share(sampled_channels: Sequence[Sampled], found: ClockEstimate) -> float:
+def _explained_share(sampled_channels: Sequence[Sampled], estimate: ClockEstimate) -> float:
     """Share of the variance of one-second means that the prediction explains at the estimate."""
     left = total = 0.0
     for s in sampled_channels:
-        lag = found.radio_minus_telemetry_s + found.drift_s_per_s * (s.t - found.reference_s)
+        lag = estimate.radio_minus_telemetry_s + estimate.drift_s_per_s * (s.t - estimate.reference_s)
         predicted = s.prediction.at(s.t - lag)
         ok = np.isfinite(predicted)
         measured, residual = s.measured_db[ok], s.measured_db[ok] - predicted[ok]
@@ -411,14 +411,14 @@ def _explained_share(sampled_channels: Sequence[Sampled], found: ClockEstimate) 
     return 1.0 - left / total if total > 0 else float("nan")
 
 
-def _held_out(sampled_channels: Sequence[Sampled], found: ClockEstimate, lags: FloatArray) -> HeldOutBlocks:
+def _held_out(sampled_channels: Sequence[Sampled], estimate: ClockEstimate, lags: FloatArray) -> HeldOutBlocks:
     """Error of blocks of the flight, with a lag and offsets estimated on the other blocks, against no lag.
 
     Errors are root mean squares over one second and all channels: channels of one receiver hear the same fades.
     """
     first, last = min(s.t[0] for s in sampled_channels), max(s.t[-1] for s in sampled_channels)
     blocks = int(np.clip((last - first) / _BLOCK_S, 4, 10))
-    tables = [_block_table(s, found, lags, np.linspace(first, last, blocks + 1)[1:-1]) for s in sampled_channels]
+    tables = [_block_table(s, estimate, lags, np.linspace(first, last, blocks + 1)[1:-1]) for s in sampled_channels]
     squares: dict[str, list[FloatArray]] = {"corrected": [], "uncorrected": []}
     improved = 0
     for block in range(blocks):
@@ -462,10 +462,10 @@ class _BlockTable:
         return n, mean, np.nansum((kept - mean[:, None]) ** 2, axis=1)
 
 
-def _block_table(s: Sampled, found: ClockEstimate, lags: FloatArray, cuts: FloatArray) -> _BlockTable:
+def _block_table(s: Sampled, estimate: ClockEstimate, lags: FloatArray, cuts: FloatArray) -> _BlockTable:
     step = -(-len(s.t) // _CHECK_WITH)
     t, m = s.t[::step], s.measured_db[::step]
-    drifted = t - found.drift_s_per_s * (t - found.reference_s)
+    drifted = t - estimate.drift_s_per_s * (t - estimate.reference_s)
     residual = np.stack([m - s.prediction.at(drifted - lag) for lag in lags])
     unshifted = m - s.prediction.at(t)
     ok = np.isfinite(residual).all(axis=0) & np.isfinite(unshifted)

@@ -166,16 +166,16 @@ def ground_nodes(
             assert node.longitude_deg is not None
             latitude, longitude, source = node.latitude_deg, node.longitude_deg, "flight.yaml"
         else:
-            found = _node_track(name, node, folder, settings, site)
-            latitude, longitude, source = found.latitude_deg, found.longitude_deg, node.track.path
-            if found.track is not None:
-                nodes[name] = found.track
+            place = _node_track(name, node, folder, settings, site)
+            latitude, longitude, source = place.latitude_deg, place.longitude_deg, node.track.path
+            if place.track is not None:
+                nodes[name] = place.track
                 if warnings is not None:
-                    warnings += [f"towers.{name}: {text}" for text in found.said]
+                    warnings += [f"towers.{name}: {text}" for text in place.said]
         east, north = site.frame.to_local(np.array([latitude]), np.array([longitude]))
         height = node.antenna_height_m
         if node.height == "logged":
-            height = found.height_m
+            height = place.height_m
         towers[name] = Tower(
             name=name,
             latitude_deg=latitude,
@@ -572,7 +572,7 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
 Series = TypeVar("Series", "RssSeries", "RankSeries")
 
 
-def _records(found: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
+def _records(parts: Sequence[tuple[str, Series]], name: Callable[[Series], str]) -> tuple[Series, ...]:
     """One series per name: logs that follow each other (a radio started anew) are one record.
 
     Raises
@@ -581,7 +581,7 @@ def _records(found: Sequence[tuple[str, Series]], name: Callable[[Series], str])
         If two logs hold the same at the same time: only one of them could be compared.
     """
     groups: dict[str, list[tuple[str, Series]]] = {}
-    for path, series in found:
+    for path, series in parts:
         groups.setdefault(name(series), []).append((path, series))
     return tuple(_record(what, group) for what, group in groups.items())
 

@@ -150,9 +150,9 @@ def drafts(
         At least one; its remarks say what is left to check.
     """
     every = [flight for flight in flights(files) if flight.measured]
-    found = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
+    complete = [flight for flight in every if flight.complete] or every  # without any track each waits for its own
     options_of_clock = {"timezone": timezone, "time_origin": time_origin, "mapping": mapping}
-    groups = [flight.files for flight in found] if len(found) > 1 else [list(files)]
+    groups = [flight.files for flight in complete] if len(complete) > 1 else [list(files)]
     made = []
     for group in groups:
         text, remarks = draft(group, folder, **options_of_clock)  # type: ignore[arg-type]

@@ -54,14 +54,14 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
     files : sequence of IngestedFile
     """
     timed = [(file, span) for file in files if (span := span_of(file)) is not None]
-    found: list[Flight] = []
+    groups: list[Flight] = []
     for file, span in sorted(timed, key=lambda one: (not _has_track(one[0]), one[1][0])):
         place = _place(file)
-        near = [flight for flight in found if _meet(flight, span, place)]
+        near = [flight for flight in groups if _meet(flight, span, place)]
         flight = max(near, key=lambda one: _shared(one.span, span), default=None)
         if flight is None:
             flight = Flight(span=span, place=place)
-            found.append(flight)
+            groups.append(flight)
         flight.files.append(file)
         if _has_track(file) or not any(_has_track(other) for other in flight.files):
             assert flight.span is not None
@@ -69,8 +69,8 @@ def flights(files: Sequence[IngestedFile]) -> list[Flight]:
             flight.place = flight.place or place
     for file in files:
         if span_of(file) is None:
-            _home(file, found).files.append(file)
-    return sorted(found, key=lambda one: (one.span is None, one.span[0] if one.span else np.datetime64(0, "ns")))
+            _home(file, groups).files.append(file)
+    return sorted(groups, key=lambda one: (one.span is None, one.span[0] if one.span else np.datetime64(0, "ns")))
 
 
 def span_of(file: IngestedFile) -> Span | None:
@@ -120,15 +120,15 @@ def _shared(one: Span | None, other: Span) -> np.timedelta64:
 def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
     """Origin under which a log with positions lies on the track of a flight."""
     tracks = [track for other in flight.files for track in _tracks(other)]
-    found = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
-    return min((one for one in found if one is not None), key=lambda one: one.distance_m, default=None)
+    origins = [origin_of(stream, track) for stream in file.result.streams for track in tracks[:1]]
+    return min((one for one in origins if one is not None), key=lambda one: one.distance_m, default=None)
 
 
-def _home(file: IngestedFile, found: list[Flight]) -> Flight:
+def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
     """The flight of a file without a wall clock; a new one is added to ``found``."""
     # what holds both levels and positions is a flight by itself: with another in its own time it shares none
     alone = Flight([file]).complete
-    known = [flight for flight in found if flight.span is not None] if alone else found
+    known = [flight for flight in groups if flight.span is not None] if alone else groups
     by_track = [
         (origin.distance_m, i) for i, flight in enumerate(known) if (origin := _origin(file, flight)) is not None
     ]
@@ -139,6 +139,6 @@ def _home(file: IngestedFile, found: list[Flight]) -> Flight:
     if len(near) != 1:
         near = known if len(known) == 1 else []
     if not near:
-        found.append(Flight())
-        near = found[-1:]
+        groups.append(Flight())
+        near = groups[-1:]
     return near[0]

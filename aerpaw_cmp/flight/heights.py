@@ -67,5 +67,5 @@ def height_in_name(path: str) -> float | None:
     >>> height_in_name("urban/60m.csv"), height_in_name("run2_120m_5G.csv"), height_in_name("phone.csv")
     (60.0, 120.0, None)
     """
-    found = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
-    return found.pop() if len(found) == 1 else None
+    heights = {float(text) for text in _IN_NAME.findall(Path(path).stem.replace("_", " "))}
+    return heights.pop() if len(heights) == 1 else None

@@ -250,11 +250,11 @@ def estimate_lag(
     0.1 % significance.
     """
     lags = symmetric(window_s, max(0.1, resolution_s))
-    found = sample(times, measured_db, predictor, window_s=window_s, resolution_s=resolution_s)
-    if isinstance(found, str):
-        return no_lag(found, 0, window_s, lags)
-    drifting = (found.t[-1] - found.t[0]) >= DRIFT_FROM_S if drift is None else drift
-    return fit_lag(found.t, found.measured_db, found.prediction, lags, limit_s, drifting)
+    samples = sample(times, measured_db, predictor, window_s=window_s, resolution_s=resolution_s)
+    if isinstance(samples, str):
+        return no_lag(samples, 0, window_s, lags)
+    drifting = (samples.t[-1] - samples.t[0]) >= DRIFT_FROM_S if drift is None else drift
+    return fit_lag(samples.t, samples.measured_db, samples.prediction, lags, limit_s, drifting)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -390,16 +390,16 @@ def _cost(residual: FloatArray, phi: float, least: int) -> float:
 def _costs(residuals: FloatArray, phi: float, least: int) -> FloatArray:
     """:func:`_cost` of each row (lags, n), to the last digit; rows without a gap at once."""
     whole = np.isfinite(residuals).all(axis=1)
-    found = np.empty(len(residuals))
+    costs = np.empty(len(residuals))
     if whole.any() and residuals.shape[1] > least:
         r = residuals if whole.all() else residuals[whole]
         r = r - r.mean(axis=1, keepdims=True)
-        found[whole] = (r[:, 1:] - phi * r[:, :-1]).var(axis=1)
+        costs[whole] = (r[:, 1:] - phi * r[:, :-1]).var(axis=1)
     else:
         whole = np.zeros(len(residuals), dtype=bool)
     for row in np.flatnonzero(~whole):
-        found[row] = _cost(residuals[row], phi, least)
-    return found
+        costs[row] = _cost(residuals[row], phi, least)
+    return costs
 
 
 def _phi(residual: FloatArray) -> float:
@@ -532,7 +532,7 @@ def fit_lag(
 
     def costs(tried: FloatArray, rate: float, phi: float) -> FloatArray:
         free = prediction.terms.shape[1]
-        found = np.empty(len(tried))
+        variances = np.empty(len(tried))
         drifted = rate * (ts - middle)
         for block in range(0, len(tried), rows := max(1, (_HELD_FREE if free else _HELD) // len(ts))):
             part = slice(block, block + rows)
@@ -540,8 +540,8 @@ def fit_lag(
             y = ms - prediction.at(at)
             if free:
                 y = _without_terms(y, prediction.terms_at(at), phi)
-            found[part] = _costs(y, phi, least)
-        return found
+            variances[part] = _costs(y, phi, least)
+        return variances
 
     def scan(phi: float, rate: float) -> FloatArray:
         return costs(lags, rate, phi)
@@ -646,11 +646,11 @@ def _refine(
         shift = start * scale
     r, rw, jw = evaluate(shift, phi)
     width = _sandwich(rw, jw) / scale
-    found = np.zeros(2)
-    found[: len(start)] = shift / scale
+    refined = np.zeros(2)
+    refined[: len(start)] = shift / scale
     reach = np.full(2, np.nan)
     reach[: len(start)] = width
-    return (float(found[0]), float(found[1])), (float(reach[0]), float(reach[1])), float(np.sqrt(np.mean(r**2)))
+    return (float(refined[0]), float(refined[1])), (float(reach[0]), float(reach[1])), float(np.sqrt(np.mean(r**2)))
 
 
 def _blocks(values: FloatArray) -> FloatArray:

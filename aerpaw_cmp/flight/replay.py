@@ -41,7 +41,7 @@ POWER_STEP_S = 0.1
 class Clock:
     """Radio clock of one series: what was found, and ``applied_s`` (n,), taken off the radio times for the replay."""
 
-    found: ClockResult
+    result: ClockResult
     applied_s: FloatArray
 
 
@@ -196,7 +196,7 @@ def estimate_clocks(
         return [None] * len(data.rss)
     if isinstance(wanted, float):
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
-    predict, found = _Predictions(data), dict[str, ClockEstimate]()
+    predict, estimated = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
     with ahead(calls) if may_share(data) else ahead(calls, 1) as estimates:
@@ -204,13 +204,13 @@ def estimate_clocks(
             meanwhile()
         for tower in towers:
             progress(f"clock {tower}")
-            found[tower] = next(estimates)
-    return [_clock_of(series, found[series.tower], apply=wanted == "apply") for series in data.rss]
+            estimated[tower] = next(estimates)
+    return [_clock_of(series, estimated[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
 def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) -> Clock:
     """The clock of a flight file that states it."""
-    found = ClockResult(
+    result = ClockResult(
         receiver=receiver,
         radio_minus_telemetry_s=radio_minus_telemetry_s,
         ci95_s=(radio_minus_telemetry_s, radio_minus_telemetry_s),
@@ -219,7 +219,7 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
         reason="",
         applied=GIVEN,
     )
-    return Clock(found=found, applied_s=np.full(samples, radio_minus_telemetry_s))
+    return Clock(result=result, applied_s=np.full(samples, radio_minus_telemetry_s))
 
 
 SHARED_UP_TO = 200_000
@@ -259,10 +259,10 @@ class _Predictions:
         track = self.track_at(times).where(known)
         poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
         if tower in data.nodes:
-            found = replay_moving(data.site, link, poses, place[track.valid], max_depth=depth)
+            replayed = replay_moving(data.site, link, poses, place[track.valid], max_depth=depth)
         else:
-            found = replay(data.site, link, poses, engine="image", max_depth=depth)
-        levels = {"rss_dbm": found.rss_dbm[:, 0], "rss_power_dbm": found.rss_power_dbm[:, 0]}
+            replayed = replay(data.site, link, poses, engine="image", max_depth=depth)
+        levels = {"rss_dbm": replayed.rss_dbm[:, 0], "rss_power_dbm": replayed.rss_power_dbm[:, 0]}
         return {name: _spread(track.valid, level) for name, level in levels.items()}
 
     def track_at(self, times: Any) -> TrackPoses:
@@ -275,14 +275,14 @@ class _Predictions:
 
     def terms_at(self, tower: str, times: Any) -> FloatArray:
         """Terms of direction (n, 12) as seen from a tower, for antennas that are not known."""
-        found, start = np.empty((len(times), DIRECTION_TERMS)), 0
+        terms, start = np.empty((len(times), DIRECTION_TERMS)), 0
         for part in _in_blocks(times):
             track = self.track_at(part)
             place = self._data.tower_at(tower, part)[0]
             some = terms_from(place, track.position_m, track.heading_deg)
-            found[start : start + len(part)] = some
+            terms[start : start + len(part)] = some
             start += len(part)
-        return found
+        return terms
 
 
 _TRACKS_KEPT = 4
@@ -343,9 +343,9 @@ def _high_enough(data: FlightData, series: RssSeries) -> FloatArray:
 
 def _clock_of(series: RssSeries, fit: ClockEstimate, *, apply: bool) -> Clock:
     """The clock of a receiver as that of one of its series."""
-    found = fit.result(series.tower, apply=apply)
-    used = found.applied == APPLIED
-    return Clock(found=found, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
+    result = fit.result(series.tower, apply=apply)
+    used = result.applied == APPLIED
+    return Clock(result=result, applied_s=fit.correction_s(series.time) if used else np.zeros(len(series.time)))
 
 
 def part_of(whole: Replay, start: int, stop: int) -> Replay:
@@ -389,10 +389,10 @@ def replay_rank(data: FlightData, progress: Progress = silent) -> list[Replayed]
         poses = Poses(position[valid], rotation)
         progress(f"replay rank {series.tower}: {len(poses)} poses")
         # H holds reflections alone, so nothing else is searched
-        found = replay_poses(
+        replayed = replay_poses(
             data.site, data.settings.rt, link, poses, towers_m=towers_m, others=False, progress=progress
         )
-        out.append(Replayed(link=link, poses=poses, valid=valid, replay=found, track=track, tower_m=towers_m))
+        out.append(Replayed(link=link, poses=poses, valid=valid, replay=replayed, track=track, tower_m=towers_m))
     return out
 
 
@@ -486,7 +486,7 @@ def replay_poses(
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
-    found = replay(
+    replayed = replay(
         site,
         link,
         poses,
@@ -510,8 +510,8 @@ def replay_poses(
         progress=share_of(progress, name) if engine == "sionna" else None,
     )
     if rt.other_interactions and not others:
-        found.left_out.append(NOT_IN_RANKS)
-    return found
+        replayed.left_out.append(NOT_IN_RANKS)
+    return replayed
 
 
 def _tell(progress: Progress, name: str, estimate: Estimate) -> None:

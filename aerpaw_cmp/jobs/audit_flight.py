@@ -88,8 +88,8 @@ def audit_replays(data: FlightData, replays: Sequence[Replayed], progress: Progr
 
 def _other_interactions(replays: Sequence[Replayed]) -> dict[str, object]:
     """What diffraction, scattering and refraction added, over all RSS series."""
-    found = [r.replay for r in replays if r.replay.other is not None]
-    return summary((mean_pair_power(f.h), f.other) for f in found if f.other is not None)
+    with_others = [r.replay for r in replays if r.replay.other is not None]
+    return summary((mean_pair_power(f.h), f.other) for f in with_others if f.other is not None)
 
 
 def _crown_settings(rt: RtSettings, replays: Sequence[Replayed]) -> dict[str, object]:
@@ -123,7 +123,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
             parts.append(next(audits))
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
-    found = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
+    fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))
     return AuditResult(
         reference=parts[0].reference,
         links=links,
@@ -134,7 +134,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         seconds=sum(r.replay.seconds for r in replays) * links / max(total, 1),
         reference_seconds=sum(p.reference_seconds for p in parts),
         note=" ".join([TIMES, *_rays(parts)]),
-        fields=dataclasses.replace(found, not_covered=(*found.not_covered, *NOT_COVERED)),
+        fields=dataclasses.replace(fields, not_covered=(*fields.not_covered, *NOT_COVERED)),
     )
 
 

@@ -284,8 +284,8 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
         residual_db=series.measured_db[keep] - free,
     )
     guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
-    found = Observed(samples, free, pose.heading_deg[keep], place if series.tower in data.nodes else None)
-    return found.part(order), guessed
+    observed = Observed(samples, free, pose.heading_deg[keep], place if series.tower in data.nodes else None)
+    return observed.part(order), guessed
 
 
 # --- what is learned -----------------------------------------------------------------------------------------------
@@ -467,16 +467,16 @@ def score_on(
     stamp = uuid.uuid4().hex
     names = ["", *_controls((), recipe)]
     orders = [ScoreOrder(path=path, logs_root=logs_root, control=name, stamp=stamp) for name in names]
-    found: dict[int, dict[str, tuple[Score, ...]]] = {}
+    scored: dict[int, dict[str, tuple[Score, ...]]] = {}
 
     def done(number: int, result: dict[str, tuple[Score, ...]] | Lost) -> None:
         if isinstance(result, Lost):
             raise InputError(f"scores of the calibration: {result.message}")
-        found[number] = result
+        scored[number] = result
 
     workers.run(score_part, orders, done)
-    controls = {name: scores for number in range(1, len(names)) for name, scores in found[number].items()}
-    return found[0], controls
+    controls = {name: scores for number in range(1, len(names)) for name, scores in scored[number].items()}
+    return scored[0], controls
 
 
 def score_part(order: ScoreOrder) -> dict[str, tuple[Score, ...]]:

@@ -233,11 +233,11 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
 
 def powers_of(geometries: Sequence[Geometry], samples: RankSamples) -> FloatArray:
     """Squares (geometries, n, 4) of the singular values of the modelled channels."""
-    found = singular_values_of(
+    singular = singular_values_of(
         geometries, samples.link.tower_arrays[samples.tower], samples.tower_m, samples.link.uav_array, samples.poses,
         samples.link.carrier_hz,
     )  # fmt: skip
-    return np.stack([sigma**2 for sigma in found])
+    return np.stack([sigma**2 for sigma in singular])
 
 
 def features_of(geometries: Sequence[Geometry], samples: RankSamples, timing: Timing | None = None) -> FloatArray:
@@ -311,10 +311,10 @@ def _sectors(one: RankSamples, fitted: FittedReceiver, constant: FloatArray) -> 
     good = one.part(one.rank >= 1)
     groups = sector_groups(good.poses.position_m, good.tower_m)
     penalty = fitted.mixture.members[0].penalty
-    found = out_of_group(
+    forecast = out_of_group(
         features_of(fitted.geometries[:1], good, fitted.timing)[0], good.rank.astype(np.int64), groups, penalty
     )
-    return score_forecast(good.rank, found, found.argmax(axis=1) + 1, constant)
+    return score_forecast(good.rank, forecast, forecast.argmax(axis=1) + 1, constant)
 
 
 @dataclass(frozen=True, slots=True)
@@ -371,7 +371,7 @@ class Tried:
         """Least log score of the mean forecast of some geometries, on sectors left out within the flights."""
         thin = [self.thin[i] for i in flights]
         rank, groups = np.concatenate([one.rank for one in thin]), _groups(thin)
-        found = [
+        candidates = [
             Timing(
                 shift_s=shift_s,
                 average_s=average_s,
@@ -382,7 +382,7 @@ class Tried:
             for shift_s in self.settings.shift_s
             for average_s in self.settings.average_s
         ]
-        return min(found, key=lambda one: one.log_score)
+        return min(candidates, key=lambda one: one.log_score)
 
     def features(
         self, flights: Sequence[int] | range, timing: Timing, which: IntArray | slice = slice(None)

@@ -26,11 +26,11 @@ MARK = "# aerpaw-cmp calibrate"
 """First words of calibrated.yaml, by which an own earlier output is known."""
 
 
-def antenna_maps(found: Calibration) -> dict[tuple[str, str], AntennaMap]:
+def antenna_maps(calibration: Calibration) -> dict[tuple[str, str], AntennaMap]:
     """Every antenna over the sphere, by ``(tower.channel, "uav" or "tower")``."""
     theta, azimuth, vectors = sphere_grid()
     flat, shape = vectors.reshape(-1, 3), vectors.shape[:2]
-    fit = found.learned.fit
+    fit = calibration.learned.fit
     if fit is None:
         raise UsageError(
             "fit.gain is 'none': there is no gain over direction to write", expected="gain: both, uav or tower"
@@ -40,7 +40,7 @@ def antenna_maps(found: Calibration) -> dict[tuple[str, str], AntennaMap]:
         for end, frame in (("uav", "body"), ("tower", "mast")):
             name = "uav" if end == "uav" else antenna
             gain, sd = fit.gain("body" if frame == "body" else "mast", antenna, flat)
-            whole = unit_mean_gain((gain + found.learned.pattern_db(name, flat)).reshape(shape))
+            whole = unit_mean_gain((gain + calibration.learned.pattern_db(name, flat)).reshape(shape))
             out[antenna, end] = AntennaMap(
                 name=f"{antenna} {end}",
                 theta_deg=theta,
@@ -53,7 +53,7 @@ def antenna_maps(found: Calibration) -> dict[tuple[str, str], AntennaMap]:
 
 
 def antenna_files(
-    found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], carrier_hz: float
 ) -> dict[str, str | bytes]:
     """Content of each file by its name: the full sphere with standard deviation, and cuts for planning tools.
 
@@ -61,7 +61,7 @@ def antenna_files(
 
     Parameters
     ----------
-    found : Calibration
+    calibration : Calibration
     maps : mapping of (antenna, end) to AntennaMap
     carrier_hz : float
 
@@ -69,9 +69,9 @@ def antenna_files(
     -------
     dict of str to str or bytes
     """
-    names = ", ".join(data.settings.flight.name for data in found.flights)
+    names = ", ".join(data.settings.flight.name for data in calibration.flights)
     notes = (
-        f"aerpaw-cmp calibrate: {found.settings.calibration}, from {names}",
+        f"aerpaw-cmp calibrate: {calibration.settings.calibration}, from {names}",
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
     )
@@ -85,7 +85,7 @@ def antenna_files(
         said = {
             "title": f"{antenna}, antenna at the {end}",
             "source": f"learned from the flights {names}",
-            "history": f"{made} written by aerpaw-cmp calibrate, calibration {found.settings.calibration}",
+            "history": f"{made} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
             "institution": "not stated",
             "references": "https://arxiv.org/abs/2502.10324",
             "comment": "; ".join(notes[1:]),
@@ -96,19 +96,21 @@ def antenna_files(
     return out
 
 
-def settings_text(found: Calibration, folder_name: str) -> str:
+def settings_text(calibration: Calibration, folder_name: str) -> str:
     """calibrated.yaml: the part of a flight.yaml that names the learned antennas."""
-    names = [data.settings.flight.name for data in found.flights]
+    names = [data.settings.flight.name for data in calibration.flights]
     lines = [
-        f"{MARK}: {found.settings.calibration}. Learned from {', '.join(names)}.",
-        *(f"# {text}" for text in found.words),
+        f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(names)}.",
+        *(f"# {text}" for text in calibration.words),
         "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
         "link:",
         "  channels:",
     ]
-    for antenna in found.learned.fit.antennas if found.learned.fit else ():
+    for antenna in calibration.learned.fit.antennas if calibration.learned.fit else ():
         tower, _, channel = antenna.partition(".")
-        link = next(s.link for data in found.flights for s in data.rss if (s.tower, s.channel) == (tower, channel))
+        link = next(
+            s.link for data in calibration.flights for s in data.rss if (s.tower, s.channel) == (tower, channel)
+        )
         ends = {end: f"{folder_name}/{safe_name(f'{antenna}.{end}')}.csv" for end in ("tower", "uav")}
         lines += [
             f"    {channel}:" if channel.isidentifier() else f"    {channel!r}:",
@@ -117,7 +119,7 @@ def settings_text(found: Calibration, folder_name: str) -> str:
             f"      tower: {{antenna: {{model: sphere, file: {ends['tower']}}}}}",
             f"      uav: {{antenna: {{model: sphere, file: {ends['uav']}}}}}",
         ]
-    rough = None if found.ground is None else found.ground.used_m
+    rough = None if calibration.ground is None else calibration.ground.used_m
     lines += [
         "# the gains were learned beside line of sight alone",
         "rt: {engine: image, max_depth: 0, attitude: logged}",
@@ -129,13 +131,13 @@ def settings_text(found: Calibration, folder_name: str) -> str:
 
 
 def record_of(
-    found: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
+    calibration: Calibration, maps: Mapping[tuple[str, str], AntennaMap], text: str, stages_s: Mapping[str, float]
 ) -> CalibrationData:
     """All that the page shows.
 
     Parameters
     ----------
-    found : Calibration
+    calibration : Calibration
     maps : mapping of (antenna, end) to AntennaMap
     text : str
         The settings to copy into a flight file.
@@ -147,58 +149,61 @@ def record_of(
     CalibrationData
         As :func:`aerpaw_cmp.report.calibration_html.write_calibration` takes it.
     """
-    model = found.learned.choice.model
+    model = calibration.learned.choice.model
     mounts = {
         name: {k: v for k, v in dataclasses.asdict(m).items() if k not in ("grid_deg", "probability")}
         | {"probability": dict(zip([f"{g:g}" for g in m.grid_deg], map(float, m.probability), strict=True))}
-        for name, m in found.learned.mounts.items()
+        for name, m in calibration.learned.mounts.items()
     }
     ground = None
-    if found.ground is not None:
-        named = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in found.ground.roughness_m]
-        ground = {"rows": list(zip(named, found.ground.log_likelihood, strict=True)), "likely_m": found.ground.likely_m}
+    if calibration.ground is not None:
+        named = [f"{100 * r:g} cm" if math.isfinite(r) else "no ray" for r in calibration.ground.roughness_m]
+        ground = {
+            "rows": list(zip(named, calibration.ground.log_likelihood, strict=True)),
+            "likely_m": calibration.ground.likely_m,
+        }
     return CalibrationData(
-        name=found.settings.calibration,
+        name=calibration.settings.calibration,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
-        flights=[data.settings.flight.name for data in found.flights],
-        words=found.words,
-        warnings=found.warnings,
-        scores={k: [dataclasses.asdict(s) for s in v] for k, v in found.scores.items()},
-        controls={k: [dataclasses.asdict(s) for s in v] for k, v in found.controls.items()},
+        flights=[data.settings.flight.name for data in calibration.flights],
+        words=calibration.words,
+        warnings=calibration.warnings,
+        scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},
+        controls={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.controls.items()},
         mounts=mounts,
         strengths={
-            "spread": found.learned.choice.spread,
-            "scale": found.learned.choice.scale,
-            "left_out_rmse_db": {f"{k:g}": v for k, v in found.learned.choice.left_out_rmse_db.items()},
+            "spread": calibration.learned.choice.spread,
+            "scale": calibration.learned.choice.scale,
+            "left_out_rmse_db": {f"{k:g}": v for k, v in calibration.learned.choice.left_out_rmse_db.items()},
             "model": dataclasses.asdict(model),
         },
         ground=ground,
         antennas=tuple(maps.values()),
-        place=None if found.place is None else _place(found, found.place),
-        rank=found.rank,
+        place=None if calibration.place is None else _place(calibration, calibration.place),
+        rank=calibration.rank,
         settings_text=text,
         versions=versions(),
         stages_s=stages_s,
     )
 
 
-def _place(found: Calibration, place: Learned) -> dict[str, FloatArray]:
+def _place(calibration: Calibration, place: Learned) -> dict[str, FloatArray]:
     """The place field of the first antenna along all flights, thinned."""
     assert place.fit is not None
     first = place.fit.antennas[0]
-    own = [o.samples for o in found.observed if o.samples.antenna == first]
+    own = [o.samples for o in calibration.observed if o.samples.antenna == first]
     thin = [s.part(np.arange(0, len(s), max(1, len(s) // 1500))) for s in own]
     gain = [place.fit.mean(s, ("place",)) for s in thin]
     position = np.concatenate([s.position_m for s in thin])
     return {"east_m": position[:, 0], "north_m": position[:, 1], "gain_db": np.concatenate(gain)}
 
 
-def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[str, float]) -> tuple[Any, str]:
+def write_files(calibration: Calibration, folder: Path, name: str, stages_s: Mapping[str, float]) -> tuple[Any, str]:
     """Fill the folder of a calibration; gives its record and the text of calibrated.yaml.
 
     Parameters
     ----------
-    found : Calibration
+    calibration : Calibration
     folder : Path
         Exists, and is swapped for the old one by the caller.
     name : str
@@ -212,11 +217,11 @@ def write_files(found: Calibration, folder: Path, name: str, stages_s: Mapping[s
     text : str
         calibrated.yaml.
     """
-    maps = antenna_maps(found)
-    carrier = next(s.link.carrier_hz for data in found.flights for s in data.rss)
-    for file, content in antenna_files(found, maps, carrier).items():
+    maps = antenna_maps(calibration)
+    carrier = next(s.link.carrier_hz for data in calibration.flights for s in data.rss)
+    for file, content in antenna_files(calibration, maps, carrier).items():
         write_file(folder / file, content)
-    text = settings_text(found, name)
-    record = record_of(found, maps, text, stages_s)
+    text = settings_text(calibration, name)
+    record = record_of(calibration, maps, text, stages_s)
     write_calibration(record, folder)
     return record, text

@@ -179,7 +179,7 @@ def run(
         with stage("pool"):
             rows, pooled = pool_offsets([row for o in results for row in o.rss], campaign.calibration)
             reference = [row for row in rows if row.setting == next(iter(settings))]
-            found = repeats(reference, campaign.repeatability, crew, where if scheduler else None)
+            repeated = repeats(reference, campaign.repeatability, crew, where if scheduler else None)
             ranks_again = rank_repeats(flown, campaign.repeatability.radius_m)
         held_out = _Folds()
         if campaign.held_out is not None:
@@ -202,7 +202,7 @@ def run(
         flown_ranks=flown,
         failures=tuple(failures),
         pooled=tuple(pooled),
-        repeats=tuple(found),
+        repeats=tuple(repeated),
         rank_repeats=tuple(ranks_again),
         held_out=held_out.rss,
         held_out_rank=held_out.rank,
@@ -384,17 +384,17 @@ def spread_over(workers: Workers, tasks: Mapping[str, Task], settings: HeldOutSe
             for flight, wanted in points.items()
             for some in _parts(wanted, pieces)
         ]
-        found: dict[int, list[float]] = {}
+        errors_of: dict[int, list[float]] = {}
 
         def done(number: int, result: list[float] | Lost) -> None:
             if isinstance(result, Lost):
                 raise InputError(f"held-out fit of {orders[number].task.flight}: {result.message}")
-            found[number] = result
+            errors_of[number] = result
 
         workers.run(point_errors, orders, done)
         out: dict[str, list[float]] = {}
         for number, order in enumerate(orders):
-            out.setdefault(order.task.flight, []).extend(found[number])
+            out.setdefault(order.task.flight, []).extend(errors_of[number])
         return out
 
     return errors

@@ -209,25 +209,25 @@ def fit_all(
         progress("held-out: fit on " + ", ".join(train))
         test = [name for name in names if name not in train]
         try:
-            found = search(few, grids, train, refine=refine)
+            optimum = search(few, grids, train, refine=refine)
         except ValueError as error:
             raise InputError(
                 f"nothing can be fitted on {', '.join(train)}: {error}",
                 expected="samples that are measured and simulated under some of the values",
                 cause="no coverage, or values far off",
             ) from None
-        curves = _curves(few, grids, found.parameters)
+        curves = _curves(few, grids, optimum.parameters)
         flat = [n for n, by in curves.items() if all(np.ptp(by[f][1]) < NO_EFFECT_DB for f in train)]
         folds.append(
             HeldOutFold(
                 setting=setting,
                 fitted_on=tuple(train),
                 applied_to=tuple(test),
-                parameters=found.parameters,
-                at_bounds=found.at_bounds,
-                evaluations=found.evaluations,
-                method=found.method,
-                rows=tuple(_scores(full, found.parameters, train, test)),
+                parameters=optimum.parameters,
+                at_bounds=optimum.at_bounds,
+                evaluations=optimum.evaluations,
+                method=optimum.method,
+                rows=tuple(_scores(full, optimum.parameters, train, test)),
                 without_effect=tuple(flat),
                 curves=curves,
             )
@@ -338,7 +338,7 @@ def _scores(benches: Mapping[str, Bench], point: Point, train: list[str], test: 
 
 def _own_lag(clock: Clock | None, point: Point) -> tuple[str, ...]:
     """``lag_s`` where a lag that was estimated on these very samples has been applied."""
-    estimated = clock is not None and clock.found.applied == APPLIED and "rss.lag" not in point
+    estimated = clock is not None and clock.result.applied == APPLIED and "rss.lag" not in point
     return ("lag_s",) if estimated else ()
 
 

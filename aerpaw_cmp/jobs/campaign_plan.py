@@ -251,16 +251,16 @@ def run_tasks(
     list of Outcome
         In the order of the tasks; what goes wrong in one is its failure.
     """
-    found, orders = kept_outcomes(tasks, keep, progress)
-    compute(tasks, orders, workers, progress, found)
-    return [found[number] for number in range(len(tasks))]
+    outcomes, orders = kept_outcomes(tasks, keep, progress)
+    compute(tasks, orders, workers, progress, outcomes)
+    return [outcomes[number] for number in range(len(tasks))]
 
 
 def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -> tuple[Outcomes, dict[int, Order]]:
     """Outcomes that are there, and what is to be computed, by number."""
-    found, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
+    outcomes, orders = Outcomes(tasks), {number: Order(task=task) for number, task in enumerate(tasks)}
     if keep is None:
-        return found, orders
+        return outcomes, orders
     store = outcome_store(keep)
     there, _ = store.keys()
     for number, task in enumerate(tasks):
@@ -269,17 +269,17 @@ def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -
             orders[number] = Order(task=task, key=key, keep=keep)
             outcome = store.load(key) if key in there else None
             if outcome is not None:
-                found.put(number, outcome)
+                outcomes.put(number, outcome)
                 del orders[number]
     for text in store.warnings:
         progress(text)
-    if found:
-        progress(f"{len(found)} of {len(tasks)} outcomes are kept from before in {store.place.url}")
-    return found, orders
+    if outcomes:
+        progress(f"{len(outcomes)} of {len(tasks)} outcomes are kept from before in {store.place.url}")
+    return outcomes, orders
 
 
 def compute(
-    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, found: Outcomes
+    tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, outcomes: Outcomes
 ) -> None:
     """Let the workers do what is to do; each outcome is put into ``found``.
 
@@ -292,7 +292,7 @@ def compute(
     workers : Workers
     progress : Progress
         Tasks done, and the time left.
-    found : Outcomes
+    outcomes : Outcomes
         Gets the new ones.
     """
     if not orders:
@@ -304,7 +304,7 @@ def compute(
 
     def through(number: int, result: Done | Lost) -> None:
         outcome = _outcome(orders[number], result)
-        found.put(number, outcome)
+        outcomes.put(number, outcome)
         watch(outcome, 0 if isinstance(result, Lost) else result.links)
 
     def batch_through(place: int, results: list[Done] | Lost) -> None:

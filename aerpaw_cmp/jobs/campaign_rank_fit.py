@@ -76,8 +76,8 @@ class RankBench:
             said = ranks.rank_from_singular_values(sigma[known], k)
             reported.append(series.rank[known][said >= 1])
             simulated.append(said[said >= 1])
-        found = (np.concatenate(part) if part else np.zeros(0) for part in (reported, simulated))
-        one, two = (np.minimum(part, MAX_RANK).astype(np.int64) for part in found)
+        joined = (np.concatenate(part) if part else np.zeros(0) for part in (reported, simulated))
+        one, two = (np.minimum(part, MAX_RANK).astype(np.int64) for part in joined)
         return one, two
 
     def thinned(self, samples: int) -> RankBench:
@@ -171,14 +171,14 @@ def fit_rank_all(
     folds = []
     for train in trainings:
         progress("held-out rank: fit on " + ", ".join(train))
-        found = search([few[name] for name in train], grids, criterion)
-        if not np.isfinite(found.loss):
+        optimum = search([few[name] for name in train], grids, criterion)
+        if not np.isfinite(optimum.loss):
             raise InputError(
                 f"nothing can be fitted on {', '.join(train)}",
                 expected="reports with a rank where the replay has a channel",
                 cause="no coverage, no positions, or rank.minimum_height_m above the flight",
             )
-        folds.append(_fold(full, few, train, found, criterion, setting))
+        folds.append(_fold(full, few, train, optimum, criterion, setting))
     return folds
 
 
@@ -224,26 +224,26 @@ def _fold(
     full: Mapping[str, RankBench],
     few: Mapping[str, RankBench],
     train: Sequence[str],
-    found: Search,
+    optimum: Search,
     criterion: Criterion,
     setting: str,
 ) -> RankHeldOutFold:
     test = [name for name in full if name not in train]
-    ties = _ties([few[name] for name in train], found)
+    ties = _ties([few[name] for name in train], optimum)
     return RankHeldOutFold(
         setting=setting,
         criterion=criterion,
         fitted_on=tuple(train),
         applied_to=tuple(test),
-        parameters=found.point,
-        evaluations=len(found.tried),
-        method=found.method,
+        parameters=optimum.point,
+        evaluations=len(optimum.tried),
+        method=optimum.method,
         ties=tuple(ties),
-        rows=tuple(_rows(full, train, test, found.point)),
+        rows=tuple(_rows(full, train, test, optimum.point)),
     )
 
 
-def _ties(benches: Sequence[RankBench], found: Search) -> list[dict[str, Any]]:
+def _ties(benches: Sequence[RankBench], optimum: Search) -> list[dict[str, Any]]:
     """Other points whose misses cannot be told from those of the best one, on the flights of the fit."""
 
     def misses(point: Point) -> list[FloatArray]:
@@ -256,9 +256,9 @@ def _ties(benches: Sequence[RankBench], found: Search) -> list[dict[str, Any]]:
                 out.append(np.where(known, (said != series.rank).astype(np.float64), np.nan))
         return out
 
-    best = np.concatenate(misses(found.point))
+    best = np.concatenate(misses(optimum.point))
     same = []
-    for point, _ in found.tried[1:FINALISTS]:
+    for point, _ in optimum.tried[1:FINALISTS]:
         difference = paired_difference(np.concatenate(misses(point)), best, replicates=REPLICATES)
         if difference.verdict != "worse":
             same.append(point)

@@ -61,10 +61,10 @@ class Outcome:
 def _stamp(path: Path) -> tuple[int, int]:
     """Size and time of a file: a worker that lives for days must see that it was changed; zeros where there is none."""
     try:
-        found = os.stat(path)  # noqa: PTH116
+        status = os.stat(path)  # noqa: PTH116
     except OSError:
         return 0, 0
-    return found.st_size, found.st_mtime_ns
+    return status.st_size, status.st_mtime_ns
 
 
 @lru_cache(maxsize=512)
@@ -101,15 +101,15 @@ def flight_data(task: Task) -> FlightData:
 def run_task(task: Task) -> Outcome:
     """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
     try:
-        found = run_flight(flight_data(task), audit=False)
+        ran = run_flight(flight_data(task), audit=False)
     except AerpawCmpError as error:
         return _failed(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
         return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
     return Outcome(
-        rss=tuple(_rss_row(task, found.data.settings.rss, one) for one in found.result.rss),
-        rank=tuple(row for one in found.result.rank for row in _rank_rows(task, one)),
-        track=_flown(task, found.result),
+        rss=tuple(_rss_row(task, ran.data.settings.rss, one) for one in ran.result.rss),
+        rank=tuple(row for one in ran.result.rank for row in _rank_rows(task, one)),
+        track=_flown(task, ran.result),
         flown=tuple(
             FlownRank(
                 flight=task.flight,
@@ -120,7 +120,7 @@ def run_task(task: Task) -> Outcome:
                 time_s=_elapsed_s(one.time),
                 start_ns=_start_ns(one.time),
             )
-            for one in found.result.rank
+            for one in ran.result.rank
         ),
     )
 
@@ -314,14 +314,14 @@ def _elapsed_s(time: AnyArray) -> FloatArray:
     return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
-    score, clock = found.score, found.further.clock
+def _rss_row(task: Task, rules: RssSettings, result: RssResult) -> RssRow:
+    score, clock = result.score, result.further.clock
     return RssRow(
         flight=task.flight,
         setting=task.setting,
-        tower=found.tower,
-        channel=found.channel,
-        unit=found.unit,
+        tower=result.tower,
+        channel=result.channel,
+        unit=result.unit,
         offset_db=score.offset_db,
         rmse_db=score.rmse_db,
         correlation=score.correlation,
@@ -335,28 +335,28 @@ def _rss_row(task: Task, rules: RssSettings, found: RssResult) -> RssRow:
         lag_s=score.lag_s,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
-        baselines={name: model.rmse_db for name, model in found.baselines.items()},
+        baselines={name: model.rmse_db for name, model in result.baselines.items()},
         step_db=rules.step_db,
         span_db=rules.span_db,
-        measured_db=found.measured_db,
-        simulated_dbm=found.simulated_dbm,
-        time_s=_elapsed_s(found.time),
-        start_ns=_start_ns(found.time),
-        position_m=found.position_m,
-        distance_m=found.geometry["distance_m"],
-        heading_deg=found.geometry.get("heading_deg"),
-        within=found.further.repeatability,
-        difference=offset.difference_moments(found.measured_db, found.simulated_dbm),
+        measured_db=result.measured_db,
+        simulated_dbm=result.simulated_dbm,
+        time_s=_elapsed_s(result.time),
+        start_ns=_start_ns(result.time),
+        position_m=result.position_m,
+        distance_m=result.geometry["distance_m"],
+        heading_deg=result.geometry.get("heading_deg"),
+        within=result.further.repeatability,
+        difference=offset.difference_moments(result.measured_db, result.simulated_dbm),
     )
 
 
-def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
-    score = found.score
+def _rank_rows(task: Task, result: RankResult) -> list[RankRow]:
+    score = result.score
     return [
         RankRow(
             flight=task.flight,
             setting=task.setting,
-            tower=found.tower,
+            tower=result.tower,
             n=score.n,
             best_k=score.best_k,
             best_k_ci95=score.curve.best_k_interval,
@@ -368,7 +368,7 @@ def _rank_rows(task: Task, found: RankResult) -> list[RankRow]:
             total_variation=fit.total_variation,
             total_variation_ci95=fit.total_variation_ci95,
             wasserstein=fit.wasserstein,
-            commonest_agreement=found.further.commonest.agreement,
+            commonest_agreement=result.further.commonest.agreement,
         )
         for k, fit in score.simulated.items()
     ]

@@ -75,15 +75,15 @@ FEWEST_SERIES = 4
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
-    found = []
+    results = []
     for one in in_order(calls, None if may_share(data) else 1, fewest=FEWEST_SERIES):
-        found.append(one)
+        results.append(one)
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
-        rss=tuple(found),
+        rss=tuple(results),
         rank=tuple(compare_rank_series(data, s, r) for s, r in zip(data.rank, replays.rank, strict=True)),
-        pairs=tuple(pairs_of(found)),
-        serving=serving_of(data.rss, found),
+        pairs=tuple(pairs_of(results)),
+        serving=serving_of(data.rss, results),
     )
 
 
@@ -91,13 +91,13 @@ SERVING_WITHIN_S = 1.5
 """A prediction of another cell at most this long before or after stands for the moment: phones report once a second."""
 
 
-def serving_of(series: Sequence[RssSeries], found: Sequence[RssResult]) -> ServingComparison | None:
+def serving_of(series: Sequence[RssSeries], results: Sequence[RssResult]) -> ServingComparison | None:
     """Serving cells of the log against the strongest predicted; None where no log tells which cell serves.
 
     Compared are the cells that the flight file gives to towers, at the moments when one of them served. Levels are as
     simulated: cells of one network send alike, and an offset fitted per cell would hide which one is stronger.
     """
-    cells = [(one, result) for one, result in zip(series, found, strict=True) if one.serving is not None]
+    cells = [(one, result) for one, result in zip(series, results, strict=True) if one.serving is not None]
     if len(cells) < 2 or not any(np.nansum(one.serving) for one, _ in cells if one.serving is not None):
         return None
     start = min(one.time.min() for one, _ in cells if len(one.time))
@@ -137,8 +137,8 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         step_db=settings.step_db,
         span_db=settings.span_db,
         replicates=max(settings.bootstrap, 1),
-        lag_s=float("nan") if clock is None else clock.found.radio_minus_telemetry_s,
-        fitted_on_scored=("lag_s",) if clock is not None and clock.found.applied == APPLIED else (),
+        lag_s=float("nan") if clock is None else clock.result.radio_minus_telemetry_s,
+        fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     position = _positions(replayed)
@@ -178,7 +178,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             n_too_low=int((replayed.valid & ~levels.posed).sum()),
             n_no_pose=int((~replayed.valid).sum()),
             n_flagged=dict(series.flagged),
-            clock=None if clock is None else clock.found,
+            clock=None if clock is None else clock.result,
             baseline_rmse_ci95_db=score.baseline_intervals,
             compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
             averaged=_averaged(series, replayed, levels, position, settings),
@@ -272,10 +272,10 @@ def _averaged(
 def _expected(
     budget: ReferencePowers | None, folder: Path, series: RssSeries, offset_db: float
 ) -> ExpectedOffset | None:
-    found = expected_offset(budget, folder, series)
-    if found is None:
+    budgeted = expected_offset(budget, folder, series)
+    if budgeted is None:
         return None
-    expected, received, sent = found
+    expected, received, sent = budgeted
     return ExpectedOffset(
         expected_db=expected,
         receiver_reference_dbm=received,
@@ -334,7 +334,7 @@ def _repeatability(
     elapsed = rss.seconds(time)
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
-    found = {}
+    repeated = {}
     for name, turned in (("same_heading", heading_deg), ("any_heading", None)):
         if name == "same_heading" and turned is None:
             continue
@@ -347,8 +347,8 @@ def _repeatability(
             heading_deg=None if turned is None else turned[~late],
             other_heading_deg=None if turned is None else turned[late],
         )
-        found[name] = Repeated(rmse_db=fit.rmse_db, rmse_ci95_db=fit.interval_db, n=fit.n)
-    return found
+        repeated[name] = Repeated(rmse_db=fit.rmse_db, rmse_ci95_db=fit.interval_db, n=fit.n)
+    return repeated
 
 
 def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
@@ -557,11 +557,11 @@ def _repeated_rank(
     with np.errstate(invalid="ignore"):
         late = elapsed > 0.5 * np.nanmax(elapsed, initial=0.0)
     heading = None if replayed.track is None else replayed.spread(replayed.track.heading_deg)[rows]
-    found = {}
+    repeated = {}
     for name, turned in (("same_heading", heading), ("any_heading", None)):
         if name == "same_heading" and turned is None:
             continue
-        found[name] = ranks.repeat_rank(
+        repeated[name] = ranks.repeat_rank(
             position_m[~late],
             rank[~late],
             position_m[late],
@@ -570,4 +570,4 @@ def _repeated_rank(
             heading_deg=None if turned is None else turned[~late],
             other_heading_deg=None if turned is None else turned[late],
         )
-    return found
+    return repeated

@@ -182,7 +182,7 @@ class SiteChannels:
                 raise ValueError(f"towers {towers} are not those of the site")
             chunk = position_m.tobytes()
             if (mode, chunk) not in self._kept:
-                self._kept |= {(name, chunk): found for name, found in self._all_modes(position_m).items()}
+                self._kept |= {(name, chunk): evaluated for name, evaluated in self._all_modes(position_m).items()}
             return self._kept.pop((mode, chunk))
 
         return evaluate
@@ -211,7 +211,7 @@ class SiteChannels:
                 raise InputError(f"a piece of the map: {result.message}")
             order = orders[number]
             chunk = grid.positions_m(order.height_m)[order.start : order.start + CHUNK].tobytes()
-            self._kept |= {(mode, chunk): found for mode, found in result.modes.items()}
+            self._kept |= {(mode, chunk): evaluated for mode, evaluated in result.modes.items()}
             self.paths += result.paths
             self.paths_off_crowns += result.paths_off_crowns
             progress("maps on workers", len(self._kept) / (len(orders) * len(s.foliage)))
@@ -221,14 +221,14 @@ class SiteChannels:
     def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (len(position_m), 3, 3)))
         s = self.settings
-        found = replay(self.site, self.siso, poses, s.engine, max_depth=s.max_depth, samples=s.samples)
-        self.paths += len(found.paths)
-        siso, mimo = found.h, self._matrices(found, found.paths, poses, self.mimo, None)
+        replayed = replay(self.site, self.siso, poses, s.engine, max_depth=s.max_depth, samples=s.samples)
+        self.paths += len(replayed.paths)
+        siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)
         result = {}
         for mode in s.foliage:
-            loss = self._loss_db(mode, found.paths, poses)
-            one = self._shaded(siso, found, poses, self.siso, loss)
-            many = self._shaded(mimo, found, poses, self.mimo, loss)
+            loss = self._loss_db(mode, replayed.paths, poses)
+            one = self._shaded(siso, replayed, poses, self.siso, loss)
+            many = self._shaded(mimo, replayed, poses, self.mimo, loss)
             if mode == "opaque" and self.mirrors:
                 one, many = self._with_bounces(self.mirrors, poses, one, many)
             result[mode] = Evaluation(self._rss_dbm(one), self._rss_dbm(many), singular_values(many))
@@ -263,23 +263,23 @@ class SiteChannels:
         return foliage_loss_db(source, paths.vertices_m, target, self.crowns, model)
 
     def _matrices(
-        self, found: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None
+        self, replayed: Replay, paths: PathSet, poses: Poses, link: Link, loss_db: FloatArray | None
     ) -> ComplexArray:
-        h: ComplexArray = channel_matrices(paths, found.faces, self.sources_m, poses, link, loss_db).h
+        h: ComplexArray = channel_matrices(paths, replayed.faces, self.sources_m, poses, link, loss_db).h
         return h
 
     def _shaded(
-        self, clear: ComplexArray, found: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
+        self, clear: ComplexArray, replayed: Replay, poses: Poses, link: Link, loss_db: FloatArray | None
     ) -> ComplexArray:
         """Channel matrices with foliage: those of links without any loss stay as they are."""
         if loss_db is None:
             return clear
-        paths, h = found.paths, clear.copy()
+        paths, h = replayed.paths, clear.copy()
         touched = np.zeros(h.shape[:2], dtype=np.bool_)
         touched[paths.pose[loss_db > 0], paths.tower[loss_db > 0]] = True
         # a path of infinite loss is an obstacle, not a weak path
         again = touched[paths.pose, paths.tower] & np.isfinite(loss_db)
-        h[touched] = self._matrices(found, paths.select(again), poses, link, loss_db[again])[touched]
+        h[touched] = self._matrices(replayed, paths.select(again), poses, link, loss_db[again])[touched]
         return np.asarray(h)
 
 

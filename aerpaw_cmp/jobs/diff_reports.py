@@ -215,8 +215,8 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
         if not pd.api.types.is_numeric_dtype(table[name]) and len(table):
             bad = pd.to_numeric(table[name], errors="coerce").isna() & table[name].notna()
             row = int(np.flatnonzero(bad.to_numpy())[0]) if bad.any() else 0
-            found = one_line(str(table[name].iloc[row]))
-            raise InputError(f"column {name!r}: {found!r}", expected="a number", path=path, line=row + 2)
+            shown = one_line(str(table[name].iloc[row]))
+            raise InputError(f"column {name!r}: {shown!r}", expected="a number", path=path, line=row + 2)
     torn = table["tower"].isna() | table["time_s"].isna()
     if torn.any():
         row = int(np.flatnonzero(torn.to_numpy())[0])
@@ -420,10 +420,10 @@ def _instants(table: Any) -> FloatArray:
 
 def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
-    found: list[LevelDifference] = []
+    differences: list[LevelDifference] = []
     residuals: list[_Residuals] = []
     if one.rss is None or two.rss is None:
-        return found, residuals
+        return differences, residuals
     names = ("measured_db", "simulated_dbm", "residual_db")
     for tower, channels in one.metrics["rss"].items():
         for channel, numbers in channels.items():
@@ -436,14 +436,14 @@ def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], li
             offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
             scored = [int(table["residual_db"].notna().sum()) for table in tables]
             residuals.append((_instants(a), first[2], second[2]))
-            found.append(
+            differences.append(
                 level_difference(
                     tower, channel, overlap, first, second,
                     scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
                     replicates=_replicates(overlap.common),
                 )
             )  # fmt: skip
-    return found, residuals
+    return differences, residuals
 
 
 def _ranks(one: ReadReport, two: ReadReport) -> Iterator[RankDifference]:

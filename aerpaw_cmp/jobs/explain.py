@@ -171,18 +171,18 @@ def run_explain(
     rt = settings.rt.model_copy(update={"engine": "sionna"}) if engine == "sionna" else settings.rt
     chosen = rt.engine if engine in (None, "both") else engine
     others = bool(rt.other_interactions) and chosen == "sionna" and isinstance(series, RssSeries)
-    found = replay_poses(data.site, rt, link, pose, engine=chosen, others=others, progress=progress)  # type: ignore[arg-type]
-    other, found = _other_power(found, link), found.of_reflections()
+    replayed = replay_poses(data.site, rt, link, pose, engine=chosen, others=others, progress=progress)  # type: ignore[arg-type]
+    other, replayed = _other_power(replayed, link), replayed.of_reflections()
     source = data.site.towers[tower].position_m
     if tower in data.nodes:
         notes.append(f"{tower} moves: it was at {source[0]:.1f} m east, {source[1]:.1f} m north, {source[2]:.1f} m up")
-    paths = _paths(data.site, rt, found, link, pose, source)
+    paths = _paths(data.site, rt, replayed, link, pose, source)
     differences = None
     if engine == "both":
-        differences = tuple(_differences(data.site, rt, found, link, pose, source, progress))
+        differences = tuple(_differences(data.site, rt, replayed, link, pose, source, progress))
     if isinstance(series, RssSeries) and settings.rss.field != "coherent":
         notes.append(f"rss.csv holds rss.field: {settings.rss.field}; the level here is the coherent sum")
-    if found.pairs_differ is not None and found.pairs_differ.any():
+    if replayed.pairs_differ is not None and replayed.pairs_differ.any():
         notes.append(
             "element pairs have paths of their own (rt.visibility: pairs); listed are those of the array centres"
         )
@@ -196,22 +196,22 @@ def run_explain(
         position_m=tuple(float(x) for x in pose.position_m[0]),  # type: ignore[arg-type]
         transmit_power_dbm=link.transmit_power_dbm,
         carrier_hz=link.carrier_hz,
-        engine=found.engine,
+        engine=replayed.engine,
         paths=paths,
-        level_dbm=float(found.rss_dbm[0, 0]),
+        level_dbm=float(replayed.rss_dbm[0, 0]),
         power_sum_dbm=power_sum_dbm(paths) if paths else float("nan"),
         measured_db=measured,
         unit=series.unit if isinstance(series, RssSeries) else "",
-        absent=tuple(_absent(found, source, pose.position_m[0])),
+        absent=tuple(_absent(replayed, source, pose.position_m[0])),
         differences=differences,
-        notes=(*notes, *(f"left out: {what}" for what in found.left_out)),
+        notes=(*notes, *(f"left out: {what}" for what in replayed.left_out)),
         other_interactions=other,
     )
 
 
-def _other_power(found: Replay, link: Link) -> OtherPower | None:
+def _other_power(replayed: Replay, link: Link) -> OtherPower | None:
     """What other interactions than reflections add to the one link of a replay."""
-    other = found.other
+    other = replayed.other
     if other is None:
         return None
     power = float(other.power[0, 0])
@@ -220,7 +220,7 @@ def _other_power(found: Replay, link: Link) -> OtherPower | None:
         paths=int(other.paths[0, 0]),
         kinds=dict(other.kinds),
         power_dbm=_level(link.transmit_power_dbm + 10.0 * float(np.log10(power))) if power > 0.0 else None,
-        level_dbm=_level(float(found.rss_dbm[0, 0])),
+        level_dbm=_level(float(replayed.rss_dbm[0, 0])),
     )
 
 
@@ -325,39 +325,39 @@ SMOOTH = {"reflection_loss_db": 0.0, "ground_roughness_m": 0.0}
 
 
 def _paths(
-    site: Site, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray
+    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray
 ) -> tuple[ExplainedPath, ...]:
     """The paths with their terms, foliage and roughness apart."""
     through = path_loss(site, rt.model_copy(update=SMOOTH), link.carrier_hz)
     further = {}
     if through is not None:
-        further["foliage"] = through(found.paths, source[None], pose.position_m)
+        further["foliage"] = through(replayed.paths, source[None], pose.position_m)
     if rt.reflection_loss_db:
-        further["rough surfaces"] = rt.reflection_loss_db * found.paths.depth.astype(np.float64)
+        further["rough surfaces"] = rt.reflection_loss_db * replayed.paths.depth.astype(np.float64)
     rough = roughness_loss(site, rt, link.carrier_hz)
     if rough is not None:
-        further["rough ground"] = rough(found.paths, source[None], pose.position_m)
-    return explain_paths(found.paths, found.faces, source, pose, link, further)
+        further["rough ground"] = rough(replayed.paths, source[None], pose.position_m)
+    return explain_paths(replayed.paths, replayed.faces, source, pose, link, further)
 
 
-def _absent(found: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
-    there = {tuple(row[row >= 0].tolist()) for row in found.paths.faces}
-    for words, sequence in simple_paths(found):
+def _absent(replayed: Replay, source: FloatArray, target: FloatArray) -> Iterator[tuple[str, str]]:
+    there = {tuple(row[row >= 0].tolist()) for row in replayed.paths.faces}
+    for words, sequence in simple_paths(replayed):
         if tuple(sequence.tolist()) not in there:
-            yield words, why_not(found.faces, source, target, sequence, found.surfaces) or _elsewhere(found)
+            yield words, why_not(replayed.faces, source, target, sequence, replayed.surfaces) or _elsewhere(replayed)
 
 
-def _elsewhere(found: Replay) -> str:
-    if found.engine == "sionna":
-        return f"nothing is in its way: not found with {found.samples} samples per tower"
+def _elsewhere(replayed: Replay) -> str:
+    if replayed.engine == "sionna":
+        return f"nothing is in its way: not found with {replayed.samples} samples per tower"
     return "geometry allows it: stopped by the terrain, the ground of another tower, or left out by rt.power_cut_db"
 
 
 def _differences(
-    site: Site, rt: RtSettings, found: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
+    site: Site, rt: RtSettings, replayed: Replay, link: Link, pose: Poses, source: FloatArray, progress: Progress
 ) -> Iterator[OtherEngine]:
     """Paths of one engine that the other has not, both ways, with the reason."""
-    engines = {found.engine: found}
+    engines = {replayed.engine: replayed}
     for name in ("image", "sionna"):
         if name not in engines:
             engines[name] = replay_poses(site, rt, link, pose, engine=name, progress=progress)  # type: ignore[arg-type]

@@ -179,26 +179,26 @@ class _Climber:
 
     def _antennas(self, _best: Model) -> list[Model]:
         patterns = [p for s in self._series for a in _arrays(s.replayed.link) for p in a.patterns]
-        found = [Model()]
+        models = [Model()]
         if all(p.name == "iso" for p in patterns):
-            return found
+            return models
         kind: Antennas = "learned" if any(isinstance(p, SpherePattern) for p in patterns) else "measured"
-        found.append(Model(antennas=kind))
+        models.append(Model(antennas=kind))
         tracks = [s.replayed.track for s in self._series]
         if all(t is not None for t in tracks):
             known = np.concatenate([t.attitude_known for t in tracks if t is not None])
-            found.append(Model(antennas=kind, attitude="level"))
+            models.append(Model(antennas=kind, attitude="level"))
             if known.any():
-                found.append(Model(antennas=kind, attitude="logged"))
+                models.append(Model(antennas=kind, attitude="logged"))
         if any(isinstance(p, InstalledPattern) for p in patterns):
-            found += [dataclasses.replace(m, antennas="installed") for m in found[1:]]
-        return found
+            models += [dataclasses.replace(m, antennas="installed") for m in models[1:]]
+        return models
 
     def _ground(self, best: Model) -> list[Model]:
         kinds: tuple[Ground, ...] = ("power sum", "weakened", "coherent")
-        found = [dataclasses.replace(best, ground=kind) for kind in kinds]
+        models = [dataclasses.replace(best, ground=kind) for kind in kinds]
         rough = self._data.settings.rt.ground_roughness_m
-        return [*found, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
+        return [*models, *([dataclasses.replace(best, ground="rough", roughness_m=rough)] if rough else [])]
 
     def _buildings(self, best: Model) -> list[Model]:
         if not self._data.site.buildings:
@@ -231,8 +231,8 @@ class _Climber:
         if model.antennas == "learned" and self._learned_here():
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
-        found = [self._level(i, model) for i in range(len(self._series))]
-        return Rung(model=model.name, level_db=tuple(f[0] for f in found), seconds=sum(f[1] for f in found))
+        levels = [self._level(i, model) for i in range(len(self._series))]
+        return Rung(model=model.name, level_db=tuple(f[0] for f in levels), seconds=sum(f[1] for f in levels))
 
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
         """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""
@@ -256,10 +256,10 @@ class _Climber:
             series = self._series[index]
             link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series)
             if series.replayed.tower_m is not None:
-                found = replay_moving(site, link, poses, sources, max_depth=depth)
+                replayed = replay_moving(site, link, poses, sources, max_depth=depth)
             else:
-                found = replay(site, link, poses, max_depth=depth, cache_dir="")
-            self._traced[index, buildings] = found, time.perf_counter() - begin
+                replayed = replay(site, link, poses, max_depth=depth, cache_dir="")
+            self._traced[index, buildings] = replayed, time.perf_counter() - begin
         return self._traced[index, buildings]
 
     def _sources(self, series: _Series) -> FloatArray:

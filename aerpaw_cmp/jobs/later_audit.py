@@ -173,8 +173,8 @@ def _metrics_of(folder: Path) -> dict[str, Any]:
             "no report there", expected=f"a folder with {METRICS}", cause="run 'aerpaw-cmp report' first", path=folder
         )
     try:
-        found = json.loads(read_bounded(path, LARGEST_TABLE, METRICS))
-        made, inputs = found["made_from"], found["inputs"]
+        metrics = json.loads(read_bounded(path, LARGEST_TABLE, METRICS))
+        made, inputs = metrics["made_from"], metrics["inputs"]
         whole = {"flight", "logs_root", "engine", "figures", "style", "export"} <= set(made) and isinstance(
             inputs, list
         )
@@ -187,4 +187,4 @@ def _metrics_of(folder: Path) -> dict[str, Any]:
             cause="a report of another job or of an older version: run 'aerpaw-cmp report' anew",
             path=path,
         )
-    return dict(found)
+    return dict(metrics)

@@ -34,10 +34,10 @@ def levels_of(series: RssSeries, replayed: Replayed, settings: RssSettings) -> L
     posed = replayed.valid.copy()
     if settings.minimum_height_m is not None:
         posed[posed] = replayed.poses.position_m[:, 2] >= settings.minimum_height_m
-    found = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
+    level_dbm = replayed.replay.rss_power_dbm if settings.field == "power" else replayed.replay.rss_dbm
     return Levels(
         measured_db=np.where(posed, measured, np.nan),
-        simulated_db=at_samples(series, replayed, found[:, 0], settings),
+        simulated_db=at_samples(series, replayed, level_dbm[:, 0], settings),
         posed=posed,
     )
 

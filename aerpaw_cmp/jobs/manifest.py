@@ -38,13 +38,13 @@ def other_inputs(settings: FlightFile, flight: Path, logs_root: Path | None = No
     """
     content = settings.model_dump(exclude={"logs"})
     roots = [flight.parent] if logs_root is None else [logs_root, flight.parent]
-    found = {os.path.realpath(flight): _entry(flight.name, flight, "flight file")}
+    entries = {os.path.realpath(flight): _entry(flight.name, flight, "flight file")}
     for key, text, place in named_files(content, roots):
         if key != "site.file":
-            found.setdefault(os.path.realpath(place), _entry(text, place, key))
+            entries.setdefault(os.path.realpath(place), _entry(text, place, key))
     for entry, place in _site_inputs(settings.site.file, flight.parent):
-        found.setdefault(os.path.realpath(place), entry)
-    return tuple(found.values())
+        entries.setdefault(os.path.realpath(place), entry)
+    return tuple(entries.values())
 
 
 def _site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
@@ -52,8 +52,8 @@ def _site_inputs(name: str, folder: Path) -> Iterator[tuple[InputFile, Path]]:
     path = folder / name
     if path.is_file():
         yield _entry(name, path, "site file"), path
-        found = path.stat()
-        model = _site_model(path, found.st_size, found.st_mtime_ns)
+        status = path.stat()
+        model = _site_model(path, status.st_size, status.st_mtime_ns)
     else:
         model = _site_model(name, 0, 0)
         packaged = name.lower().replace("-", "_").replace(" ", "_") + ".yaml"
@@ -80,10 +80,10 @@ def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
 
 
 def _entry(name: str, place: Path, role: str) -> InputFile:
-    found = os.stat(place)  # noqa: PTH116
+    status = os.stat(place)  # noqa: PTH116
     return InputFile(
         path=name,
-        sha256=digest_of(place, found.st_size, found.st_mtime_ns),
+        sha256=digest_of(place, status.st_size, status.st_mtime_ns),
         reader="",
         lines=0,
         accepted=0,

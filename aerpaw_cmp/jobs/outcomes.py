@@ -98,11 +98,11 @@ class OutcomeStore:
     def manifests(self, keys: Iterable[str], *, failed: bool = False) -> dict[str, dict[str, Any]]:
         """What stands beside the outcomes (or failures) of some keys, where it can be read."""
         end = ".failed.json" if failed else ".json"
-        found = {}
+        contents = {}
         for name, content in self.place.read_many(f"{key}{end}" for key in keys).items():
             with contextlib.suppress(ValueError):
-                found[name.removesuffix(end)] = json.loads(content)
-        return found
+                contents[name.removesuffix(end)] = json.loads(content)
+        return contents
 
     def keys(self) -> tuple[set[str], set[str]]:
         """Keys that have an outcome, and keys that failed the last time."""
@@ -190,8 +190,8 @@ class _Packed:
         if key not in self._known:
             size = count * np.dtype(kind).itemsize
             self._known[key] = self._content[start : start + size].copy().view(kind).reshape(shape)
-        found: AnyArray = self._known[key]
-        return found
+        array: AnyArray = self._known[key]
+        return array
 
 
 _AS_THEY_ARE = frozenset({str, int, float, bool})
@@ -232,15 +232,15 @@ def task_inputs(settings: FlightFile, flight: Path, logs_root: Path | None) -> l
     UsageError
         If the site cannot.
     """
-    found = [
+    entries = [
         {"role": one.role, "path": one.path, "sha256": one.sha256}
         for one in other_inputs(settings, flight, logs_root)
         if one.role != "flight file"  # what it says stands in the settings, overrides included
     ]
     for log in settings.logs:
         path = (logs_root or flight.parent) / log.path
-        found.append({"role": "log", "path": log.path, "sha256": _content(path)})
-    return found
+        entries.append({"role": "log", "path": log.path, "sha256": _content(path)})
+    return entries
 
 
 def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: object) -> str:
@@ -257,8 +257,8 @@ def task_key(settings: FlightFile, inputs: Iterable[Mapping[str, str]], *more: o
 
 
 def _content(path: Path) -> str:
-    found = os.stat(path)  # noqa: PTH116  the times make the key of the cache
-    return digest_of(path, found.st_size, found.st_mtime_ns)
+    status = os.stat(path)  # noqa: PTH116  the times make the key of the cache
+    return digest_of(path, status.st_size, status.st_mtime_ns)
 
 
 _ROOMS_ASIDE = ("cli/", "live/", "maps/", "report/", "__main__.py")

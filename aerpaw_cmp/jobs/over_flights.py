@@ -163,7 +163,7 @@ def _shared_pairs(
 ) -> list[PassPair]:
     """The pairs by workers: the series are written once, tasks name them."""
     flights = list(dict.fromkeys(one.flight for one in passes))
-    found: list[PassPair] = []
+    pairs: list[PassPair] = []
     with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-repeats-") as folder:
         where = open_place(place or Path(folder))
         content = seal(_packed(passes), _SEAL)
@@ -177,14 +177,14 @@ def _shared_pairs(
         def done(_number: int, result: list[PassPair] | Lost) -> None:
             if isinstance(result, Lost):
                 raise InputError(f"repeatability of the flights: {result.message}")
-            found.extend(result)
+            pairs.extend(result)
 
         try:
             where.write(name, content)
             workers.run(pairs_of, orders, done)
         finally:
             where.remove(name)
-    return found
+    return pairs
 
 
 def pairs_of(order: PairsOrder) -> list[PassPair]:
@@ -272,19 +272,19 @@ def rank_repeats(flown: Sequence[FlownRank], radius_m: float) -> list[RankPairin
             continue
         if not _near(boxes[i], boxes[j], radius_m):
             continue
-        found = repeat_rank(
+        repeated = repeat_rank(
             first.position_m, first.rank, second.position_m, second.rank, radius_m=radius_m, replicates=0
         )
-        if found.n:
+        if repeated.n:
             out.append(
                 RankPairing(
                     tower=first.tower,
                     first=first.flight,
                     second=second.flight,
-                    n=found.n,
-                    agreement=found.agreement,
-                    kappa=found.kappa,
-                    kappa_ci95=found.kappa_ci95,
+                    n=repeated.n,
+                    agreement=repeated.agreement,
+                    kappa=repeated.kappa,
+                    kappa_ci95=repeated.kappa_ci95,
                 )
             )
     return out

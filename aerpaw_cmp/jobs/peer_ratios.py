@@ -46,8 +46,8 @@ def path_search_ratios(
         at[count] = path_search(poses, count, repeats=3)
         if at[count]["extra_paths"] <= most["extra_paths"]:
             break
-    enough = min(n for n, found in at.items() if found["extra_paths"] <= most["extra_paths"])
-    return {"at": {f"{n:.0e}": found for n, found in sorted(at.items())}, "equal_error": at[enough]}
+    enough = min(n for n, measured in at.items() if measured["extra_paths"] <= most["extra_paths"])
+    return {"at": {f"{n:.0e}": measured for n, measured in sorted(at.items())}, "equal_error": at[enough]}
 
 
 def kriging_shared_weights(fields: int = 27, neighbours: int = 20) -> dict[str, Any] | None:

@@ -114,14 +114,14 @@ class ObjectStore:
         if not by_path:
             return {}
         try:
-            found = self._fs.cat(list(by_path), on_error="omit")
+            contents = self._fs.cat(list(by_path), on_error="omit")
         except FileNotFoundError:
             return {}
         except Exception as error:
             raise _unreachable(self.url, error) from error
-        if not isinstance(found, Mapping):  # one path gives its content alone
-            return {next(iter(by_path.values())): bytes(found)}
-        return {by_path[path]: bytes(content) for path, content in found.items() if path in by_path}
+        if not isinstance(contents, Mapping):  # one path gives its content alone
+            return {next(iter(by_path.values())): bytes(contents)}
+        return {by_path[path]: bytes(content) for path, content in contents.items() if path in by_path}
 
     def write(self, name: str, content: bytes) -> None:  # noqa: D102
         path = self._path(name)
@@ -188,11 +188,11 @@ def check_place(place: Place) -> None:
     name, content = f"probe-{uuid.uuid4().hex}", hashlib.sha256(os.urandom(8)).digest()
     try:
         place.write(name, content)
-        found = place.read(name)
+        read_back = place.read(name)
     except Exception as error:
         raise _unusable(place.url, error) from None
     place.remove(name)
-    if found != content:
+    if read_back != content:
         raise UsageError(f"outcomes cannot be kept in {place.url}: a probe did not come back as it was written")
 
 

@@ -17,16 +17,16 @@ POSES = 300
 
 def pose_paths(data: FlightData, replays: FlightReplay, limit: int = POSES) -> tuple[PosePaths, ...]:
     """Paths of each tower's first series at about ``limit`` of its poses, spread over the flight."""
-    found: dict[str, PosePaths] = {}
+    by_tower: dict[str, PosePaths] = {}
     every: list[RssSeries | RankSeries] = [*data.rss, *data.rank]
     for series, replayed in zip(every, replays.all, strict=True):
-        if series.tower not in found and replayed.valid.any():
+        if series.tower not in by_tower and replayed.valid.any():
             poses = np.unique(np.linspace(0, len(replayed.poses) - 1, limit).astype(np.int64))
             time = series.time[replayed.valid][poses]
             tower_m = np.broadcast_to(replayed.source_m(data.site), replayed.poses.position_m.shape)
             lines = tuple(tuple(_lines(replayed, pose, tower_m[pose])) for pose in poses)
-            found[series.tower] = PosePaths(tower=series.tower, time=time, lines=lines)
-    return tuple(found.values())
+            by_tower[series.tower] = PosePaths(tower=series.tower, time=time, lines=lines)
+    return tuple(by_tower.values())
 
 
 def _lines(replayed: Replayed, pose: int, tower_m: FloatArray) -> Iterator[tuple[FloatArray, int]]:

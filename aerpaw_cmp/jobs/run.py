@@ -32,17 +32,17 @@ def mapping(pairs: list[str]) -> dict[str, Any]:
     UsageError
         If a pair is none, or two name one quantity.
     """
-    found: dict[str, str] = {}
+    columns: dict[str, str] = {}
     for pair in pairs:
         column, mark, quantity = pair.rpartition("=")
         quantity = {"rank": "ri_raw"}.get(quantity.strip(), quantity.strip())
         if not mark or not column or not quantity:
             raise UsageError(f"--map {pair!r}", expected="COLUMN=quantity, e.g. --map 'Power (dBm)=rss_db'")
-        if quantity in found:
+        if quantity in columns:
             raise UsageError(f"--map names two columns for {quantity!r}", expected="one column per quantity")
-        found[quantity] = column.strip()
-    kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in found), "telemetry")
-    return {"columns": found, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}
+        columns[quantity] = column.strip()
+    kind = next((kind for quantity, kind in _KIND_OF.items() if quantity in columns), "telemetry")
+    return {"columns": columns, "kind": kind, **({"ri_base": "one"} if kind == "rank" else {})}
 
 
 def run_ingest(
@@ -244,14 +244,14 @@ def run_report(
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
         replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
-        found = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(found, other_inputs(settings, flight, logs_root), stages)
+        ran = run_flight(data, stages, replays=replays, ladder=True)
+        record = report_record(ran, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
             refuse_changed(same_inputs, record.inputs)
         if target is not None:
-            target.write(sealed(recommended_text(load_flight(flight), found.ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight), ran.ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)
@@ -431,13 +431,13 @@ def run_bench(
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)
     rows = speed_against_error(site, link, some, samples=samples, progress=progress)
-    found = _against_peers(progress) if ratios else {}
+    measured = _against_peers(progress) if ratios else {}
     return {
         "conditions": {"poses": poses, "towers": names, "buildings": len(site.buildings), "cpus": os.cpu_count()},
         "replay": {"rows": [row.as_dict() for row in rows]},
-        "ratios": {name: value["ratio"] for name, value in found.items() if value is not None and "ratio" in value},
-        "report": found.get("report"),
-        "details": found,
+        "ratios": {name: value["ratio"] for name, value in measured.items() if value is not None and "ratio" in value},
+        "report": measured.get("report"),
+        "details": measured,
     }
 
 
@@ -449,7 +449,7 @@ def _against_peers(progress: Progress) -> dict[str, Any]:
     searches = peers.path_search_ratios()
     progress("Kriging against PyKrige")
     shared = peers.kriging_shared_weights()
-    found: dict[str, Any] = {
+    measured: dict[str, Any] = {
         "path_search_image_vs_sionna_equal_error": searches["equal_error"],
         "path_search_image_vs_sionna_1e6": searches["at"]["1e+06"],
         "kriging_vs_pykrige_c_one_field": shared and {**shared, "ratio": shared["ratio_one_field"]},
@@ -458,10 +458,10 @@ def _against_peers(progress: Progress) -> dict[str, Any]:
     }
     progress("ingest against pandas")
     for lines, value in peers.ingest_at_sizes().items():
-        found["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
+        measured["ingest_vs_pandas" if lines == peers.LINES else f"ingest_vs_pandas_{lines // 1_000_000}m"] = value
     progress("a report, cold and warm")
-    found["report"] = peers.report_cold_and_warm()
-    return found
+    measured["report"] = peers.report_cold_and_warm()
+    return measured
 
 
 def run_site_import(
@@ -594,18 +594,18 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
     # paths join the centres of the arrays: which elements they have does not matter
     link = Link(settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
     crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
-    found = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
+    paths = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
     loss = path_loss(site, settings.rt, link.carrier_hz)
     if settings.rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
-        found = found.select(np.isfinite(loss(found, sources, point)))
+        paths = paths.select(np.isfinite(loss(paths, sources, point)))
     lines = []
-    for index in range(len(found)):
-        corners = found.vertices_m[index][np.isfinite(found.vertices_m[index]).all(axis=1)]
-        source = site.towers[towers[found.tower[index]]].position_m
-        count, off = int(found.depth[index]), ", one off a crown" if found.off_crown[index] else ""
-        label = f"{towers[found.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
+    for index in range(len(paths)):
+        corners = paths.vertices_m[index][np.isfinite(paths.vertices_m[index]).all(axis=1)]
+        source = site.towers[towers[paths.tower[index]]].position_m
+        count, off = int(paths.depth[index]), ", one off a crown" if paths.off_crown[index] else ""
+        label = f"{towers[paths.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
 
@@ -647,8 +647,8 @@ def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int
             roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
             rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
         pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
-        found = replay_poses(site, settings.rt, link, pose, engine="image")
-        rank = int(channel_rank(found.h[0, 0], k))
+        replayed = replay_poses(site, settings.rt, link, pose, engine="image")
+        rank = int(channel_rank(replayed.h[0, 0], k))
         return rank or None
 
     return predict_along(follower, rank_at)
@@ -1037,11 +1037,13 @@ def run_calibrate(
         else:
             path, logs_root = (path, logs_root) if scheduler is None else (absolute(path), absolute(logs_root))
             with open_workers(workers, scheduler, paths=[path], progress=progress) as crew:
-                found = calibrate(path, logs_root=logs_root, stages=stages, workers=crew)
+                calibration = calibrate(path, logs_root=logs_root, stages=stages, workers=crew)
             if ranked is not None:
-                found = replace(found, rank=ranked.metrics(), warnings=(*found.warnings, *ranked.warnings))
+                calibration = replace(
+                    calibration, rank=ranked.metrics(), warnings=(*calibration.warnings, *ranked.warnings)
+                )
             with output.filling() as place:
-                record, text = write_files(found, place, folder.name, stages.seconds)
+                record, text = write_files(calibration, place, folder.name, stages.seconds)
                 if ranked is not None:
                     (place / "receiver.json").write_text(ranked.text(), encoding="utf-8")
             metrics = calibration_metrics(record)

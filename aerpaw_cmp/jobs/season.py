@@ -64,11 +64,11 @@ def with_season(data: CampaignData, reports: Mapping[str, str] | None = None) ->
 
 def started_of(rows: Iterable[RssRow]) -> dict[str, int]:
     """First instant of each flight [ns after 1970-01-01]; none where its logs have relative times only."""
-    found: dict[str, int] = {}
+    starts: dict[str, int] = {}
     for row in rows:
         if row.start_ns and has_wall_clock(np.datetime64(row.start_ns, "ns")):
-            found[row.flight] = min(row.start_ns, found.get(row.flight, row.start_ns))
-    return found
+            starts[row.flight] = min(row.start_ns, starts.get(row.flight, row.start_ns))
+    return starts
 
 
 def _iso(ns: int) -> str:
@@ -138,11 +138,11 @@ def rank_settings(
             table[row.setting].setdefault(row.flight, {})[row.link] = error_of(row)
     means = {name: np.array([np.mean(list(by.values())) for by in table[name].values()]) for name in settings}
     known = sorted((name for name in settings if len(means[name])), key=lambda name: float(means[name].mean()))
-    found = []
+    choices = []
     for name in known:
         difference = mean_of_flights(_paired(table[name], table[known[0]], flights))
         low, *middle, high = (float(v) for v in np.quantile(means[name], (0.0, *QUANTILES, 1.0)))
-        found.append(
+        choices.append(
             SettingRank(
                 setting=name,
                 link=link,
@@ -155,17 +155,17 @@ def rank_settings(
                 verdict="first" if name == known[0] else verdict_of(difference),
             )
         )
-    return found
+    return choices
 
 
 def _paired(one: Mapping[str, Any], other: Mapping[str, Any], flights: Sequence[str]) -> FloatArray:
     """Mean difference on the links that both settings scored, per flight, in the order of the dates."""
-    found = []
+    differences = []
     for flight in flights:
         both = sorted(set(one.get(flight, ())) & set(other.get(flight, ())))
         if both:
-            found.append(float(np.mean([one[flight][link] - other[flight][link] for link in both])))
-    return np.array(found)
+            differences.append(float(np.mean([one[flight][link] - other[flight][link] for link in both])))
+    return np.array(differences)
 
 
 def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
@@ -174,14 +174,14 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
     for row in rows:
         if np.isfinite(row.offset_db):
             groups.setdefault((row.setting, row.tower, row.channel), []).append(row)
-    found = []
+    made = []
     for (setting, tower, channel), members in groups.items():
         days = [started.get(row.flight, np.nan) / DAY_NS for row in members]
         # not the offsets themselves: three flights whose rounded offsets lie on a line would have no uncertainty
         exact = np.array([mean_difference_db(row) for row in members])
         offsets = np.array([row.offset_db for row in members])
         line = trend(days, exact)
-        found.append(
+        made.append(
             Drift(
                 setting=setting,
                 tower=tower,
@@ -193,7 +193,7 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
                 spread_db=float(offsets.std(ddof=1)) if len(offsets) > 1 else float("nan"),
             )
         )
-    return found
+    return made
 
 
 # --- places -----------------------------------------------------------------------------------------------------------
@@ -201,14 +201,14 @@ def drifts(rows: Sequence[RssRow], started: Mapping[str, int]) -> list[Drift]:
 
 def place_maps(rows: Sequence[RssRow], cell_m: float) -> list[PlaceMap]:
     """Mean residual of each cell of the plan over flights: of every tower and channel, and of all together."""
-    found: dict[tuple[str, str], dict[tuple[int, int], list[float]]] = {}
+    residuals: dict[tuple[str, str], dict[tuple[int, int], list[float]]] = {}
     for row in rows:
         for cell, (residual, _) in place_means(row, cell_m).items():
             for key in ((row.tower, row.channel), ("", "")):
-                found.setdefault(key, {}).setdefault(cell, []).append(residual)
-    if len(found) == 2:  # one link: all together is the same
-        found.pop(("", ""))
-    return [_place_map(tower, channel, cells, cell_m) for (tower, channel), cells in found.items()]
+                residuals.setdefault(key, {}).setdefault(cell, []).append(residual)
+    if len(residuals) == 2:  # one link: all together is the same
+        residuals.pop(("", ""))
+    return [_place_map(tower, channel, cells, cell_m) for (tower, channel), cells in residuals.items()]
 
 
 def _place_map(tower: str, channel: str, cells: Mapping[tuple[int, int], list[float]], cell_m: float) -> PlaceMap:
@@ -243,15 +243,15 @@ def find_reports(flights: Iterable[str], folder: Path, beside: Sequence[Path]) -
     dict
         A folder whose metrics.json is of another flight is no report of this one.
     """
-    found: dict[str, str] = {}
+    reports: dict[str, str] = {}
     for name in flights:
         for place in beside:
             page = place / name / "report.html"
             if page.is_file() and _flight_of(page.with_name("metrics.json")) == name:
                 relative = Path(os.path.relpath(page.resolve(), folder.resolve())).as_posix()
-                found[name] = quote(relative)
+                reports[name] = quote(relative)
                 break
-    return found
+    return reports
 
 
 def _flight_of(path: Path) -> str | None:

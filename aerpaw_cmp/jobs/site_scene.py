@@ -166,17 +166,17 @@ def _towers(towers: Sequence[str], frame: SiteFrame, low: Any, high: Any) -> dic
             expected="--tower name=east,north,height (metres in the scene; may be repeated), or --base SITE",
             cause=f"the scene reaches from {low[0]:.0f} to {high[0]:.0f} m east, {low[1]:.0f} to {high[1]:.0f} m north",
         )
-    found: dict[str, Any] = {}
+    by_name: dict[str, Any] = {}
     for text in towers:
         name, place = _pair(text, "--tower", "BS=10,20,25")
         east, north, up = _numbers(place, (3,), f"--tower {name}", "--tower name=east,north,height")
         latitude, longitude = frame.to_geographic(east, north)
-        found[name] = {
+        by_name[name] = {
             "latitude_deg": round(float(latitude), 10),
             "longitude_deg": round(float(longitude), 10),
             "antenna_height_m": up,
         }
-    return found
+    return by_name
 
 
 def run_site_export(site: str, out: Path, *, trees: bool = True, force: bool = False) -> list[Path]:

@@ -93,13 +93,13 @@ def rss_alternatives(site: Site, rt: RtSettings, replayed: Replayed, field: RssF
             if mode != rt.attitude:
                 rotation = attitude_rotation(replayed.track, mode)
                 changed[name] = (link, Poses(replayed.poses.position_m, np.ascontiguousarray(rotation)))
-    found = {
+    levels = {
         name: level_dbm(other, evaluate(site, replayed, loss, link=other, poses=poses), field)
         for name, (other, poses) in changed.items()
     }
     for name, fields in foliage_alternatives(site, rt, replayed).items():
-        found[name] = level_dbm(link, fields, field)
-    return found
+        levels[name] = level_dbm(link, fields, field)
+    return levels
 
 
 def _with_patterns(link: Link, change: Any) -> Link:
@@ -124,10 +124,10 @@ def foliage_alternatives(site: Site, rt: RtSettings, replayed: Replayed) -> dict
         return evaluate(site, replayed, loss)
 
     foliage = "attenuating" if rt.foliage == "none" else rt.foliage
-    found = {"without trees": with_trees("none")}
+    fields = {"without trees": with_trees("none")}
     for leaves in LEAVES:
-        found[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = with_trees(foliage, leaves)
-    return found
+        fields[f"trees {leaves} leaf".replace("out leaf", "out of leaf")] = with_trees(foliage, leaves)
+    return fields
 
 
 def foliage_notes(trees: int, rt: RtSettings, carriers_hz: Collection[float]) -> tuple[str, ...]:
@@ -164,19 +164,19 @@ def foliage_rss_difference(levels: Mapping[str, FloatArray]) -> dict[str, Foliag
     bare = levels.get("without trees")
     if bare is None:
         return {}
-    found = {}
+    losses = {}
     for name in ("trees in leaf", "trees out of leaf"):
         with np.errstate(invalid="ignore"):
             loss = bare - levels[name]
         known = np.isfinite(loss)
-        found[name.replace(" ", "_")] = FoliageLoss(
+        losses[name.replace(" ", "_")] = FoliageLoss(
             n=int(known.sum()),
             n_blocked=int((np.isfinite(bare) & ~np.isfinite(levels[name])).sum()),
             mean_loss_db=float(loss[known].mean()) if known.any() else float("nan"),
             largest_loss_db=float(loss[known].max()) if known.any() else float("nan"),
             share_above_1_db=float((np.abs(loss[known]) > 1.0).mean()) if known.any() else float("nan"),
         )
-    return found
+    return losses
 
 
 PairedRanks = dict[str, dict[float, IntArray]]
@@ -203,7 +203,7 @@ def foliage_ranks(site: Site, rt: RtSettings, replayed: Replayed, keep: IntArray
     dict of str to dict of float to (m,) int
         By run and K; empty without a paired run.
     """
-    return {name: _ranks(found.h[keep, 0], ks) for name, found in foliage_alternatives(site, rt, replayed).items()}
+    return {name: _ranks(fields.h[keep, 0], ks) for name, fields in foliage_alternatives(site, rt, replayed).items()}
 
 
 def foliage_rank_difference(paired: PairedRanks) -> dict[str, dict[str, FoliageRankChange]]:

@@ -472,16 +472,16 @@ def check_workers(client: Any, paths: Sequence[Path], keep: str | None = None) -
     if keep is not None:
         open_place(keep).write(probe, b"seen?")
     try:
-        found = client.run(worker_facts, texts, keep, probe, on_error="return")
+        answers = client.run(worker_facts, texts, keep, probe, on_error="return")
     finally:
         if keep is not None:
             open_place(keep).remove(probe)
     here = worker_facts([])
-    wrong = [f"{worker}: {text}" for worker, facts in found.items() if (text := _trouble(facts, here))]
+    wrong = [f"{worker}: {text}" for worker, facts in answers.items() if (text := _trouble(facts, here))]
     if wrong:
         more = f"; and {len(wrong) - 4} more" if len(wrong) > 4 else ""
         raise UsageError(
-            f"{len(wrong)} of {len(found)} workers cannot do this campaign: " + "; ".join(wrong[:4]) + more,
+            f"{len(wrong)} of {len(answers)} workers cannot do this campaign: " + "; ".join(wrong[:4]) + more,
             expected="the same aerpaw-cmp on every worker, and the same files under the same paths",
             cause="another environment, or a disk that is not mounted there",
         )

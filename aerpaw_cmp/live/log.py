@@ -467,9 +467,9 @@ def segments(source: Path) -> list[Path]:
         If there is none.
     """
     if source.is_dir():
-        found = sorted(source.glob("tap_*.jsonl"))
-        if found:
-            return found
+        files = sorted(source.glob("tap_*.jsonl"))
+        if files:
+            return files
         raise InputError("no tap log in this folder", expected="tap_*.jsonl files", path=source)
     if not source.exists():
         raise InputError("no such file", expected="a tap log or its folder", path=source)

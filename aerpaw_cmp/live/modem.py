@@ -508,9 +508,9 @@ class Redactor:
         if whole:
             self.count += 1
             return text[: whole.end()] + ": <redacted>"
-        cleaned, found = _PERSONAL.subn("<redacted>", text)
+        cleaned, count = _PERSONAL.subn("<redacted>", text)
         if cut:
             cleaned, more = _CUT_NUMBER.subn("<redacted>", cleaned)
-            found += more
-        self.count += found
+            count += more
+        self.count += count
         return cleaned

@@ -105,24 +105,24 @@ def _entries(folder: Path, pattern: str) -> list[Path]:
 def find_candidates(roots: Roots | None = None) -> list[PortInfo]:
     """AT ports of Quectel modems, the likeliest first: by-id names, then USB interface numbers, then PCIe nodes."""
     roots = roots or Roots()
-    found: list[PortInfo] = []
+    ports: list[PortInfo] = []
     for interface in AT_INTERFACES:
         for link in _entries(roots.dev / "serial/by-id", f"*[Qq]uectel*-if{interface}*"):
             if link.exists():
                 usb = _usb_of(link.resolve().name, roots)
-                found.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
-    known = {port.device for port in found}
+                ports.append(PortInfo(link, link.resolve(), "by-id", interface, usb[0] if usb else None))
+    known = {port.device for port in ports}
     ttys = sorted(_entries(roots.sys / "class/tty", "ttyUSB*"), key=lambda p: (len(p.name), p.name))
     for interface in AT_INTERFACES:
         for tty in ttys:
             usb = _usb_of(tty.name, roots)
             node = roots.dev / tty.name
             if usb and usb[0].startswith(QUECTEL_VENDOR) and usb[1] == interface and node.resolve() not in known:
-                found.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
+                ports.append(PortInfo(node, node.resolve(), "usb", interface, usb[0]))
     for name in ("mhi_DUN", "smd11"):
         if (roots.dev / name).exists():
-            found.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
-    return found
+            ports.append(PortInfo(roots.dev / name, roots.dev / name, "node"))
+    return ports
 
 
 def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
@@ -141,10 +141,10 @@ def find_port(port: str | Path | None, roots: Roots | None = None) -> PortInfo:
     roots = roots or Roots()
     _refuse_url(port)
     if port is None:
-        found = find_candidates(roots)
-        if not found:
+        candidates = find_candidates(roots)
+        if not candidates:
             raise PortGoneError("no AT port of a Quectel modem (USB 2c7c, interface 02 or 03) is there")
-        return found[0]
+        return candidates[0]
     path = Path(port)
     if not path.exists():
         raise PortGoneError(f"{path} is not there")
@@ -163,10 +163,10 @@ _URL = re.compile(r"([A-Za-z][A-Za-z0-9+.]{1,12})://(.*)", re.DOTALL)
 
 def _refuse_url(port: str | Path | None) -> None:
     """The tap opens devices itself (see the head of this file); what pyserial calls a URL is refused by name."""
-    found = _URL.fullmatch(port) if isinstance(port, str) else None
-    if found is None:
+    match = _URL.fullmatch(port) if isinstance(port, str) else None
+    if match is None:
         return
-    kind, rest = found[1].lower(), found[2]
+    kind, rest = match[1].lower(), match[2]
     bridge = {
         "socket": f"socat pty,link=/tmp/modem,rawer tcp:{rest or 'HOST:PORT'}",
         "loop": "aerpaw-cmp modem-sim --link /tmp/modem",
@@ -185,7 +185,7 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
         wanted = path.stat().st_rdev
     except OSError:
         return []
-    found: dict[int, Holder] = {}
+    by_pid: dict[int, Holder] = {}
     for process in Path("/proc").iterdir():
         if not process.name.isdigit() or (others_only and int(process.name) == os.getpid()):
             continue
@@ -196,8 +196,8 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
                     # the master of a pseudo-terminal has another device number, so only openers of the port count
                     if stat.S_ISCHR(target.st_mode) and target.st_rdev == wanted:
                         name = (process / "comm").read_text().strip()
-                        found[int(process.name)] = Holder(int(process.name), name)
-    return sorted(found.values(), key=lambda h: h.pid)
+                        by_pid[int(process.name)] = Holder(int(process.name), name)
+    return sorted(by_pid.values(), key=lambda h: h.pid)
 
 
 def modem_manager() -> Holder | None:

@@ -41,10 +41,10 @@ class PredictionWorker:
 
     def results(self) -> list[dict[str, Any]]:
         """Finished predictions, each with measured rank and residual (measured - predicted)."""
-        found = []
+        done = []
         while self._done:
-            found.append(self._done.popleft())
-        return found
+            done.append(self._done.popleft())
+        return done
 
     def close(self) -> None:
         """Finish what is asked for, at most 2 s long."""

@@ -267,22 +267,22 @@ class Tap:
         roots, last = self._settings.roots, self._info
         if last is None:
             named = self._settings.port
-            found = find_candidates(roots) if named is None else []
-            return found or [find_port(named, roots)]
-        found = []
+            ports = find_candidates(roots) if named is None else []
+            return ports or [find_port(named, roots)]
+        ports = []
         try:
             now = find_port(last.path, roots)
             if now.interface == last.interface:  # else the number now belongs to another port of the modem
-                found.append(now)
+                ports.append(now)
         except PortGoneError:
             pass
         if last.product is not None:
-            known = {port.device for port in found}
+            known = {port.device for port in ports}
             others = [p for p in find_candidates(roots) if p.product == last.product and p.device not in known]
-            found += sorted(others, key=lambda port: port.interface != last.interface)
-        if not found:
+            ports += sorted(others, key=lambda port: port.interface != last.interface)
+        if not ports:
             raise PortGoneError(f"{last.path} is not there")
-        return found
+        return ports
 
     def _open_and_probe(self, info: PortInfo) -> None:
         self._leave_framer()

@@ -62,10 +62,10 @@ class LogWriter:
 
     def messages(self) -> list[str]:
         """What happened to the disk since the last call."""
-        found = []
+        taken = []
         while self._messages:
-            found.append(self._messages.popleft())
-        return found
+            taken.append(self._messages.popleft())
+        return taken
 
     def open(self) -> None:
         """Open the log; raises ``InputError`` as :meth:`SegmentLog.open` does."""

@@ -62,9 +62,9 @@ def _hidden(name: str) -> bool:
 
 def _zip(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
     book = zipfile.ZipFile(io.BytesIO(data))
-    found = [one for one in book.infolist() if not one.is_dir() and not _hidden(one.filename)]
-    _check(len(found), sum(one.file_size for one in found), path)
-    for one in sorted(found, key=lambda one: one.filename):
+    members = [one for one in book.infolist() if not one.is_dir() and not _hidden(one.filename)]
+    _check(len(members), sum(one.file_size for one in members), path)
+    for one in sorted(members, key=lambda one: one.filename):
         yield one.filename, lambda one=one: _unzipped(book, one, path)  # type: ignore[misc]
 
 
@@ -86,9 +86,9 @@ def _unzipped(book: zipfile.ZipFile, one: zipfile.ZipInfo, path: str | Path) -> 
 
 def _tar(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
     book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
-    found = [one for one in book.getmembers() if one.isreg() and not _hidden(one.name)]
-    _check(len(found), sum(one.size for one in found), path)
-    for one in sorted(found, key=lambda one: one.name):
+    members = [one for one in book.getmembers() if one.isreg() and not _hidden(one.name)]
+    _check(len(members), sum(one.size for one in members), path)
+    for one in sorted(members, key=lambda one: one.name):
         yield one.name, lambda one=one: _untarred(book, one)  # type: ignore[misc]
 
 

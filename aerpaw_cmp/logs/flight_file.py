@@ -211,8 +211,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
     try:
         with h5py.File(place, "r") as book:
-            found, version = book.attrs.get("format"), book.attrs.get("version")
-            if found != FORMAT:
+            form, version = book.attrs.get("format"), book.attrs.get("version")
+            if form != FORMAT:
                 raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
             if version != VERSION:
                 raise InputError(

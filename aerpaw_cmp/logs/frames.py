@@ -34,10 +34,10 @@ class Logs(dict[str, pd.DataFrame]):
         self.files = files
         streams = [(Path(file.path).name, file, stream) for file in files for stream in file.result.streams]
         names = [stream.name for _, _, stream in streams]
-        found: dict[str, pd.DataFrame] = {}
+        frames: dict[str, pd.DataFrame] = {}
         for file_name, file, stream in streams:
             key = stream.name if names.count(stream.name) == 1 else f"{file_name}:{stream.name}"
-            if key in found:  # two files of one name in two folders
+            if key in frames:  # two files of one name in two folders
                 key = f"{file.path}:{stream.name}"
             frame = stream.frame.copy(deep=False)
             frame.attrs = {
@@ -46,8 +46,8 @@ class Logs(dict[str, pd.DataFrame]):
                 "reader": file.result.reader,
                 "file": file.path,
             }
-            found[key] = frame
-        super().__init__(found)
+            frames[key] = frame
+        super().__init__(frames)
 
     @property
     def account(self) -> dict[str, Any]:

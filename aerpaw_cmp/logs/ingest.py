@@ -149,18 +149,18 @@ def ingest(
     for path in [paths] if isinstance(paths, (str, Path)) else paths:
         place = Path(path)
         if _is_folder(place):
-            found, left = _folder(place, options, chosen)
+            inside, left = _folder(place, options, chosen)
         elif _is_archive(place):
-            found, left = _archive(place, options, chosen)
+            inside, left = _archive(place, options, chosen)
         elif chosen is None and _head(place).startswith(_HDF5):
             files += read_flight(place)
             continue
         else:
             files.append(read_file(place, options=options, reader=chosen))
             continue
-        files += join(found)
+        files += join(inside)
         skipped += left
-        if not found:
+        if not inside:
             known = "a reader knows" if chosen is None else f"reader {chosen.name!r} can read"
             looked = "1 file" if len(left) == 1 else f"{len(left)} files"
             first = f"; {one_line(Path(left[0].path).name)}: {left[0].reason}" if left else ""
@@ -340,8 +340,8 @@ def _member(
         raise InputError("an archive inside an archive: unpack it", path=path)
 
     def beside(other: str) -> bytes | None:
-        found = content.get(f"{name.rpartition('/')[0]}/{other}".lstrip("/"))
-        return None if found is None else found()
+        unpack = content.get(f"{name.rpartition('/')[0]}/{other}".lstrip("/"))
+        return None if unpack is None else unpack()
 
     return _read(path, data, digest, chosen or identify(data, path=str(path)), options, beside)
 
@@ -496,8 +496,8 @@ def _folder(
             continue
         try:
             if _is_archive(place):
-                found, left = _archive(place, options, chosen)
-                files, skipped = files + found, skipped + left
+                inside, left = _archive(place, options, chosen)
+                files, skipped = files + inside, skipped + left
             else:
                 files.append(read_file(place, options=options, reader=chosen))
         except InputError as error:

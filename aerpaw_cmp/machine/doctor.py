@@ -69,14 +69,14 @@ def checks() -> list[Check]:
     ]
 
 
-def as_dict(found: Sequence[Check]) -> dict[str, Any]:
+def as_dict(checks: Sequence[Check]) -> dict[str, Any]:
     """What ``doctor --json`` prints: ``{"ready": bool, "checks": [{name, status, found, remedy}]}``."""
-    return {"ready": ready(found), "checks": [asdict(check) for check in found]}
+    return {"ready": ready(checks), "checks": [asdict(check) for check in checks]}
 
 
-def ready(found: Sequence[Check]) -> bool:
+def ready(checks: Sequence[Check]) -> bool:
     """Whether no check failed (warnings are allowed)."""
-    return all(check.status != "fail" for check in found)
+    return all(check.status != "fail" for check in checks)
 
 
 def python_check(version: tuple[int, ...] = sys.version_info[:3]) -> Check:

@@ -179,10 +179,10 @@ def candidates(environ: Mapping[str, str] = os.environ) -> list[Library]:
         paths = [path for folder in folders.split(os.pathsep) for path in Path(folder).glob("libLLVM*")]
     else:
         paths = _system_paths()
-    found: dict[Path, Library] = {}
+    by_path: dict[Path, Library] = {}
     for library in filter(None, map(_library, paths)):  # one file under several names: the one that tells the release
-        found[library.path] = max(found.get(library.path, library), library, key=lambda one: one.version)
-    return sorted(found.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
+        by_path[library.path] = max(by_path.get(library.path, library), library, key=lambda one: one.version)
+    return sorted(by_path.values(), key=lambda library: (library.version, str(library.path)), reverse=True)
 
 
 def _too_old(version: Sequence[int]) -> str:
@@ -422,8 +422,8 @@ def apt_packages(search_output: str) -> list[str]:
     >>> apt_packages(os.linesep.join(["libllvm14 - x", "libllvm19 - x", "libllvm17t64 - x", "libllvm19-dbg - x"]))
     ['libllvm19', 'libllvm17t64']
     """
-    found = re.findall(r"^(libllvm(\d+)(?:t64)?)\s", search_output + "\n", flags=re.MULTILINE)
-    new_enough = sorted(((int(major), name) for name, major in found if int(major) >= MINIMUM_MAJOR), reverse=True)
+    packages = re.findall(r"^(libllvm(\d+)(?:t64)?)\s", search_output + "\n", flags=re.MULTILINE)
+    new_enough = sorted(((int(major), name) for name, major in packages if int(major) >= MINIMUM_MAJOR), reverse=True)
     return [name for _, name in new_enough]
 
 

@@ -191,8 +191,8 @@ class _Projection:
         first, second = np.triu_indices(len(axis), 1)
         grid = np.column_stack([axis[second], axis[first]])
         cost = (self.amplitudes(grid)[1] ** 2).sum(axis=1)
-        found = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:starts]])
-        valley = found[np.argmin((self.amplitudes(found)[1] ** 2).sum(axis=1))]
+        refined = np.stack([self._search(grid[cell], 1e-5) for cell in np.argsort(cost)[:starts]])
+        valley = refined[np.argmin((self.amplitudes(refined)[1] ** 2).sum(axis=1))]
         return np.sort(self._search(valley, 1e-15))[::-1]
 
     def _search(self, start: FloatArray, tolerance: float) -> FloatArray:

@@ -179,18 +179,18 @@ def map_job(
         positions = grid.positions_m(height)
         for start in range(0, n, chunk):
             part = slice(start, min(start + chunk, n))
-            found = evaluate(positions[part], names)
-            _check(found, part.stop - part.start, t)
+            evaluated = evaluate(positions[part], names)
+            _check(evaluated, part.stop - part.start, t)
             if height in at["rss"]:
                 row = at["rss"].index(height)
-                rss[0, row, :, part] = found.rss_siso_dbm.T
-                rss[1, row, :, part] = found.rss_mimo_dbm.T
+                rss[0, row, :, part] = evaluated.rss_siso_dbm.T
+                rss[1, row, :, part] = evaluated.rss_mimo_dbm.T
             if height in at["rank"]:
                 row = at["rank"].index(height)
                 rank[row, :, :, part] = np.moveaxis(
-                    rank_of_singular_values(found.singular_values, ks), (0, 1, 2), (2, 1, 0)
+                    rank_of_singular_values(evaluated.singular_values, ks), (0, 1, 2), (2, 1, 0)
                 )
-                ratio[:, row, :, part] = np.moveaxis(_ratios_db(found.singular_values), (1, 2), (2, 1))
+                ratio[:, row, :, part] = np.moveaxis(_ratios_db(evaluated.singular_values), (1, 2), (2, 1))
             if progress is not None:
                 progress((step * n + part.stop) / (len(heights) * n))
     area = (grid.east_m[0], grid.east_m[-1], grid.north_m[0], grid.north_m[-1])
@@ -229,8 +229,8 @@ def _ratios_db(singular_values: FloatArray) -> FloatArray:
     return np.stack([np.where(covered, strongest - db_from_power(sigma[..., i] ** 2), np.nan) for i in (1, -1)])
 
 
-def _check(found: Evaluation, n: int, towers: int) -> None:
-    shapes = found.rss_siso_dbm.shape, found.rss_mimo_dbm.shape, found.singular_values.shape[:2]
+def _check(evaluated: Evaluation, n: int, towers: int) -> None:
+    shapes = evaluated.rss_siso_dbm.shape, evaluated.rss_mimo_dbm.shape, evaluated.singular_values.shape[:2]
     if set(shapes) != {(n, towers)}:
         raise ValueError(f"the engine returned shapes {shapes} for {n} positions and {towers} towers")
 
@@ -270,22 +270,22 @@ def foliage_difference(without: MapResult, foliage: MapResult) -> FoliageDiffere
 
 def layers_of(result: MapResult, *, towers_too: bool = False) -> list[Layer]:
     """Maps of a result as layers: joint ones, and with ``towers_too`` those of each tower alone."""
-    found = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
+    layers = [Layer("serving_tower", result.serving, "1", "Serving tower", result.tower_names)]
     for tower in (None, *(result.tower_names if towers_too else ())):
-        found += _rss_layers(result, tower)
-        found += _rank_layers(result, tower)
-    return found
+        layers += _rss_layers(result, tower)
+        layers += _rank_layers(result, tower)
+    return layers
 
 
 def _rss_layers(result: MapResult, tower: str | None) -> list[Layer]:
     who, of = _label(tower)
-    found = []
+    layers = []
     kinds: tuple[Antennas, ...] = ("siso", "mimo")
     for antennas in kinds:
         for height, values in zip(result.rss_altitudes_m, result.rss(antennas, tower), strict=True):
             name = f"rss_{antennas}_h{_in_name(height)}m_{who}"
-            found.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
-    return found
+            layers.append(Layer(name, values, "dBm", f"RSS {antennas.upper()}, {height:g} m{of}"))
+    return layers
 
 
 def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
@@ -294,17 +294,17 @@ def _rank_layers(result: MapResult, tower: str | None) -> list[Layer]:
         ("spread", "Singular-value spread s1/s2", result._of(result.spread_db, tower)),
         ("condition", "Condition number s1/s4", result._of(result.condition_db, tower)),
     )
-    ranks, found = result.ranks(tower), []
+    ranks, layers = result.ranks(tower), []
     for row, height in enumerate(result.rank_altitudes_m):
         at = f"h{_in_name(height)}m_{who}"
         for column, k in enumerate(result.ks):
             title = f"Rank, K = {k:g}, {height:g} m{of}"
-            found.append(
+            layers.append(
                 Layer(f"rank_k{_in_name(k, 0)}_{at}", ranks[row, column], "1", title, class_names(HIGHEST_RANK))
             )
         for name, title, values in ratios:
-            found.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
-    return found
+            layers.append(Layer(f"{name}_{at}", values[row], "dB", f"{title}, {height:g} m{of}"))
+    return layers
 
 
 def _label(tower: str | None) -> tuple[str, str]:

@@ -96,14 +96,14 @@ def _fill_nearest(
     while len(todo):
         wanted = min(wanted, len(samples_m))
         bound = radius_m + TIE_M
-        found, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=bound)
-        exhausted = (wanted == len(samples_m)) | ~np.isfinite(found[:, -1])
-        last = _in_micrometres(found[:, -1])
+        away, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=bound)
+        exhausted = (wanted == len(samples_m)) | ~np.isfinite(away[:, -1])
+        last = _in_micrometres(away[:, -1])
         if skip is not None:
-            found[who == skip[todo, None]] = np.inf
-        order = _tie_order(found, np.where(np.isfinite(found), who, 0), samples_m, targets_m[todo])[:, :m]
+            away[who == skip[todo, None]] = np.inf
+        order = _tie_order(away, np.where(np.isfinite(away), who, 0), samples_m, targets_m[todo])[:, :m]
         chosen = np.take_along_axis(who, order, axis=1)
-        chosen_distance = np.take_along_axis(found, order, axis=1)
+        chosen_distance = np.take_along_axis(away, order, axis=1)
         if order.shape[1] == m:
             complete = exhausted | (_in_micrometres(chosen_distance[:, -1]) < last)
         else:
@@ -120,11 +120,11 @@ def _in_micrometres(distance_m: FloatArray) -> FloatArray:
     return np.round(distance_m / TIE_M)
 
 
-def _tie_order(found: FloatArray, who: IntArray, samples_m: FloatArray, targets_m: FloatArray) -> IntArray:
+def _tie_order(distance: FloatArray, who: IntArray, samples_m: FloatArray, targets_m: FloatArray) -> IntArray:
     """Order of candidates by distance, then offset (up, north, east), then number."""
     offset = _in_micrometres(samples_m[who] - targets_m[:, None, :])
     keys = [offset[:, :, axis] for axis in range(offset.shape[2])]
-    return np.lexsort((who, *keys, _in_micrometres(found)), axis=-1)
+    return np.lexsort((who, *keys, _in_micrometres(distance)), axis=-1)
 
 
 def random_within(

@@ -420,18 +420,18 @@ def random_scene(poses: int, *, buildings: int = 12, towers: int = 1, seed: int 
     rng = np.random.default_rng(seed)
     places = rng.uniform(-200, 200, (towers, 2))
     places[0] = 0.0
-    found: list[Building] = []
-    while len(found) < buildings:
+    made: list[Building] = []
+    while len(made) < buildings:
         east, north = rng.uniform(-300, 300, 2)
         half = rng.uniform((5, 5), (20, 12))
         shape = box(east - half[0], north - half[1], east + half[0], north + half[1])
         shape = affinity.rotate(shape, rng.uniform(0, 180))
         near_tower = min(shape.distance(Point(p)) for p in places) < 10
-        if near_tower or any(shape.distance(b.footprint) < 3 for b in found):
+        if near_tower or any(shape.distance(b.footprint) < 3 for b in made):
             continue
-        found.append(Building(f"building {len(found) + 1}", shape, float(rng.uniform(4, 12))))
+        made.append(Building(f"building {len(made) + 1}", shape, float(rng.uniform(4, 12))))
     named = {f"LW{i + 1}": Tower(f"LW{i + 1}", 35.7, -78.7, float(p[0]), float(p[1])) for i, p in enumerate(places)}
-    site = Site("random boxes", SiteFrame(35.7275, -78.696), named, tuple(found))
+    site = Site("random boxes", SiteFrame(35.7275, -78.696), named, tuple(made))
     # a Lissajous curve of 4.6 km crosses the whole field
     along = np.linspace(0.0, 2.0 * np.pi, poses, endpoint=False)
     position = np.column_stack(

@@ -84,20 +84,20 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
 
 
 @njit(**OPTIONS)
-def _opened(tree, node, todo, waiting, found, total):  # type: ignore[no-untyped-def]
+def _opened(tree, node, todo, waiting, hits, total):  # type: ignore[no-untyped-def]
     """The children of a node join the nodes that wait, the items of a leaf those found; how many both are then."""
     _, _, child, start, count, items = tree
     if child[node] >= 0:
         todo[waiting], todo[waiting + 1] = child[node], child[node] + 1
         return waiting + 2, total
     for k in range(start[node], start[node] + count[node]):
-        found[total] = items[k]
+        hits[total] = items[k]
         total += 1
     return waiting, total
 
 
 @njit(**OPTIONS)
-def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
+def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many.
 
     Parameters
@@ -105,7 +105,7 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
     tree : BoxTree
     low, high : (3,)
         Corners of the box [m].
-    found : (items,) int
+    hits : (items,) int
         Gets the items; has room for all of the tree.
 
     Returns
@@ -126,12 +126,12 @@ def overlapping(tree, low, high, found):  # type: ignore[no-untyped-def]
                 out = True
         if out:
             continue
-        waiting, total = _opened(tree, node, todo, waiting, found, total)
+        waiting, total = _opened(tree, node, todo, waiting, hits, total)
     return total
 
 
 @njit(**OPTIONS)
-def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-def]
+def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
@@ -145,7 +145,7 @@ def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-
         How many of them count.
     reach : (10,)
         A point, the corners of a box, and the longest way from the one to the other over a box that counts [m].
-    found : (items,) int
+    hits : (items,) int
         Gets the items; has room for all of the tree.
 
     Returns
@@ -164,7 +164,7 @@ def within_planes(tree, planes, many, reach, found):  # type: ignore[no-untyped-
             continue
         if np.isfinite(reach[9]) and way_over_box(lower, upper, node, reach) > reach[9]:
             continue
-        waiting, total = _opened(tree, node, todo, waiting, found, total)
+        waiting, total = _opened(tree, node, todo, waiting, hits, total)
     return total
 
 

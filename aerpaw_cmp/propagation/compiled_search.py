@@ -75,8 +75,8 @@ def find(
     def run(first: int) -> PathSet:
         last = min(first + POSES_PER_CHUNK, len(targets_m))
         room = rooms.setdefault(get_ident(), _Room(max_depth))
-        found = room.fill(kernels, known, first, last)
-        return _decided(kernels, found, faces, known, hiding)
+        lines = room.fill(kernels, known, first, last)
+        return _decided(kernels, lines, faces, known, hiding)
 
     return in_threads(run, range(0, len(targets_m), POSES_PER_CHUNK), threads)
 
@@ -106,20 +106,20 @@ class _Room:
         while True:
             own = {"numbers": self.numbers, "faces": self.faces, "points": self.points}
             values = {"first_pose": first, "last_pose": last, **own, **known}
-            found = int(kernels.search(*(values[name] for name in kernels.SEARCH_ARGUMENTS)))
-            if found <= len(self.numbers):
+            count = int(kernels.search(*(values[name] for name in kernels.SEARCH_ARGUMENTS)))
+            if count <= len(self.numbers):
                 break
-            self._make(found)
-        taken = tuple(array[:found].copy() for array in own.values())
-        self.faces[:found], self.points[:found] = -1, np.nan
+            self._make(count)
+        taken = tuple(array[:count].copy() for array in own.values())
+        self.faces[:count], self.points[:count] = -1, np.nan
         return taken
 
 
 def _decided(
-    kernels: ModuleType, found: tuple[Any, ...], faces: Faces, known: dict[str, Any], hiding: Occlusion
+    kernels: ModuleType, lines: tuple[Any, ...], faces: Faces, known: dict[str, Any], hiding: Occlusion
 ) -> PathSet:
     """The paths of a run, after polygons and seams had their say."""
-    numbers, sequence, points = found
+    numbers, sequence, points = lines
     flags = numbers[:, 3]
     pose, tower, depth_ = (np.ascontiguousarray(numbers[:, i]) for i in range(3))
     if not flags.any():

@@ -159,15 +159,15 @@ class Crowns:
         hiding = Occlusion(faces, tolerance_m)
         ground = faces.solid[None] < 0 if usable is None else usable & (faces.solid < 0)
         ground = np.broadcast_to(ground, (len(sources_m), len(faces)))
-        found: list[PathSet] = []
+        pieces: list[PathSet] = []
         for tower, source in enumerate(sources_m):
             poses = np.flatnonzero(alive[tower])
             for before, after, plane in _sequences(np.flatnonzero(ground[tower]), max_depth):
                 search = _Search(
                     crowns=self, faces=faces, hiding=hiding, ground=plane, before=before, after=after, dem=dem
                 )
-                found.append(search(source, targets_m, poses, tower, max_depth))
-        paths = merge(found, max_depth, None)
+                pieces.append(search(source, targets_m, poses, tower, max_depth))
+        paths = merge(pieces, max_depth, None)
         return self._with_facets(paths, faces, max_depth)
 
     def beams(self, source_m: FloatArray) -> tuple[_Beams, ...]:
@@ -392,7 +392,7 @@ def _single_bounces(
     point_m : (points, 3)
     """
     none = np.zeros(0, dtype=np.int64)
-    found: list[tuple[IntArray, IntArray, FloatArray]] = [(none, none, np.zeros((0, 3)))]
+    pieces: list[tuple[IntArray, IntArray, FloatArray]] = [(none, none, np.zeros((0, 3)))]
     for beam, target in _candidates(beams, targets_m):
         facet, behind = beams.facet[beam], beams.height_m[beam]
         ahead = np.einsum("ni,ni->n", facets.normal[facet], targets_m[target]) - facets.offset_m[facet]
@@ -401,8 +401,8 @@ def _single_bounces(
         image = beams.image_m[:, beam[good]].T
         point = image + share[:, None] * (targets_m[target] - image)
         good = np.flatnonzero(facets.contain(facet, point, tolerance_m))
-        found.append((facet[good], target[good], point[good]))
-    facet, target, point = (np.concatenate(x) for x in zip(*found, strict=True))
+        pieces.append((facet[good], target[good], point[good]))
+    facet, target, point = (np.concatenate(x) for x in zip(*pieces, strict=True))
     return facet, target, point
 
 

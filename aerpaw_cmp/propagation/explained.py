@@ -123,7 +123,7 @@ def explain_paths(
     seen: list[tuple[str, AnyArray]] = []
     rows = np.arange(len(paths))
     array = next(iter(link.tower_arrays.values()))
-    found = []
+    explained = []
     for row in rows:
         seen.clear()
         one = paths.select(np.array([row]))
@@ -132,8 +132,8 @@ def explain_paths(
             one, np.zeros(1, np.int64), faces, tables, source_m, array, poses, link, lambda *step: seen.append(step)
         )
         further = {name: float(loss[row]) for name, loss in further_db.items()}
-        found.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field, further))
-    return tuple(sorted(found, key=lambda path: -path.level_dbm))
+        explained.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field, further))
+    return tuple(sorted(explained, key=lambda path: -path.level_dbm))
 
 
 def _explained(
@@ -216,9 +216,9 @@ def _elevation_deg(leg: FloatArray) -> float:
     return float(np.degrees(np.arctan2(leg[2], np.hypot(leg[0], leg[1]))))
 
 
-def power_sum_dbm(found: tuple[ExplainedPath, ...]) -> float:
+def power_sum_dbm(paths: tuple[ExplainedPath, ...]) -> float:
     """Level of the paths' powers added [dBm]."""
-    return float(db_from_power(sum(float(power_from_db(path.level_dbm)) for path in found)))
+    return float(db_from_power(sum(float(power_from_db(path.level_dbm)) for path in paths)))
 
 
 # ---------------------------------------------------------------- why not

@@ -78,10 +78,10 @@ def site_faces(site: Site, towers: Sequence[str] = ()) -> Faces:
 @lru_cache(maxsize=4096)
 def _building_faces(building: Building, solid: int) -> tuple[_Face, ...]:
     """Walls and roof; kept, for a replay in parts asks again with each part."""
-    found: list[_Face] = []
+    faces: list[_Face] = []
     for part in _parts(building.footprint):
-        found += [*_walls(building, part, solid), _roof(building, part, solid)]
-    return tuple(found)
+        faces += [*_walls(building, part, solid), _roof(building, part, solid)]
+    return tuple(faces)
 
 
 def _ground(height_m: float, material: str, several: bool) -> _Face:

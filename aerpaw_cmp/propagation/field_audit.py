@@ -195,13 +195,13 @@ class _OneLink:
     def sequence(self, path: int) -> tuple[Mirror, ...] | None:
         """The mirrors of a path of the replay, looked up in the site; None where the site has no such face."""
         faces, vertices = self.replay.paths.faces[path], self.replay.paths.vertices_m[path]
-        found = []
+        mirrors = []
         for face, vertex in zip(faces[faces >= 0].tolist(), vertices, strict=False):
             mirror = _mirror_of(self.reference, self.replay.faces, face, vertex)
             if mirror is None:
                 return None
-            found.append(mirror)
-        return tuple(found)
+            mirrors.append(mirror)
+        return tuple(mirrors)
 
     def paths_checked(self, max_depth: int, complete: bool) -> FieldAudit:
         """Paths that cannot exist, and paths that are not there."""
@@ -438,13 +438,13 @@ def per_pair(
     ranks = [channel_rank(pairs.h, k) != channel_rank(replay.h[chosen], k) for k in ks]
     size = np.abs(pairs.h).max(axis=(2, 3)) + np.abs(replay.h[chosen]).max(axis=(2, 3))
     other = np.abs(pairs.h - replay.h[chosen]).max(axis=(2, 3)) > 1e-9 * size
-    found = FieldAudit(
+    audit = FieldAudit(
         pairs_links=other.size,
         pairs_differ=int(other.sum()),
         pairs_rss_max_db=float(np.nanmax(change, initial=0.0)),
         pairs_rank_differs=int(np.any(ranks, axis=0).sum()),
     )
-    return found + _explicit(site, link, few, int(settings["max_depth"]))
+    return audit + _explicit(site, link, few, int(settings["max_depth"]))
 
 
 EXPLICIT_POSES, EXPLICIT_RANGE_M = 10, 150.0

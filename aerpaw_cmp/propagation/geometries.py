@@ -194,11 +194,11 @@ def basis_fields(
     faces = Faces(np.array([[0.0, 0.0, 1.0]]), np.zeros(1), (material,), ("ground",))
     n = len(poses)
     index, zero = np.arange(n), np.zeros(n, dtype=np.int64)
-    found = []
+    fields = []
     for depth in (0, 1):
         path = PathSet(index, zero, zero + depth, np.full((n, 1), depth - 1), np.full((n, 1, 3), np.nan))
-        found.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link).h[:, 0])
-    return found[0], found[1]
+        fields.append(channel_matrices(path, faces, np.asarray(tower_m)[None, :], poses, link).h[:, 0])
+    return fields[0], fields[1]
 
 
 def _both_slants(array: Array) -> Array:

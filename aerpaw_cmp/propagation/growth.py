@@ -136,7 +136,7 @@ def grow_paths(
     if not 0 <= max_depth <= 3:
         raise UsageError(f"max_depth {max_depth}", expected="0, 1, 2 or 3 reflections")
     started = time.perf_counter()
-    found: list[PathSet] = []
+    pieces: list[PathSet] = []
     effort = Effort()
     margin = SOLID_MARGIN if solids else 0.0
     rules = _Rules(
@@ -163,7 +163,7 @@ def grow_paths(
             longest=longest[tower, poses],
             rules=rules,
         )
-        found.append(_pad(one.direct(), poses, tower, max_depth))
+        pieces.append(_pad(one.direct(), poses, tower, max_depth))
         if max_depth:
             first, hidden = one.first_faces()
 
@@ -175,7 +175,7 @@ def grow_paths(
                 on_estimate(one.estimate(first, thread_count(threads)).times(len(sources_m) - tower))
                 on_estimate = None
             parts, spent = one.run(first, thread_count(threads), share)
-            found += [_pad(part, poses, tower, max_depth) for part in parts]
+            pieces += [_pad(part, poses, tower, max_depth) for part in parts]
             effort = Effort(
                 sequences=effort.sequences + spent.sequences,
                 candidates=effort.candidates + spent.candidates,
@@ -184,7 +184,7 @@ def grow_paths(
             )
         if progress:
             progress((tower + 1) / len(sources_m))
-    paths = merge(found, max_depth, None)
+    paths = merge(pieces, max_depth, None)
     paths = paths if solids else without_coincident(paths, surfaces)
     return paths, Effort(
         sequences=effort.sequences,
@@ -343,7 +343,7 @@ class _Search:
 
     def run(self, first: IntArray, threads: int, share: Progress) -> tuple[list[_Found], Effort]:
         """Follow all sequences that begin with the faces ``first``."""
-        found: list[_Found] = []
+        levels: list[_Found] = []
         totals = np.zeros(2, np.int64)
         begun = time.perf_counter()
         done, estimate = 0, 0.0
@@ -352,14 +352,14 @@ class _Search:
                 depth = (faces >= 0).sum(axis=1)
                 for d in np.unique(depth):
                     rows = depth == d
-                    found.append((pose[rows], faces[rows, :d], points[rows, :d]))
+                    levels.append((pose[rows], faces[rows, :d], points[rows, :d]))
                 totals[:] += counts
             if not done:
                 estimate = (time.perf_counter() - begun) * len(first) / size / max(1, threads)
             done += size
             share(done / len(first))
         spent = time.perf_counter() - begun
-        return found, Effort(sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate, seconds=spent)
+        return levels, Effort(sequences=int(totals[0]), candidates=int(totals[1]), estimate_s=estimate, seconds=spent)
 
 
 def memory_mib(search: _Search) -> float:
@@ -380,8 +380,8 @@ def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int
         at += each * 4 * threads
 
 
-def _pad(found: _Found, poses: IntArray, tower: int, max_depth: int) -> PathSet:
-    pose, sequence, points = found
+def _pad(level: _Found, poses: IntArray, tower: int, max_depth: int) -> PathSet:
+    pose, sequence, points = level
     count, depth = sequence.shape
     faces = np.full((count, max_depth), -1, dtype=np.int64)
     vertices = np.full((count, max_depth, 3), np.nan)

@@ -125,7 +125,7 @@ def find_paths(
         ends = _Ends.of(faces, targets_m, alive[tower], tolerance_m) if few else shared
         return Sequences.of(faces, box, facing, sources_m[tower], ends, usable_faces, max_depth, budget, tolerance_m)
 
-    found: list[PathSet] = []
+    pieces_of_towers: list[PathSet] = []
     in_order = False
     for group, levels in _groups(sequences, len(sources_m)):
         tests = sum(
@@ -141,15 +141,19 @@ def find_paths(
                 compiled_code, faces, plain, sources_m[some], targets_m, alive[some], max_depth, hiding, threads
             )
             in_order = len(group) == len(sources_m)
-            found += pieces if in_order else [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
+            pieces_of_towers += (
+                pieces if in_order else [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
+            )
         else:
             for tower, tree in zip(group, levels, strict=True):
                 poses, source = np.flatnonzero(alive[tower]), sources_m[tower]
                 for level in tree:
-                    found.append(_paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding))
+                    pieces_of_towers.append(
+                        _paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding)
+                    )
         if progress:
             progress((group[-1] + 1) / len(sources_m))
-    return merge(found, max_depth, faces, in_order=in_order)
+    return merge(pieces_of_towers, max_depth, faces, in_order=in_order)
 
 
 def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:

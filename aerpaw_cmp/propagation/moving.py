@@ -170,22 +170,22 @@ def _replay_block(site: Site, link: Link, name: str, poses: Poses, block: _Block
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
     only = np.arange(len(names))[:, None] == block.own[None, :]
-    found = replay(here, several, some, only=None if len(names) == 1 else only, **options)
+    replayed = replay(here, several, some, only=None if len(names) == 1 else only, **options)
     row = np.arange(len(some))
 
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])
 
     return replace(
-        found,
-        rss_dbm=own(found.rss_dbm),
-        rss_power_dbm=own(found.rss_power_dbm),
-        h=own(found.h),
-        has_path=own(found.has_path),
-        pairs_differ=None if found.pairs_differ is None else own(found.pairs_differ),
-        paths=replace(found.paths, tower=np.zeros_like(found.paths.tower)),
+        replayed,
+        rss_dbm=own(replayed.rss_dbm),
+        rss_power_dbm=own(replayed.rss_power_dbm),
+        h=own(replayed.h),
+        has_path=own(replayed.has_path),
+        pairs_differ=None if replayed.pairs_differ is None else own(replayed.pairs_differ),
+        paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
         towers=(name,),
-        left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in found.left_out],
+        left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in replayed.left_out],
     )
 
 
@@ -258,13 +258,13 @@ _COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
 
 def _counted(parts: list[Replay]) -> list[str]:
     """What was left out, each message once; counts at the front of a message are added up."""
-    found: dict[str, list[int]] = {}
+    counts: dict[str, list[int]] = {}
     for text in (text for part in parts for text in part.left_out):
         match = _COUNT.fullmatch(text)
         key, numbers = (match[3], [int(n) for n in match.groups()[:2] if n]) if match else (text, [])
-        kept = found.get(key, [0] * len(numbers))
-        found[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
-    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in found.items()]
+        kept = counts.get(key, [0] * len(numbers))
+        counts[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
+    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in counts.items()]
 
 
 def moving_matrices(
@@ -310,14 +310,14 @@ def moving_matrices(
         names = [f"{name} {i}" for i in range(len(block.places_m))]
         several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
         spots = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
-        found = channel_matrices(
+        matrices = channel_matrices(
             some, faces, block.places_m, spots, several, None if loss_db is None else loss_db[mine],
             work=len(poses) * ports * uav,
         )  # fmt: skip
         rows = np.arange(len(block.rows))
-        h[block.rows] = found.h[rows, block.own][:, None]
-        power[block.rows] = found.power[rows, block.own][:, None]
-        path_power[mine] = found.path_power
+        h[block.rows] = matrices.h[rows, block.own][:, None]
+        power[block.rows] = matrices.power[rows, block.own][:, None]
+        path_power[mine] = matrices.path_power
     return Fields(h, path_power, power)
 
 

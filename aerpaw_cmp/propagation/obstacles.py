@@ -39,10 +39,10 @@ def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray
         _, _, ahead = reflection_points(surfaces, sequence[None], *ends, edge_m=1e9)
         if not ahead[0]:
             return "the ends of a reflection lie on two sides of its face"
-        _, found, good = reflection_points(surfaces, sequence[None], *ends, edge_m=EDGE_M)
+        _, vertices, good = reflection_points(surfaces, sequence[None], *ends, edge_m=EDGE_M)
         if not good[0]:
             return f"a reflection point lies outside {surfaces.faces.label[int(sequence[0])]} or a later face"
-        points = found[0]
+        points = vertices[0]
     obstacle = first_obstacle(surfaces, np.concatenate([source_m[None], points, target_m[None]]), sequence)
     return "" if obstacle is None else f"occluded by {surfaces.faces.label[obstacle]}"
 

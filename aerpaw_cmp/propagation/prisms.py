@@ -71,7 +71,7 @@ def find_paths(
     Effort
     """
     tolerance_m = scene_tolerance_m(faces, sources_m, targets_m if extent_m is None else extent_m)
-    found, effort = grow_paths(
+    paths, effort = grow_paths(
         solid_surfaces(faces, sources_m, targets_m),
         sources_m,
         targets_m,
@@ -87,7 +87,7 @@ def find_paths(
     hiding = Occlusion(faces, tolerance_m)
     pieces = []
     for depth in range(max_depth + 1):
-        some = found.select(found.depth == depth)
+        some = paths.select(paths.depth == depth)
         source, target = sources_m[some.tower], targets_m[some.pose]
         sequence = some.faces[:, :depth]
         vertices, good = trace_back(faces, sequence, images_of(faces, sequence, source), target, tolerance_m)

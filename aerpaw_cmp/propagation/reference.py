@@ -291,7 +291,7 @@ class Mirror:
 
 def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
     """Ground of the tower, then walls and roof of each building."""
-    found = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
+    mirrors = [Mirror((0.0, 0.0, 1.0), tower.ground_m, site.ground_material)]
     for number, building in enumerate(site.buildings):
         foot, top = min(building.base_m, 0.0) - 0.5, building.base_m + building.height_m
         whole = building.footprint if building.footprint.is_valid else shapely.make_valid(building.footprint)
@@ -308,7 +308,7 @@ def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
                     along = ((b[0] - a[0]) / length, (b[1] - a[1]) / length)
                     normal = (along[1], -along[0], 0.0)
                     offset = normal[0] * a[0] + normal[1] * a[1]
-                    found.append(
+                    mirrors.append(
                         Mirror(
                             normal,
                             offset,
@@ -321,8 +321,8 @@ def mirrors_of(site: Site, tower: Tower) -> tuple[Mirror, ...]:
                             solid=number,
                         )
                     )
-            found.append(Mirror((0.0, 0.0, 1.0), top, building.material, roof=part, solid=number))
-    return tuple(found)
+            mirrors.append(Mirror((0.0, 0.0, 1.0), top, building.material, roof=part, solid=number))
+    return tuple(mirrors)
 
 
 class Blocks:
@@ -418,7 +418,7 @@ class Reference:
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
         """All sequences whose images lie on the right sides; None when there are more than the budget."""
         facing = [m for m in self.mirrors if m.height(target) >= -MARGIN_M]
-        found: list[tuple[Mirror, ...]] = [()]
+        grown_so_far: list[tuple[Mirror, ...]] = [()]
         level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
         for depth in range(1, max_depth + 1):
             grown = []
@@ -428,9 +428,9 @@ class Reference:
                         grown.append(((*past, mirror), mirror.mirrored(image)))
             if len(grown) > budget:
                 return None
-            found += [s for s, _ in grown if s[-1] in facing]
+            grown_so_far += [s for s, _ in grown if s[-1] in facing]
             level = grown if depth < max_depth else []
-        return found
+        return grown_so_far
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
         """Whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""
@@ -508,10 +508,10 @@ class Reference:
             size = math.sqrt(_dot(across, across))
         s = (across[0] / size, across[1] / size, across[2] / size)
         p_in, p_out = _cross(s, ray), _cross(s, onward)
-        found = permittivity(mirror.material, self.link.carrier_hz)
-        if found is None:
+        constants = permittivity(mirror.material, self.link.carrier_hz)
+        if constants is None:
             raise LookupError(mirror.material)
-        te, tm = fresnel(cosine, *found, C_MPS / self.link.carrier_hz)
+        te, tm = fresnel(cosine, *constants, C_MPS / self.link.carrier_hz)
         e_s = sum(a * b for a, b in zip(s, wave, strict=True))
         e_p = sum(a * b for a, b in zip(p_in, wave, strict=True))
         e = [te * e_s * s[k] + tm * e_p * p_out[k] for k in range(3)]

@@ -350,7 +350,7 @@ def search(
     int
         Number of paths found.
     """
-    found, room = 0, len(numbers)
+    written, room = 0, len(numbers)
     count = len(normal)
     last, tests, mark = np.empty(len(sequences), np.uint64), np.empty((7, len(sequences))), np.empty(len(sequences))
     last_tests(sequences, depths, images_m, normal, offset_m, along, across, lower, upper, tolerance_m, last, tests)
@@ -400,19 +400,19 @@ def search(
                     flags |= cut
                 if cut == 1:
                     continue
-                if found < room:
-                    numbers[found, 0], numbers[found, 1], numbers[found, 2], numbers[found, 3] = (
+                if written < room:
+                    numbers[written, 0], numbers[written, 1], numbers[written, 2], numbers[written, 3] = (
                         pose,
                         tower,
                         depth,
                         flags,
                     )
                     for step in range(depth):
-                        faces[found, step] = sequences[s, step]
+                        faces[written, step] = sequences[s, step]
                         for i in range(3):
-                            points[found, step, i] = vertices[step, i]
-                found += 1
-    return found
+                            points[written, step, i] = vertices[step, i]
+                written += 1
+    return written
 
 
 SEARCH_ARGUMENTS = tuple(inspect.signature(search.py_func).parameters)
@@ -429,7 +429,7 @@ def try_out() -> None:
     none, nothing = np.zeros((0, 3)), np.zeros(0)
     box = np.concatenate([np.eye(3), -np.eye(3)])
     numbers = np.zeros((2, 4), np.int64)
-    found = search(
+    count = search(
         0, 2, np.array([[10.0, 0.0, 0.0], [0.0, 10.0, 0.0]]), np.zeros((1, 3)), np.ones((1, 2), np.bool_),
         np.array([0, 1]), np.zeros((1, 0), np.int64), np.zeros(1, np.int64), np.zeros((1, 0, 3)), none, nothing, none,
         none, np.zeros((0, 2)), np.zeros((0, 2)), np.zeros(0, np.bool_), np.array([[4.0, -1.0, -1.0]]),
@@ -437,5 +437,5 @@ def try_out() -> None:
         np.array([6.0, 1.0, 1.0, -4.0, 1.0, 1.0]), np.zeros(1, np.bool_), 1e-12, numbers, np.zeros((2, 0), np.int64),
         np.zeros((2, 0, 3)),
     )  # fmt: skip
-    if found != 1 or numbers[0, 0] != 1:
-        raise RuntimeError(f"compiled code finds {found} of 1 line of sight")
+    if count != 1 or numbers[0, 0] != 1:
+        raise RuntimeError(f"compiled code finds {count} of 1 line of sight")

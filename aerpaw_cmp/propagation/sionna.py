@@ -465,12 +465,12 @@ def find_paths(
             progress=progress,
         )
     )
-    found = merge(pieces, max_depth, faces if surfaces is None else None)
+    paths = merge(pieces, max_depth, faces if surfaces is None else None)
     if surfaces is not None:
         from .growth import without_coincident
 
-        found = without_coincident(found, surfaces)
-    return found if excluded is None else found.select(~excluded[found.tower, found.pose])
+        paths = without_coincident(paths, surfaces)
+    return paths if excluded is None else paths.select(~excluded[paths.tower, paths.pose])
 
 
 def find_others(
@@ -511,8 +511,8 @@ def find_others(
     if search.diffraction:
         flags["diffraction_lit_region"] = False  # where the direct path is there, phases would decide
 
-    def take(found: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> OtherPaths:
-        part = _others(found, raw, built.face_of, poses, towers)
+    def take(traced: Any, raw: dict[str, Any], built: _Scene, poses: IntArray, towers: IntArray) -> OtherPaths:
+        part = _others(traced, raw, built.face_of, poses, towers)
         return part if excluded is None else part.select(~excluded[part.tower, part.pose])
 
     yield from _in_batches(
@@ -572,10 +572,10 @@ def _in_batches(
         with _Finder(built, _Ends.points(sources_m[towers]), np.zeros((1, 3)), batch, flags=flags) as finder:
             for start in range(0, len(poses), batch):
                 some = poses[start : start + batch]
-                found, raw = finder.searched(targets_m[some], max_depth, samples)
+                traced, raw = finder.searched(targets_m[some], max_depth, samples)
                 _check_gain(raw, sources_m[towers], targets_m[some], carrier_hz)
-                part = take(found, raw, built, some, towers)
-                del found, raw
+                part = take(traced, raw, built, some, towers)
+                del traced, raw
                 yield part
                 if progress:
                     progress((number + min(1.0, (start + batch) / len(poses))) / len(groups))
@@ -583,7 +583,7 @@ def _in_batches(
 
 
 def _others(
-    found: Any, raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray
+    traced: Any, raw: dict[str, Any], face_of: dict[int, IntArray], poses: IntArray, towers: IntArray
 ) -> OtherPaths:
     """The paths of one batch that are no chain of reflections."""
     kind, shape, primitive = raw["kind"], raw["shape"], raw["primitive"]
@@ -594,11 +594,11 @@ def _others(
         # a diffracted path names a triangle beside the edge, which is no mirror
         here = (kinds > 0) & (kinds != DIFFRACTED) & np.equal(shape[:, receiver, tower, path].T, number)
         hit[here] = owner[primitive[:, receiver, tower, path].T[here]]
-    vertices = np.moveaxis(found.vertices.numpy()[:, receiver, tower, path], 0, 1).astype(np.float64)
+    vertices = np.moveaxis(traced.vertices.numpy()[:, receiver, tower, path], 0, 1).astype(np.float64)
     vertices[kinds == 0] = np.nan
-    real, imaginary = (np.asarray(part.numpy())[receiver, :, tower, :, path] for part in found.a)
+    real, imaginary = (np.asarray(part.numpy())[receiver, :, tower, :, path] for part in traced.a)
     angles = [
-        getattr(found, f"{name}_{end}").numpy()[receiver, tower, path] for end in "tr" for name in ("theta", "phi")
+        getattr(traced, f"{name}_{end}").numpy()[receiver, tower, path] for end in "tr" for name in ("theta", "phi")
     ]
     return OtherPaths(
         pose=poses[receiver],
@@ -702,13 +702,13 @@ def _raw_paths(
     finder: _Finder, built: _Scene, target: _Ends, poses: IntArray, towers: IntArray, max_depth: int, samples: int
 ) -> tuple[PathSet, ComplexArray]:
     """Paths of one batch made of reflections only, and their gains (paths, V and H, V and H)."""
-    found = finder.trace(target, max_depth, samples)
-    real, imaginary = (np.asarray(part.numpy()) for part in found.a)
+    traced = finder.trace(target, max_depth, samples)
+    real, imaginary = (np.asarray(part.numpy()) for part in traced.a)
     raw: dict[str, Any] = {
-        "valid": found.valid.numpy()[: len(poses)],
-        "kind": found.interactions.numpy()[:, : len(poses)],
-        "shape": found.objects.numpy()[:, : len(poses)],
-        "primitive": found.primitives.numpy()[:, : len(poses)],
+        "valid": traced.valid.numpy()[: len(poses)],
+        "kind": traced.interactions.numpy()[:, : len(poses)],
+        "shape": traced.objects.numpy()[:, : len(poses)],
+        "primitive": traced.primitives.numpy()[:, : len(poses)],
     }
     receiver, tower, path = np.nonzero(raw["valid"])
     steps = min(max_depth, len(raw["kind"]))
@@ -717,7 +717,7 @@ def _raw_paths(
     receiver, tower, path = receiver[good], tower[good], path[good]
     pose, source, sequence = _sequences(raw, built.face_of, poses, towers, max_depth)
     points = np.full((len(pose), max_depth, 3), np.nan)
-    points[:, :steps] = np.moveaxis(found.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
+    points[:, :steps] = np.moveaxis(traced.vertices.numpy()[:steps, receiver, tower, path], 0, 1)
     points[sequence < 0] = np.nan
     gain = (real + 1j * imaginary)[receiver, :, tower, :, path].astype(np.complex128)
     return PathSet(pose, source, (sequence >= 0).sum(axis=1), sequence, points), gain

@@ -233,13 +233,13 @@ def _planes_of_boxes(faces: Faces, roofs: IntArray, foot: FloatArray) -> list[tu
 def _footprints(faces: Faces, roofs: IntArray) -> AnyArray:
     """The roofs (roofs,) seen from above, as polygons in site coordinates."""
     low, high = faces.lower[roofs], faces.upper[roofs]
-    found = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
+    polygons = shapely.box(low[:, 0], low[:, 1], high[:, 0], high[:, 1])
     for place, roof in enumerate(roofs.tolist()):
         if faces.polygon[roof] is not None:
-            found[place] = faces.polygon[roof]
-    point, owner = shapely.get_coordinates(found, return_index=True)
+            polygons[place] = faces.polygon[roof]
+    point, owner = shapely.get_coordinates(polygons, return_index=True)
     axes = np.stack([faces.along[roofs, :2], faces.across[roofs, :2]], axis=1)
-    return np.asarray(shapely.set_coordinates(found, np.einsum("ni,nij->nj", point, axes[owner])))
+    return np.asarray(shapely.set_coordinates(polygons, np.einsum("ni,nij->nj", point, axes[owner])))
 
 
 def _convex(footprints: AnyArray) -> list[list[Polygon]]:

@@ -452,12 +452,12 @@ def _by_pairs(
         spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)
         one = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
         paths, _ = _above_terrain(site, several, spots, _search(several, one, spots, settings, None))
-        found = several
+        geometry = several
         if crowns is not None and several.surfaces is None:
-            found, bounces = several.with_bounces(site, spots, crowns, settings.max_depth)
+            geometry, bounces = several.with_bounces(site, spots, crowns, settings.max_depth)
             paths = image.merge([paths, bounces], settings.max_depth, None)
-        loss_db = None if loss is None else loss(paths, found.sources_m, spots.position_m)
-        fields = channel_matrices(paths, found.faces, found.sources_m, spots, one, loss_db)
+        loss_db = None if loss is None else loss(paths, geometry.sources_m, spots.position_m)
+        fields = channel_matrices(paths, geometry.faces, geometry.sources_m, spots, one, loss_db)
         h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), len(names), ports)
         power += fields.power.reshape(len(poses), len(names), ports).sum(axis=2) / (ports * len(uav))
     h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
@@ -753,9 +753,9 @@ def _other_powers(
     shape = (len(poses), len(scene.sources_m))
     power, count, kinds = np.zeros(shape), np.zeros(shape, dtype=np.int64), Counter[str]()
     for search in searches:
-        for found in _others(scene, link, poses, settings, search, cache):
-            clear = _clear_of_terrain(site, scene, poses, found.geometry)
-            paths = found.select(clear)
+        for others in _others(scene, link, poses, settings, search, cache):
+            clear = _clear_of_terrain(site, scene, poses, others.geometry)
+            paths = others.select(clear)
             loss_db = None if loss is None else loss(paths.reflections, scene.sources_m, poses.position_m)
             if loss_db is not None:
                 paths, loss_db = paths.select(np.isfinite(loss_db)), loss_db[np.isfinite(loss_db)]
@@ -795,9 +795,9 @@ def _others(
     if cache is None:
         yield from batches
         return
-    found = OtherPaths.joined(batches, settings.max_depth)
-    cache.save_others(key, found)
-    yield found
+    joined = OtherPaths.joined(batches, settings.max_depth)
+    cache.save_others(key, joined)
+    yield joined
 
 
 def _with_others(

@@ -273,16 +273,16 @@ def pair_panel(result: PairResult) -> record.ChannelPair:
 
 def metrics_beyond_panels(result: FlightResult) -> dict[str, Any]:
     """Numbers for metrics.json alone: tables of residuals, pairs of channels."""
-    found: dict[str, Any] = {"ladder": [json_safe(fields_of(row)) for row in result.ladder]} if result.ladder else {}
-    found |= {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
+    content: dict[str, Any] = {"ladder": [json_safe(fields_of(row)) for row in result.ladder]} if result.ladder else {}
+    content |= {"clock": {name: _clock_entry(clock) for name, clock in clocks_of(result).items()}}
     for one in result.rss:
         tables = {name: table.as_dict() for name, table in one.residual_by.items()}
-        merge(found, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
+        merge(content, {"rss": {one.tower: {one.channel: {"residual_by": tables}}}})
     if result.serving is not None:
-        merge(found, {"serving": result.serving.as_dict()})
+        merge(content, {"serving": result.serving.as_dict()})
     for pair in result.pairs:
-        merge(found, {"pairs": {pair.tower: {f"{pair.first} - {pair.second}": pair.score.as_dict()}}})
-    return found
+        merge(content, {"pairs": {pair.tower: {f"{pair.first} - {pair.second}": pair.score.as_dict()}}})
+    return content
 
 
 def _clock_entry(clock: ClockResult) -> dict[str, Any]:

@@ -133,15 +133,15 @@ def _ranked(entry: SettingRank, settings: dict[str, int], links: dict[str, int])
 
 
 def _places(
-    found: PlaceMap, links: dict[tuple[str, str], int], arrays: PackedArrays, cell_m: float, step: float
+    place_map: PlaceMap, links: dict[tuple[str, str], int], arrays: PackedArrays, cell_m: float, step: float
 ) -> dict[str, int]:
     return {
-        "link": links.get((found.tower, found.channel), -1) if found.tower else -1,
-        "east": arrays.add(np.floor(found.east_m / cell_m), "i4"),
-        "north": arrays.add(np.floor(found.north_m / cell_m), "i4"),
-        "mean": arrays.add_steps(found.mean_db, step),
-        "spread": arrays.add_steps(found.spread_db, step),
-        "n": arrays.add(np.minimum(found.n, 65_535), "u2"),
+        "link": links.get((place_map.tower, place_map.channel), -1) if place_map.tower else -1,
+        "east": arrays.add(np.floor(place_map.east_m / cell_m), "i4"),
+        "north": arrays.add(np.floor(place_map.north_m / cell_m), "i4"),
+        "mean": arrays.add_steps(place_map.mean_db, step),
+        "spread": arrays.add_steps(place_map.spread_db, step),
+        "n": arrays.add(np.minimum(place_map.n, 65_535), "u2"),
     }
 
 

@@ -190,16 +190,16 @@ def season_drift(data: CampaignData) -> Figure:
 
 def season_places(data: CampaignData) -> Figure:
     """Mean residual of each cell of the plan over flights, all towers and channels."""
-    found = (
+    place_map = (
         data.season.places[0] if len(data.season.places) == 1 else next(p for p in data.season.places if not p.tower)
     )
-    first = np.array([found.east_m.min(), found.north_m.min()])
-    column = np.rint((found.east_m - first[0]) / data.cell_m).astype(int)
-    row = np.rint((found.north_m - first[1]) / data.cell_m).astype(int)
+    first = np.array([place_map.east_m.min(), place_map.north_m.min()])
+    column = np.rint((place_map.east_m - first[0]) / data.cell_m).astype(int)
+    row = np.rint((place_map.north_m - first[1]) / data.cell_m).astype(int)
     image = np.full((row.max() + 1, column.max() + 1), np.nan)
-    image[row, column] = found.mean_db
+    image[row, column] = place_map.mean_db
     west, south = first - data.cell_m / 2
-    reach = max(float(np.percentile(np.abs(found.mean_db), 98)), 0.1)
+    reach = max(float(np.percentile(np.abs(place_map.mean_db), 98)), 0.1)
     fig = figure((7.0, 5.0))
     ax = fig.subplots()
     ax.set_facecolor("#F4F4F4")
@@ -207,7 +207,7 @@ def season_places(data: CampaignData) -> Figure:
     mesh = ax.imshow(
         image, origin="lower", extent=extent, cmap="RdBu_r", vmin=-reach, vmax=reach, interpolation="none", zorder=2
     )
-    east, north = found.east_m, found.north_m
+    east, north = place_map.east_m, place_map.north_m
     for tower in () if data.site is None else dict.fromkeys(r.tower for r in data.reference_rows):
         at = data.site.towers.get(tower) if data.site is not None else None
         if at is not None:
@@ -215,7 +215,7 @@ def season_places(data: CampaignData) -> Figure:
             east, north = np.append(east, at.east_m), np.append(north, at.north_m)
     plan_axes(ax)
     frame_around(ax, east, north)
-    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(found.mean_db, -reach, reach))
+    colour_bar(fig, mesh, [ax], "Mean of measured − simulated [dB]", beyond(place_map.mean_db, -reach, reach))
     return fig
 
 
@@ -223,7 +223,7 @@ def season_plates(data: CampaignData) -> list[FigureSpec]:
     """What stands on the page where no script runs, and in print."""
     if not data.season.over_all():
         return []
-    found = [
+    figures = [
         FigureSpec(
             name="season_errors",
             section="season",
@@ -243,7 +243,7 @@ def season_plates(data: CampaignData) -> list[FigureSpec]:
         ),
     ]
     if any(len(p.n) for p in data.season.places):
-        found.append(
+        figures.append(
             FigureSpec(
                 name="season_places",
                 section="season",
@@ -254,14 +254,14 @@ def season_plates(data: CampaignData) -> list[FigureSpec]:
                 draw=lambda: season_places(data),
             )
         )
-    return found
+    return figures
 
 
 def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     """Mean residual per cell of the plan, flights side by side on one scale."""
     means = [place_means(row, data.cell_m) for row in rows]
-    cells = np.array([cell for found in means for cell in found]).reshape(-1, 2)
-    values = np.array([mean for found in means for mean, _ in found.values()])
+    cells = np.array([cell for cell_mean in means for cell in cell_mean]).reshape(-1, 2)
+    values = np.array([mean for cell_mean in means for mean, _ in cell_mean.values()])
     reach = float(np.percentile(np.abs(values), 98)) if len(values) else 1.0
     east, north = (cells.T + 0.5) * data.cell_m
     columns = min(len(rows), MAPS_PER_ROW)
@@ -273,10 +273,10 @@ def places(data: CampaignData, rows: Sequence[RssRow]) -> Figure:
     mesh: Any = None
     for ax in axes.ravel()[len(rows) :]:
         ax.set_visible(False)
-    for ax, row, found in zip(axes.ravel(), rows, means, strict=False):
+    for ax, row, cell_mean in zip(axes.ravel(), rows, means, strict=False):
         first, last = cells.min(axis=0), cells.max(axis=0)
         image = np.full((last[1] - first[1] + 1, last[0] - first[0] + 1), np.nan)
-        for (e, n), (mean, _) in found.items():
+        for (e, n), (mean, _) in cell_mean.items():
             image[n - first[1], e - first[0]] = mean
         extent = np.array([first[0], last[0] + 1, first[1], last[1] + 1]) * data.cell_m
         ax.set_facecolor("#F4F4F4")
@@ -408,9 +408,9 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
 def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    found: list[FigureSpec] = season_plates(data)
+    figures: list[FigureSpec] = season_plates(data)
     if data.rss and len(data.rss) <= MOST_BARS:
-        found.append(
+        figures.append(
             FigureSpec(
                 name="settings_rmse",
                 section="result",
@@ -423,7 +423,7 @@ def figure_specs(data: CampaignData) -> list[FigureSpec]:
             )
         )
     if data.rank and len(data.rank) <= MOST_BARS:
-        found.append(
+        figures.append(
             FigureSpec(
                 name="rank_tv",
                 section="result",
@@ -436,7 +436,7 @@ def figure_specs(data: CampaignData) -> list[FigureSpec]:
         )
     if numbers and data.site is not None:
         site = data.site
-        found.append(
+        figures.append(
             FigureSpec(
                 name="tracks",
                 section="overlay",
@@ -447,10 +447,10 @@ def figure_specs(data: CampaignData) -> list[FigureSpec]:
             )
         )
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
-        found += _link_plates(data, link, rows, numbers)
+        figures += _link_plates(data, link, rows, numbers)
     for number, fold in enumerate(data.held_out[:MOST_FLIGHTS]):
-        found.append(_fold_plate(fold, number, numbers))
-    return found
+        figures.append(_fold_plate(fold, number, numbers))
+    return figures
 
 
 def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[FigureSpec]:

@@ -196,12 +196,12 @@ def repeatability_beside(data: CampaignData) -> list[tuple[Any, float, float]]:
 
 def halves(data: CampaignData) -> list[tuple[RssRow, Repeated | None, Repeated]]:
     """Rows whose first and second half pass the same places: with like headings, and with any."""
-    found = []
+    rows = []
     for row in data.reference_rows:
         every = row.within.get("any_heading")
         if every is not None and every.n:
-            found.append((row, row.within.get("same_heading"), every))
-    return found
+            rows.append((row, row.within.get("same_heading"), every))
+    return rows
 
 
 def headline(data: CampaignData) -> list[str]:
@@ -322,8 +322,8 @@ def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
         error = row.held_out_rmse_db if np.isfinite(row.held_out_rmse_db) else row.rmse_db
         if row.setting == order[0].setting and np.isfinite(error):
             by.setdefault(row.flight, []).append((error, row.link))
-    found = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
-    return sorted(found, key=lambda entry: -entry[1])
+    flights = [(name, float(np.mean([e for e, _ in of])), max(of)[1]) for name, of in by.items()]
+    return sorted(flights, key=lambda entry: -entry[1])
 
 
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:

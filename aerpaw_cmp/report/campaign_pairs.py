@@ -45,12 +45,12 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
     groups: dict[tuple[str, str], list[Repeat]] = {}
     for pair in pairs:
         groups.setdefault((pair.tower, pair.channel), []).append(pair)
-    found = []
+    rows = []
     for (tower, channel), members in groups.items():
         meeting = [pair for pair in members if pair.n]
         rmse = np.array([pair.rmse_db for pair in meeting if np.isfinite(pair.rmse_db)])
         low, median, high = np.quantile(rmse, (0.1, 0.5, 0.9)).tolist() if len(rmse) else (float("nan"),) * 3
-        found.append(
+        rows.append(
             {
                 "tower": tower,
                 "channel": channel,
@@ -61,7 +61,7 @@ def by_link(pairs: Sequence[Repeat]) -> list[dict[str, Any]]:
                 "rmse_quantiles_db": {"10": low, "50": median, "90": high},
             }
         )
-    return found
+    return rows
 
 
 def pair_frame(data: CampaignData) -> pd.DataFrame:
@@ -69,8 +69,8 @@ def pair_frame(data: CampaignData) -> pd.DataFrame:
     rss = _columns(data.repeats, Repeat, {"rmse_ci95_db": ("rmse_low_db", "rmse_high_db")})
     rank = _columns(data.rank_repeats, RankPairing, {"kappa_ci95": ("kappa_low", "kappa_high")})
     frames = [pd.DataFrame({"kind": kind, **columns}) for kind, columns in (("rss", rss), ("rank", rank)) if columns]
-    found = [frame for frame in frames if len(frame)]
-    table: pd.DataFrame = pd.concat(found, ignore_index=True) if found else pd.DataFrame()
+    filled = [frame for frame in frames if len(frame)]
+    table: pd.DataFrame = pd.concat(filled, ignore_index=True) if filled else pd.DataFrame()
     return table
 
 

@@ -143,8 +143,8 @@ def figure(size: tuple[float, float] = WIDE) -> Figure:
 
 def save(fig: Figure) -> tuple[bytes, bytes]:
     """The figure as SVG and PNG."""
-    found = save_as(fig, ("svg", "png"))
-    return found["svg"], found["png"]
+    images = save_as(fig, ("svg", "png"))
+    return images["svg"], images["png"]
 
 
 def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[str, bytes]:
@@ -155,23 +155,23 @@ def save_as(fig: Figure, formats: Sequence[str], kind: str = "screen") -> dict[s
         width, height = fig.get_size_inches()
         fig.set_size_inches(IEEE_WIDTH_IN, height * IEEE_WIDTH_IN / width)
     fig.set_dpi(300.0 if kind == "paper" else RASTER_DPI)
-    found = {name: io.BytesIO() for name in formats}
+    images = {name: io.BytesIO() for name in formats}
     # the canvases themselves: Figure.savefig draws everything once more, unseen, before each file
     agg = FigureCanvasAgg(fig)
-    if "png" in found:
-        agg.print_png(found["png"], pil_kwargs={"compress_level": 2})
-    elif found:
+    if "png" in images:
+        agg.print_png(images["png"], pil_kwargs={"compress_level": 2})
+    elif images:
         agg.draw()  # the layout is made here
     fig.set_layout_engine("none")  # the parts have their places now; a second layout would cost as much as a drawing
-    if "svg" in found:
+    if "svg" in images:
         from matplotlib.backends.backend_svg import FigureCanvasSVG
 
-        FigureCanvasSVG(fig).print_svg(found["svg"], metadata={"Date": None})
-    if "pdf" in found:
+        FigureCanvasSVG(fig).print_svg(images["svg"], metadata={"Date": None})
+    if "pdf" in images:
         from matplotlib.backends.backend_pdf import FigureCanvasPdf  # loads fontTools: as much as a figure
 
-        FigureCanvasPdf(fig).print_pdf(found["pdf"], metadata={"CreationDate": None})
-    return {name: file.getvalue() for name, file in found.items()}
+        FigureCanvasPdf(fig).print_pdf(images["pdf"], metadata={"CreationDate": None})
+    return {name: file.getvalue() for name, file in images.items()}
 
 
 def smaller(png: bytes, colours: int = 256) -> bytes:

@@ -163,11 +163,11 @@ def verdict(diff: ReportDiff) -> str:
 def _causes(diff: ReportDiff) -> str:
     """What else differs, which may be the reason."""
     kinds = ((diff.settings, "setting"), (diff.inputs, "input"), (diff.versions, "version"))
-    found = [f"{len(items)} {name}{'' if len(items) == 1 else 's'}" for items, name in kinds if items]
-    if not found:
+    causes = [f"{len(items)} {name}{'' if len(items) == 1 else 's'}" for items, name in kinds if items]
+    if not causes:
         return " Settings, inputs and versions are the same." if diff.differences else ""
-    verb = "differs" if len(found) == 1 and found[0].startswith("1 ") else "differ"
-    return f" {' and '.join(found)} {verb}."
+    verb = "differs" if len(causes) == 1 and causes[0].startswith("1 ") else "differ"
+    return f" {' and '.join(causes)} {verb}."
 
 
 def _level_verdict(diff: ReportDiff) -> str:

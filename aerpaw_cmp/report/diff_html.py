@@ -48,12 +48,12 @@ def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
     def percent(value: float) -> float:
         return 50.0 + 50.0 * value / reach
 
-    found = []
+    drawn = []
     for name, one in rows:
         low, high = one.difference_ci95_db
         known = low == low
         at = percent(one.difference_db)
-        found.append(
+        drawn.append(
             Whisker(
                 name=name,
                 at=at,
@@ -62,7 +62,7 @@ def whiskers(diff: ReportDiff) -> tuple[list[Whisker], float]:
                 verdict=one.verdict,
             )
         )
-    return found, reach
+    return drawn, reach
 
 
 def diff_page(diff: ReportDiff) -> str:

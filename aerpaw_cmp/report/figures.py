@@ -80,11 +80,11 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
     return _with_own_names(result)
 
 
-def _with_own_names(found: list[FigureSpec]) -> list[FigureSpec]:
+def _with_own_names(figures: list[FigureSpec]) -> list[FigureSpec]:
     """The same plates, a number added where two names became one file name."""
     seen: dict[str, int] = {}
     result = []
-    for plate in found:
+    for plate in figures:
         count = seen[plate.name] = seen.get(plate.name, 0) + 1
         result.append(plate if count == 1 else replace(plate, name=f"{plate.name}_{count}"))
     return result

@@ -54,13 +54,13 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
 def best_baseline(panels: Sequence[RssPanel]) -> tuple[str, float] | None:
     """Name and pooled RMSE [dB] of the baseline that misses these series least; None without one that all have."""
     names = [b.name for b in panels[0].baselines] if panels else []
-    found = {}
+    errors = {}
     for name in names:
         own = [_baseline(panel, name) for panel in panels]
         known = [b.rmse_db for b in own if b is not None and math.isfinite(b.rmse_db)]
         if len(known) == len(panels):
-            found[name] = pooled_db(known, [panel.n for panel in panels])
-    return min(found.items(), key=lambda item: item[1]) if found else None
+            errors[name] = pooled_db(known, [panel.n for panel in panels])
+    return min(errors.items(), key=lambda item: item[1]) if errors else None
 
 
 def _baseline(panel: RssPanel, name: str) -> Baseline | None:
@@ -157,19 +157,19 @@ def _trust(data: ReportData) -> str:
 
 def headlines(data: ReportData) -> list[Headline]:
     """At most four numbers, each with its interval and what it must be held against."""
-    found = []
+    lines = []
     panels = _scored(data.rss)
     if panels:
-        found += [_error(panels), *_difference(panels)]
+        lines += [_error(panels), *_difference(panels)]
     for panel in data.rank:
         at = _best_k(panel)
         if at is not None:
-            found.append(_rank(panel, at))
+            lines.append(_rank(panel, at))
             break
     audit = None if data.engine is None else data.engine.audit
     if audit is not None:
-        found.append(_audit(audit))
-    return found[:4]
+        lines.append(_audit(audit))
+    return lines[:4]
 
 
 def _audit(audit: AuditResult) -> Headline:

@@ -39,7 +39,7 @@ RANK_CLASSES = ("Z", *map(str, RANKS))
 
 def page_layers(data: MapsData) -> list[MapLayer]:
     """Every layer that the page can show, quantities in their order."""
-    found = [
+    layers = [
         MapLayer(
             quantity="RSS",
             unit="dBm",
@@ -48,7 +48,7 @@ def page_layers(data: MapsData) -> list[MapLayer]:
         )
         for one in data.rss
     ]
-    found += [
+    layers += [
         MapLayer(
             quantity="Rank",
             unit="",
@@ -58,14 +58,14 @@ def page_layers(data: MapsData) -> list[MapLayer]:
         )
         for one in (*data.rank, *data.rank_by_tower)
     ]
-    found += [
+    layers += [
         MapLayer(
             quantity=one.name, unit=_unit(one.label), axes=_height(one.altitude_m), values=one.values,
             difference=one.difference,
         )
         for one in data.layers
     ]  # fmt: skip
-    return [*found, *data.further]
+    return [*layers, *data.further]
 
 
 def _unit(label: str) -> str:
@@ -76,8 +76,8 @@ def _unit(label: str) -> str:
     >>> _unit("σ1/σ2 [dB], at most 180"), _unit("rank with minus without foliage")
     ('dB', '')
     """
-    found = re.search(r"\[(.+?)\]", label)
-    return found.group(1) if found else ""
+    bracketed = re.search(r"\[(.+?)\]", label)
+    return bracketed.group(1) if bracketed else ""
 
 
 def _foliage(mode: str) -> dict[str, str]:

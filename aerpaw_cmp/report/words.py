@@ -167,32 +167,32 @@ def _beside_kappa(panel: RankPanel) -> str:
 
 def warnings(data: ReportData) -> list[str]:
     """What must be known before a number is believed; those of the data first."""
-    found = list(data.warnings)
+    texts = list(data.warnings)
     if data.synthetic:
-        found.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
+        texts.append("The logs are synthetic: they were made by simulation to show the tool, and measure nothing.")
     trees = "" if data.engine is None else data.engine.settings.get("foliage", "")
     if data.site.illustrative and (data.site.buildings or trees not in ("", "none")):
-        found.append(
+        texts.append(
             f"Buildings and forests of {data.site.name} are illustrative, not surveyed: reflections and blockage "
             "show the method, not the place."
         )
     for panel in data.rss:
-        found += _rss_warnings(panel)
+        texts += _rss_warnings(panel)
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
-        found.append(
+        texts.append(
             f"The replay engine is not audited yet: run {data.audit_command}."
             if data.audit_command
             else "The replay engine was not audited against the other engine in this report."
         )
     if audit is not None and (audit.missing_paths or audit.extra_paths):
-        found.append(
+        texts.append(
             f"The audit found {count(audit.missing_paths)} paths that only the {audit.reference} engine has and "
             f"{count(audit.extra_paths)} that only the {data.engine.engine if data.engine else ''} engine has, "
             f"on {count(audit.links)} links."
         )
     if audit is not None and audit.fields is not None and audit.fields.failed:
-        found.append(
+        texts.append(
             "The audit of the field failed, so no level or rank below can be relied on: "
             + "; ".join(audit.fields.failures[:3])
             + (f"; and {audit.fields.failed - 3} more" if audit.fields.failed > 3 else "")
@@ -200,20 +200,20 @@ def warnings(data: ReportData) -> list[str]:
         )
     rejected = sum(f.rejected for f in data.inputs)
     if rejected:
-        found.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
-    return found
+        texts.append(f"{count(rejected)} log lines were rejected; see the account of the inputs.")
+    return texts
 
 
 def _rss_warnings(panel: RssPanel) -> list[str]:
-    found = []
+    texts = []
     if panel.at_search_edge:
-        found.append(
+        texts.append(
             f"{panel.name}: the best offset lies at the edge of the searched span, so it and its RMSE are no result. "
             "Widen the span, and check the transmit power and the unit of the log."
         )
     if 0 < panel.n < FEW_SAMPLES:
-        found.append(f"{panel.name}: only {panel.n} samples were scored, too few for a verdict.")
+        texts.append(f"{panel.name}: only {panel.n} samples were scored, too few for a verdict.")
     if panel.n_out_of_coverage and len(panel.time) and panel.n_out_of_coverage > 0.2 * len(panel.time):
         share = 100 * panel.n_out_of_coverage / len(panel.time)
-        found.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
-    return found
+        texts.append(f"{panel.name}: {share:.0f} % of the samples are out of coverage and not part of the RMSE.")
+    return texts

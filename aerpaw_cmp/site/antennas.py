@@ -327,11 +327,11 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
 
 
 def _check_header(line: str, path: Path, number: int) -> None:
-    found = [cell.strip().lower() for cell in line.split("\t")]
-    if len(found) != 7 or not all(cell.startswith(column) for cell, column in zip(found, _COLUMNS, strict=True)):
-        cause = "the columns are not separated by tabs" if len(found) == 1 else None
+    columns = [cell.strip().lower() for cell in line.split("\t")]
+    if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
+        cause = "the columns are not separated by tabs" if len(columns) == 1 else None
         raise InputError(
-            f"the columns are {', '.join(found)}", expected=", ".join(_COLUMNS), cause=cause, path=path, line=number
+            f"the columns are {', '.join(columns)}", expected=", ".join(_COLUMNS), cause=cause, path=path, line=number
         )
 
 
@@ -539,16 +539,16 @@ def read_gain_grid(path: str | Path, variable: str, *, name: str | None = None) 
 
 def _grid_of(content: Mapping[str, Any], variable: str, shape: tuple[int, int], path: Path) -> FloatArray:
     """The grid of that name, if it has a row per elevation and a column per azimuth."""
-    found = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
-    grids = sorted(key for key, size in found.items() if size == shape)
+    sizes = {key: value.shape for key, value in content.items() if isinstance(value, np.ndarray)}
+    grids = sorted(key for key, size in sizes.items() if size == shape)
     if variable in grids:
         return np.asarray(content[variable], dtype=float)
     rows = f"{shape[0]} elevations x {shape[1]} azimuths"
-    if variable not in found:
+    if variable not in sizes:
         raise UsageError(
             f"no gain grid '{variable}'", expected=f"one of {', '.join(grids) or 'none'} ({rows})", path=path
         )
-    size = found[variable]
+    size = sizes[variable]
     raise UsageError(
         f"'{variable}' has {' x '.join(map(str, size))} values",
         expected=rows,

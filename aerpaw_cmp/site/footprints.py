@@ -547,7 +547,7 @@ def _first_keeps(shapes: list[_Shape], actions: list[str]) -> list[_Shape]:
 
 def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, Polygon]]:
     """Single polygons with unique names, without slivers and needless vertices."""
-    found: list[tuple[str, _Shape, Polygon]] = []
+    parts: list[tuple[str, _Shape, Polygon]] = []
     used: set[str] = set()
     for shape in shapes:
         # rounded here to what site.yaml keeps: rounding coordinates one by one can make a ring cross itself
@@ -563,8 +563,8 @@ def _parts(shapes: list[_Shape], actions: list[str]) -> list[tuple[str, _Shape, 
                 number += 1
                 name = f"{shape.name} ({number})"
             used.add(name)
-            found.append((name, shape, shapely.normalize(plain)))
-    return found
+            parts.append((name, shape, shapely.normalize(plain)))
+    return parts
 
 
 # ---------------------------------------------------------------- site.yaml
@@ -593,14 +593,14 @@ def import_site(
         raise UsageError("no map file named", expected="GeoJSON, OSM XML, Overpass JSON, KML or KMZ files")
     model = site_model(base)
     frame = SiteFrame(model.origin.latitude_deg, model.origin.longitude_deg)
-    found = import_footprints(files, frame, area_m=extent_m(model, frame), **options)
+    imports = import_footprints(files, frame, area_m=extent_m(model, frame), **options)
     content = model.model_dump()
     if model.dem is not None:  # the new file may lie in another folder
         content["dem"]["path"] = str((Path(base).parent / model.dem.path).resolve())
     content |= {
         "buildings": [
             {**_outline_dict(b.name, b.footprint), "height_m": b.height_m, "material": b.material, "source": b.source}
-            for b in found.buildings
+            for b in imports.buildings
         ],
         "forests": [
             {
@@ -609,15 +609,15 @@ def import_site(
                 "minimum_spacing_m": f.minimum_spacing_m,
                 "source": f.source,
             }
-            for f in found.forests
+            for f in imports.forests
         ],
-        "geofences": [_outline_dict(g.name, g.area) for g in found.geofences],
+        "geofences": [_outline_dict(g.name, g.area) for g in imports.geofences],
         "illustrative": False,
-        "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *found.credits],
+        "notes": [*(note for note in model.notes if "illustrative" not in note.lower()), *imports.credits],
     }
-    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in found.trees]}
+    content["trees"] |= {"points_m": [], "points_deg": [], "single": [_tree_dict(tree) for tree in imports.trees]}
     imported = SiteModel.model_validate(content)
-    return imported, [_kept_of_base(imported, base), *found.actions]
+    return imported, [_kept_of_base(imported, base), *imports.actions]
 
 
 def _kept_of_base(model: SiteModel, base: str | Path) -> str:

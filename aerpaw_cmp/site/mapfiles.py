@@ -133,7 +133,7 @@ def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
     @cache
     def lines() -> list[int]:
         start = re.search(rf'"{member}"\s*:\s*\[', text)
-        found: list[int] = []
+        numbers: list[int] = []
         at, counted, number = (start.end() if start else len(text)), 0, 1
         while True:
             at = gap.match(text, at).end()  # type: ignore[union-attr]
@@ -142,8 +142,8 @@ def _lines_of(text: str, member: str) -> Callable[[int], int | None]:
             try:
                 _, at = decoder.raw_decode(text, at)
             except (json.JSONDecodeError, RecursionError):
-                return found
-            found.append(number)
+                return numbers
+            numbers.append(number)
 
     return lambda index: lines()[index] if index < len(lines()) else None
 
@@ -256,8 +256,8 @@ def _from_xml(data: bytes, path: Path) -> MapFile:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         line = error.position[0] if isinstance(error, ElementTree.ParseError) else None
-        found = str(error).split(": line")[0]
-        raise InputError(f"not XML: {found}", cause="the file was cut off?", path=path, line=line) from None
+        why = str(error).split(": line")[0]
+        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
     tag = _plain(root.tag)
     if tag == "kml":
         return _kml(root, path, data)
@@ -276,19 +276,19 @@ def _xml_lines(data: bytes, name: str | None) -> Callable[[int], int | None]:
 
     @cache
     def lines() -> list[int]:
-        found: list[int] = []
+        numbers: list[int] = []
         inside: list[bool] = []
         parser = expat.ParserCreate()
 
         def start(tag: str, _: Any) -> None:
             wanted = len(inside) == 1 if name is None else tag.rpartition(":")[2] == name and not any(inside[-1:])
             if wanted:
-                found.append(parser.CurrentLineNumber)
+                numbers.append(parser.CurrentLineNumber)
             inside.append(name is not None and (wanted or any(inside[-1:])))
 
         parser.StartElementHandler, parser.EndElementHandler = start, lambda _: inside.pop()
         parser.Parse(data, True)
-        return found
+        return numbers
 
     return lambda index: lines()[index] if index < len(lines()) else None
 

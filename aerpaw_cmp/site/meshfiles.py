@@ -182,7 +182,7 @@ def _polygons(
         even = _even_polygons(element, data, place, order, which)
         if even is not None:
             return [even[0]], even[1]
-    found: dict[int, list[list[int]]] = {}
+    by_size: dict[int, list[list[int]]] = {}
     for _ in range(element.count):
         corners: list[int] = []
         for name, kind, length in element.properties:
@@ -190,8 +190,8 @@ def _polygons(
             values, place = _several(data, words, place, order + kind, int(count), element, path)
             corners = values if name == which else corners
         if len(corners) >= 3:
-            found.setdefault(len(corners), []).append(corners)
-    return [np.array(group, dtype=np.int64) for group in found.values()], place
+            by_size.setdefault(len(corners), []).append(corners)
+    return [np.array(group, dtype=np.int64) for group in by_size.values()], place
 
 
 def _even_polygons(element: _Element, data: bytes, place: int, order: str, which: str) -> tuple[IntArray, int] | None:

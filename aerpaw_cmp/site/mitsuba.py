@@ -151,8 +151,8 @@ def _root(path: Path) -> tuple[ElementTree.Element, bytes]:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         line = error.position[0] if isinstance(error, ElementTree.ParseError) else None
-        found = str(error).split(": line")[0]
-        raise InputError(f"not XML: {found}", cause="the file was cut off?", path=path, line=line) from None
+        why = str(error).split(": line")[0]
+        raise InputError(f"not XML: {why}", cause="the file was cut off?", path=path, line=line) from None
     if root.tag != "scene":
         raise InputError(f"XML of '{root.tag}'", expected="a Mitsuba scene ('scene')", path=path)
     if root.find(".//include") is not None:
@@ -188,11 +188,11 @@ def _materials(
         if name in given:
             radio[name] = given[name]
             continue
-        found = _radio_material(bsdf, name, path)
-        if found is None:
+        material = _radio_material(bsdf, name, path)
+        if material is None:
             unknown[name] = bsdf.get("type", "?")
         else:
-            radio[name] = found
+            radio[name] = material
             if _float(bsdf, "scattering_coefficient", 0.0, path) > 0.0:
                 rough.append(name)
     stray = sorted(set(given) - set(radio))

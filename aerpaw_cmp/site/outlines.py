@@ -81,10 +81,10 @@ def is_tangled(ring: Polygon) -> bool:
     segments = shapely.linestrings(np.stack([line[:-1], line[1:]], axis=1))
     if len(segments) * (len(segments) - 1) // 2 <= MAX_CROSSINGS:
         return False
-    tree, found = shapely.STRtree(segments), 0
+    tree, crossings = shapely.STRtree(segments), 0
     for start in range(0, len(segments), 64):
-        found += tree.query(segments[start : start + 64], predicate="crosses").shape[1]
-        if found > 2 * MAX_CROSSINGS:  # every place is seen from both sides
+        crossings += tree.query(segments[start : start + 64], predicate="crosses").shape[1]
+        if crossings > 2 * MAX_CROSSINGS:  # every place is seen from both sides
             return True
     return False
 

@@ -523,11 +523,11 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
     pairs = [(int(i), int(j)) for i, j in zip(one, two, strict=True) if i < j]
     # outlines simplified by 'site import' may still overlap by some decimetres
-    found = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
-    if not found:
+    overlapping = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
+    if not overlapping:
         return []
-    first = " and ".join(f"'{buildings[i].name}'" for i in found[0])
-    more = "" if len(found) == 1 else f" and {len(found) - 1} more pairs"
+    first = " and ".join(f"'{buildings[i].name}'" for i in overlapping[0])
+    more = "" if len(overlapping) == 1 else f" and {len(overlapping) - 1} more pairs"
     return [f"warning: the buildings {first}{more} overlap; 'aerpaw-cmp site import' makes outlines disjoint"]
 
 

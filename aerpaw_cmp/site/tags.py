@@ -98,9 +98,9 @@ def positive_metres(tags: Mapping[str, str], keys: tuple[str, ...], notes: list[
         written = tags.get(key, "").strip()
         if not written:
             continue
-        found = [metres(part.strip().lstrip("~")) for part in written.split(";")]
-        lengths = [value for value in found if value is not None]
-        if len(lengths) < len(found):
+        parts = [metres(part.strip().lstrip("~")) for part in written.split(";")]
+        lengths = [value for value in parts if value is not None]
+        if len(lengths) < len(parts):
             notes.append(f"the {key} '{written}' is not a length")
         elif max(lengths) <= 0:
             notes.append(f"the {key} '{written}' is not above 0, as where nobody knows it")
@@ -116,9 +116,9 @@ def levels_of(tags: Mapping[str, str], notes: list[str]) -> float | None:
     written = tags.get("building:levels", tags.get("levels", "")).strip()
     if not written:
         return None
-    found = [_number(part) for part in written.split(";")]
-    numbers = [value for value in found if value is not None]
-    if len(numbers) < len(found) or max(numbers) <= 0:
+    parts = [_number(part) for part in written.split(";")]
+    numbers = [value for value in parts if value is not None]
+    if len(numbers) < len(parts) or max(numbers) <= 0:
         if written != "0":  # a ground floor that some mappers do not count
             notes.append(f"the number of levels '{written}' is no positive number")
         return None

@@ -28,7 +28,7 @@ def estimate(verdict: str, **more: Any) -> ClockEstimate:
 
 
 def result(clock: Any) -> Any:
-    further = SimpleNamespace(clock=clock.found)
+    further = SimpleNamespace(clock=clock.result)
     return SimpleNamespace(
         rss=[SimpleNamespace(further=further, residual_by={}, tower="LW1", channel=c) for c in "ab"],
         pairs=(),

@@ -152,7 +152,7 @@ def test_several_processes_give_the_numbers_of_one(tmp_path: Path, monkeypatch: 
         run = run_flight(data, audit=False, ladder=True, meanwhile=partial(idle.append, processes))
         assert run.ladder is not None
         rows = [dataclasses.replace(row, seconds=0.0) for row in run.result.ladder]
-        found.append((run.result.rss, rows, run.ladder.ladder.error_db, [r.clock.found for r in run.replays.rss]))
+        found.append((run.result.rss, rows, run.ladder.ladder.error_db, [r.clock.result for r in run.replays.rss]))
     assert idle == [1, 2]
     np.testing.assert_equal(_plain(found[1]), _plain(found[0]))
 

@@ -35,8 +35,8 @@ def test_a_clock_predicted_in_blocks_is_that_of_the_whole_flight(
     for a, b in zip(whole, parts, strict=True):
         assert a is not None
         assert b is not None
-        np.testing.assert_equal(dataclasses.asdict(b.found), dataclasses.asdict(a.found))  # to the last digit
-        assert abs(a.found.radio_minus_telemetry_s - 0.4) < 0.2
+        np.testing.assert_equal(dataclasses.asdict(b.result), dataclasses.asdict(a.result))  # to the last digit
+        assert abs(a.result.radio_minus_telemetry_s - 0.4) < 0.2
 
 
 def test_a_part_of_the_flight_turns_as_the_whole_does(one_tower: FlightData) -> None:

@@ -46,7 +46,7 @@ def missing_module(name: str) -> str:
     """The module that a format needs and that is not there."""
     module = _NEEDS[name]
     try:
-        found = not module or importlib.util.find_spec(module) is not None
+        is_there = not module or importlib.util.find_spec(module) is not None
     except ValueError:  # a module that is set to None, as an import of it would fail
-        found = False
-    return "" if found else module
+        is_there = False
+    return "" if is_there else module

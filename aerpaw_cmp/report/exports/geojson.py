@@ -94,5 +94,5 @@ def plain(values: Any, *, whole: bool = False) -> list[Any]:
     if whole:
         boxed[known] = np.asarray(values, dtype=np.float64)[known].astype(np.int64).astype(object)
     boxed[~known] = None
-    found: list[Any] = boxed.tolist()
-    return found
+    listed: list[Any] = boxed.tolist()
+    return listed

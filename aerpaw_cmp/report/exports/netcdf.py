@@ -17,12 +17,12 @@ NO_CODE = -1
 
 def write_netcdf(export: Export, folder: Path) -> list[Path]:
     """``rss.nc`` and ``rank.nc``."""
-    found = []
+    paths = []
     for samples in export.sets:
         path = folder / f"{samples.kind}.nc"
         path.write_bytes(_bytes(export, samples))
-        found.append(path)
-    return found
+        paths.append(path)
+    return paths
 
 
 def _bytes(export: Export, samples: SampleSet) -> Any:
@@ -135,8 +135,8 @@ def _number(book: Any, name: str, values: AnyArray) -> Any:
 
 def _write_column(book: Any, column: Column, samples: SampleSet) -> None:
     def of(series: Series) -> AnyArray:
-        found = series.values.get(column.name)
-        return np.full(len(series), np.nan) if found is None else found
+        known = series.values.get(column.name)
+        return np.full(len(series), np.nan) if known is None else known
 
     values = _joined(samples, of)
     name = column.name.replace(".", "p")

@@ -76,19 +76,19 @@ def _columns(pa: Any, export: Export, samples: SampleSet, series: Series, part: 
     latitude, longitude = latitude_longitude(export.site.frame, series.east_m[part], series.north_m[part])
     up = series.up_m[part]
     # longitude and latitude default to WGS84 where GeoParquet names no CRS
-    found: dict[str, Any] = {"time": pa.array(series.time[part], pa.timestamp("ns", tz="UTC"))}
+    columns: dict[str, Any] = {"time": pa.array(series.time[part], pa.timestamp("ns", tz="UTC"))}
     for name, value in zip(_TEXTS, (series.flight, series.tower, series.channel, series.unit), strict=True):
-        found[name] = pa.DictionaryArray.from_arrays(np.zeros(rows, dtype=np.int32), [value])
+        columns[name] = pa.DictionaryArray.from_arrays(np.zeros(rows, dtype=np.int32), [value])
     places = (latitude, longitude, series.east_m[part], series.north_m[part], up)
-    found |= {name: _numbers(pa, values) for name, values in zip(_PLACES, places, strict=True)}
+    columns |= {name: _numbers(pa, values) for name, values in zip(_PLACES, places, strict=True)}
     missing = np.full(rows, np.nan)
     for one in samples.columns:
         values = series.values[one.name][part] if one.name in series.values else missing
-        found[one.name] = _codes(pa, values) if one.flags else _numbers(pa, values)
+        columns[one.name] = _codes(pa, values) if one.flags else _numbers(pa, values)
     known = np.isfinite(longitude)
     shapes = iter(wkb_points(longitude[known], latitude[known], up[known]))
-    found["geometry"] = pa.array([next(shapes) if one else None for one in known.tolist()], pa.binary())
-    return found
+    columns["geometry"] = pa.array([next(shapes) if one else None for one in known.tolist()], pa.binary())
+    return columns
 
 
 def _numbers(pa: Any, values: Any) -> Any:

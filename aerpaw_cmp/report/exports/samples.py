@@ -390,8 +390,8 @@ def pieces(series: Series, rows: int = 20_000) -> Iterator[slice]:
 def iso_text(time: AnyArray) -> list[str]:
     """Instants (n,) as ISO 8601 in UTC with milliseconds, rounded; empty where unknown."""
     text = np.datetime_as_string((time + np.timedelta64(500_000, "ns")).astype("datetime64[ms]"), timezone="UTC")
-    found: list[str] = np.where(np.isnat(time), "", text).tolist()
-    return found
+    texts: list[str] = np.where(np.isnat(time), "", text).tolist()
+    return texts
 
 
 def xml_text(text: str) -> str:

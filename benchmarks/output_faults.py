@@ -142,16 +142,18 @@ def compute_once(jobs: dict[str, Job], folder: Path) -> None:
     from typer import main as typer_main
 
     from aerpaw_cmp.__main__ import main
-    from aerpaw_cmp.jobs import campaign, coverage_map, run
+    from aerpaw_cmp.flight import replay
+    from aerpaw_cmp.jobs import campaign, coverage_map, flight_run
     from aerpaw_cmp.maps import export
     from aerpaw_cmp.report import campaign_figures, canvas, figures, maps_figures
 
     for room in (figures, campaign_figures, maps_figures):
-        plates: Callable[..., Any] = room.plates
-        room.plates = lambda data, _plates=plates: list(_plates(data))[:2]  # type: ignore[attr-defined]
-    for room, name in ((run, "_replayed_and_compared"), (campaign, "run"), (coverage_map, "make_maps")):
+        specs: Callable[..., Any] = room.figure_specs
+        room.figure_specs = lambda data, _specs=specs: list(_specs(data))[:2]  # type: ignore[attr-defined]
+    computed = ((replay, "replay_flight"), (flight_run, "run_flight"), (campaign, "run"), (coverage_map, "make_maps"))
+    for room, name in computed:
         setattr(room, name, _remembered(getattr(room, name), lambda *_, **__: ""))
-    canvas.render = _remembered(canvas.render, lambda plate, *_, **__: str(plate.name))
+    canvas.render = _remembered(canvas.render, lambda spec, *_, **__: str(spec.name))
     export._legend = _remembered(export._legend, lambda layer, *_, **__: str(layer.name))
     typer_main.get_command = _remembered(typer_main.get_command, lambda *_, **__: "")  # the options of all commands
     for job in jobs.values():

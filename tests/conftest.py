@@ -199,11 +199,11 @@ def few_pictures(blank_pictures: None) -> Iterator[None]:
     """Also, a figure is made from its data once per module: for usual flights that many tests of a module report."""
     from aerpaw_cmp.report import canvas
 
-    def render(plate: Any, *how: Any) -> Any:
-        if plate.name in made:
-            plate = dataclasses.replace(plate, draw=canvas.figure)
-        made.add(plate.name)
-        return real(plate, *how)
+    def render(spec: Any, *how: Any) -> Any:
+        if spec.name in made:
+            spec = dataclasses.replace(spec, draw=canvas.figure)
+        made.add(spec.name)
+        return real(spec, *how)
 
     real, made = canvas.render, set[str]()
     with pytest.MonkeyPatch.context() as patch:

@@ -71,13 +71,13 @@ class FieldAudit:
         """Both together: counts add up, the worst stays."""
         values: dict[str, Any] = {}
         for name in self.__slots__:
-            one, two = getattr(self, name), getattr(other, name)
+            mine, theirs = getattr(self, name), getattr(other, name)
             if name in ("failures", "not_covered"):
-                values[name] = tuple(dict.fromkeys((*one, *two)))
+                values[name] = tuple(dict.fromkeys((*mine, *theirs)))
             elif name.endswith(("_max_db", "_max_rad", "_max_error", "_max_error_db")):
-                values[name] = max(one, two)
+                values[name] = max(mine, theirs)
             elif not name.endswith(("_rms_db", "_rms_rad")):
-                values[name] = one + two
+                values[name] = mine + theirs
         values["power_rms_db"] = _rms(self.paths, self.power_rms_db, other.paths, other.power_rms_db)
         values["phase_rms_rad"] = _rms(self.phases, self.phase_rms_rad, other.phases, other.phase_rms_rad)
         return FieldAudit(**values)
@@ -93,5 +93,5 @@ class FieldAudit:
         }
 
 
-def _rms(n: int, one: float, m: int, two: float) -> float:
-    return float(math.sqrt((n * one**2 + m * two**2) / max(n + m, 1)))
+def _rms(n: int, rms: float, m: int, other_rms: float) -> float:
+    return float(math.sqrt((n * rms**2 + m * other_rms**2) / max(n + m, 1)))

@@ -164,9 +164,9 @@ def score_forecast(
         return _no_score(probability.shape[1])
     ranks = p.shape[1]
     flat = np.broadcast_to(constant, p.shape)
-    one, two = one_hot(rank, ranks), one_hot(choice, ranks)
+    reported, chosen = one_hot(rank, ranks), one_hot(choice, ranks)
     log, log_constant = log_losses(p, rank), log_losses(flat, rank)
-    columns = np.column_stack([rank == choice, log, log - log_constant, one, two, p]).astype(np.float64)
+    columns = np.column_stack([rank == choice, log, log - log_constant, reported, chosen, p]).astype(np.float64)
     known = max((autocorrelation(c) for c in columns[:, :3].T), key=lambda m: m.block_length)
     drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
     mean = columns.mean(axis=0)
@@ -277,13 +277,13 @@ def repeat_ceiling(
     """
     from scipy.spatial import cKDTree
 
-    one, two = np.asarray(first_rank, dtype=np.float64), np.asarray(second_rank, dtype=np.float64)
-    known, asked = one >= 1, two >= 1
+    first, second = np.asarray(first_rank, dtype=np.float64), np.asarray(second_rank, dtype=np.float64)
+    known, asked = first >= 1, second >= 1
     if not known.any() or not asked.any():
         return RepeatCeiling(n=0, kappa=float("nan"), agreement=float("nan"), within_m=within_m)
     far, index = cKDTree(first_m[known]).query(second_m[asked], distance_upper_bound=within_m)
     near = np.isfinite(far)
-    predicted, reported = one[known][index[near]], two[asked][near]
+    predicted, reported = first[known][index[near]], second[asked][near]
     return RepeatCeiling(
         n=int(near.sum()),
         kappa=cohen_kappa(reported, predicted),

@@ -311,10 +311,10 @@ def _pair(
     shared: dict[tuple[bytes, bytes], tuple[IntArray, IntArray, float]],
     rule: tuple[float, float | None],
 ) -> PassPair:
-    def difference(one: bytes, two: bytes, a: FloatArray, b: FloatArray) -> FloatArray:
-        if (one, two) not in known:
-            known[one, two] = places[one].partners(places[two], *rule)
-        i, j = known[one, two]
+    def difference(key: bytes, other_key: bytes, a: FloatArray, b: FloatArray) -> FloatArray:
+        if (key, other_key) not in known:
+            known[key, other_key] = places[key].partners(places[other_key], *rule)
+        i, j = known[key, other_key]
         return b[j] - a[i]
 
     level = difference(here.level, there.level, here.one.level_db, there.one.level_db)
@@ -341,8 +341,8 @@ def _pair(
     )
 
 
-def _common(one: IntArray, two: IntArray) -> tuple[IntArray, IntArray]:
+def _common(first: IntArray, second: IntArray) -> tuple[IntArray, IntArray]:
     """Rows of both that name the same cell, in the order of the cells (both are sorted and have each cell once)."""
-    a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (one, two))
+    a, b = ((cells[:, 0] << 32) + cells[:, 1] for cells in (first, second))
     _, i, j = np.intersect1d(a, b, assume_unique=True, return_indices=True)
     return i, j

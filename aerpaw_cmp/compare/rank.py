@@ -185,14 +185,16 @@ def agreement(measured: ArrayLike, simulated: ArrayLike) -> float:
     >>> agreement([1, 2, 2, float("nan")], [1, 2, 3, 1])
     0.6666666666666666
     """
-    one, two = _ranks(measured), _ranks(simulated)
-    if one.shape != two.shape:
-        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
-    both = (one >= 1) & (two >= 1)
-    return float(np.mean(one[both] == two[both])) if both.any() else float("nan")
+    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
+    if measured_rank.shape != simulated_rank.shape:
+        raise ValueError(
+            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
+        )
+    both = (measured_rank >= 1) & (simulated_rank >= 1)
+    return float(np.mean(measured_rank[both] == simulated_rank[both])) if both.any() else float("nan")
 
 
-def total_variation(one: ArrayLike, two: ArrayLike) -> float:
+def total_variation(first: ArrayLike, second: ArrayLike) -> float:
     """Total variation distance of two histograms of shares: half the sum of absolute differences, 0 to 1.
 
     Examples
@@ -200,10 +202,10 @@ def total_variation(one: ArrayLike, two: ArrayLike) -> float:
     >>> total_variation([0.5, 0.5, 0, 0], [1, 0, 0, 0])
     0.5
     """
-    return float(0.5 * np.abs(np.asarray(one, dtype=np.float64) - np.asarray(two, dtype=np.float64)).sum())
+    return float(0.5 * np.abs(np.asarray(first, dtype=np.float64) - np.asarray(second, dtype=np.float64)).sum())
 
 
-def wasserstein(one: ArrayLike, two: ArrayLike) -> float:
+def wasserstein(first: ArrayLike, second: ArrayLike) -> float:
     """Wasserstein-1 distance of two rank histograms [ranks]: how far shares must move, in ranks.
 
     Examples
@@ -211,17 +213,19 @@ def wasserstein(one: ArrayLike, two: ArrayLike) -> float:
     >>> wasserstein([1, 0, 0, 0], [0, 0, 0, 1])
     3.0
     """
-    step = np.cumsum(np.asarray(one, dtype=np.float64) - np.asarray(two, dtype=np.float64))
+    step = np.cumsum(np.asarray(first, dtype=np.float64) - np.asarray(second, dtype=np.float64))
     return float(np.abs(step[:-1]).sum())
 
 
 def _pairs(measured: ArrayLike, simulated: ArrayLike) -> tuple[IntArray, IntArray]:
     """Both ranks as integers, where both exist (not NaN, not 0)."""
-    one, two = _ranks(measured), _ranks(simulated)
-    if one.shape != two.shape:
-        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
-    both = (one >= 1) & (two >= 1)
-    return one[both].astype(np.int64), two[both].astype(np.int64)
+    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
+    if measured_rank.shape != simulated_rank.shape:
+        raise ValueError(
+            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
+        )
+    both = (measured_rank >= 1) & (simulated_rank >= 1)
+    return measured_rank[both].astype(np.int64), simulated_rank[both].astype(np.int64)
 
 
 def confusion_matrix(measured: ArrayLike, simulated: ArrayLike, *, max_rank: int = MAX_RANK) -> IntArray:
@@ -232,11 +236,13 @@ def confusion_matrix(measured: ArrayLike, simulated: ArrayLike, *, max_rank: int
     ndarray of int, (max_rank + 1, max_rank + 1)
         Row: measured (0: NaN, no CSI). Column: simulated (0: no channel). All samples are in it.
     """
-    one, two = _ranks(measured), _ranks(simulated)
-    if one.shape != two.shape:
-        raise ValueError(f"measured has {one.size} ranks, simulated {two.size}: they must be pairs")
-    row = np.where(one >= 1, one, 0).astype(np.int64)
-    column = np.where(two >= 1, two, 0).astype(np.int64)
+    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
+    if measured_rank.shape != simulated_rank.shape:
+        raise ValueError(
+            f"measured has {measured_rank.size} ranks, simulated {simulated_rank.size}: they must be pairs"
+        )
+    row = np.where(measured_rank >= 1, measured_rank, 0).astype(np.int64)
+    column = np.where(simulated_rank >= 1, simulated_rank, 0).astype(np.int64)
     if len(row) and max(row.max(), column.max()) > max_rank:
         raise ValueError(f"ranks must be at most {max_rank}")
     size = max_rank + 1
@@ -254,15 +260,19 @@ def cohen_kappa(measured: ArrayLike, simulated: ArrayLike) -> float:
     >>> cohen_kappa([1, 2, 1, 2], [1, 2, 2, 1])
     0.0
     """
-    one, two = _pairs(measured, simulated)
-    if not len(one):
+    measured_rank, simulated_rank = _pairs(measured, simulated)
+    if not len(measured_rank):
         return float("nan")
-    size = int(max(one.max(), two.max())) + 1
-    return _kappa(float(np.mean(one == two)), np.bincount(one, minlength=size), np.bincount(two, minlength=size))
+    size = int(max(measured_rank.max(), simulated_rank.max())) + 1
+    return _kappa(
+        float(np.mean(measured_rank == simulated_rank)),
+        np.bincount(measured_rank, minlength=size),
+        np.bincount(simulated_rank, minlength=size),
+    )
 
 
-def _kappa(observed: float, one: IntArray, two: IntArray) -> float:
-    chance = float((one / one.sum()) @ (two / two.sum()))
+def _kappa(observed: float, first: IntArray, second: IntArray) -> float:
+    chance = float((first / first.sum()) @ (second / second.sum()))
     return (observed - chance) / (1.0 - chance) if chance < 1.0 - 1e-12 else float("nan")
 
 
@@ -289,15 +299,17 @@ def shift_test(measured: ArrayLike, simulated: ArrayLike, *, minimum_shift: int 
     arXiv:2012.06862). All shifts at once: one FFT correlation per rank. As the histograms stay, the test of kappa
     is the same test.
     """
-    one, two = _pairs(measured, simulated)
-    n = len(one)
-    if n < 8 or np.ptp(one) == 0 or np.ptp(two) == 0:
+    measured_rank, simulated_rank = _pairs(measured, simulated)
+    n = len(measured_rank)
+    if n < 8 or np.ptp(measured_rank) == 0 or np.ptp(simulated_rank) == 0:
         return float("nan")
-    near = minimum_shift or max(autocorrelation(one).block_length, autocorrelation(two).block_length)
+    near = minimum_shift or max(
+        autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length
+    )
     near = int(np.clip(near, 1, n // 4))
     matches = np.zeros(n)
-    for rank in np.intersect1d(one, two):
-        spectrum = np.fft.rfft(one == rank) * np.conj(np.fft.rfft(two == rank))
+    for rank in np.intersect1d(measured_rank, simulated_rank):
+        spectrum = np.fft.rfft(measured_rank == rank) * np.conj(np.fft.rfft(simulated_rank == rank))
         matches += np.fft.irfft(spectrum, n)
     count = np.round(matches)
     apart = count[near : n - near + 1]
@@ -324,12 +336,12 @@ def histogram_test(
     float
         Share of exchanges with a total variation at least as large, the observed one counted among them.
     """
-    one, two = _pairs(measured, simulated)
-    if not len(one):
+    measured_rank, simulated_rank = _pairs(measured, simulated)
+    if not len(measured_rank):
         return float("nan")
-    difference = _indicators(one) - _indicators(two)
-    length = max(autocorrelation(one).block_length, autocorrelation(two).block_length, 1)
-    sums = np.add.reduceat(difference, np.arange(0, len(one), length), axis=0)
+    difference = _indicators(measured_rank) - _indicators(simulated_rank)
+    length = max(autocorrelation(measured_rank).block_length, autocorrelation(simulated_rank).block_length, 1)
+    sums = np.add.reduceat(difference, np.arange(0, len(measured_rank), length), axis=0)
     signs = np.random.default_rng(seed).integers(0, 2, (replicates, len(sums))) * 2.0 - 1.0
     swapped = np.abs(signs @ sums).sum(axis=1)
     return float((1 + np.sum(swapped >= np.abs(sums.sum(axis=0)).sum() - 1e-9)) / (1 + replicates))
@@ -829,16 +841,20 @@ def compare_ranks(
     RankFit
         Agreement, kappa and distances with their 95 % intervals and permutation tests.
     """
-    one, two = _ranks(measured), _ranks(simulated)
-    bars_one, bars_two = histogram(one), histogram(two)
-    a, b = _pairs(one, two)
-    agree, tv, move = agreement(one, two), total_variation(bars_one, bars_two), wasserstein(bars_one, bars_two)
-    kappa = cohen_kappa(one, two)
+    measured_rank, simulated_rank = _ranks(measured), _ranks(simulated)
+    bars_one, bars_two = histogram(measured_rank), histogram(simulated_rank)
+    a, b = _pairs(measured_rank, simulated_rank)
+    agree, tv, move = (
+        agreement(measured_rank, simulated_rank),
+        total_variation(bars_one, bars_two),
+        wasserstein(bars_one, bars_two),
+    )
+    kappa = cohen_kappa(measured_rank, simulated_rank)
     bounds = _pair_intervals(a, b, (agree, kappa, tv, move), replicates, seed)
     return RankFit(
         histogram=bars_two,
-        histogram_ci95=_histogram_intervals(two[two >= 1], replicates, seed),
-        out_of_coverage=int((two == 0).sum()),
+        histogram_ci95=_histogram_intervals(simulated_rank[simulated_rank >= 1], replicates, seed),
+        out_of_coverage=int((simulated_rank == 0).sum()),
         agreement=agree,
         agreement_ci95=bounds[0],
         kappa=kappa,
@@ -847,9 +863,9 @@ def compare_ranks(
         total_variation_ci95=bounds[2],
         wasserstein=move,
         wasserstein_ci95=bounds[3],
-        confusion=confusion_matrix(one, two),
-        p_agreement=shift_test(one, two),
-        p_histogram=histogram_test(one, two, replicates=replicates, seed=seed),
+        confusion=confusion_matrix(measured_rank, simulated_rank),
+        p_agreement=shift_test(measured_rank, simulated_rank),
+        p_histogram=histogram_test(measured_rank, simulated_rank, replicates=replicates, seed=seed),
     )
 
 
@@ -932,8 +948,8 @@ def repeat_rank(
     RankRepeat
         Kappa, its interval, agreement and the number of pairs; NaN without pairs.
     """
-    one, two = _ranks(rank), _ranks(other_rank)
-    known, other_known = np.flatnonzero(one >= 1), np.flatnonzero(two >= 1)
+    ranks, other_ranks = _ranks(rank), _ranks(other_rank)
+    known, other_known = np.flatnonzero(ranks >= 1), np.flatnonzero(other_ranks >= 1)
     here, there = same_places(
         np.asarray(position_m)[known],
         np.asarray(other_position_m)[other_known],
@@ -941,7 +957,7 @@ def repeat_rank(
         heading_deg=None if heading_deg is None else heading_deg[known],
         other_heading_deg=None if other_heading_deg is None else other_heading_deg[other_known],
     )
-    first, second = one[known[here]], two[other_known[there]]
+    first, second = ranks[known[here]], other_ranks[other_known[there]]
     if not len(first):
         return RankRepeat(kappa=float("nan"), kappa_ci95=NO_INTERVAL, agreement=float("nan"), n=0)
     agree, kappa = agreement(first, second), cohen_kappa(first, second)
@@ -972,10 +988,10 @@ def _pair_intervals(
     """Intervals of agreement, kappa, total variation and Wasserstein from one bootstrap of the pairs."""
     if len(a) < 2:
         return [NO_INTERVAL] * 4
-    equal, one, two = (a == b).astype(np.float64), _indicators(a), _indicators(b)
-    columns = np.column_stack([equal, one, two])
+    equal, first, second = (a == b).astype(np.float64), _indicators(a), _indicators(b)
+    columns = np.column_stack([equal, first, second])
     intervals: list[Interval] = []
-    for influence, statistic, bounds in _pair_statistics(equal, one, two):
+    for influence, statistic, bounds in _pair_statistics(equal, first, second):
         known = autocorrelation(influence)
         drawn = statistic(bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed))
         value = values[len(intervals)]
@@ -988,16 +1004,16 @@ def _pair_intervals(
 
 
 def _pair_statistics(
-    equal: FloatArray, one: FloatArray, two: FloatArray
+    equal: FloatArray, first: FloatArray, second: FloatArray
 ) -> list[tuple[FloatArray, Callable[[FloatArray], FloatArray], tuple[float, float]]]:
     """Agreement, kappa, total variation and Wasserstein distance of paired ranks.
 
     For each: what a pose adds to it (n,), to first order; the statistic as a function of means (r, 1 + 2 MAX_RANK) of
     agreement and indicators; and its range.
     """
-    p, q = one.mean(axis=0), two.mean(axis=0)
+    p, q = first.mean(axis=0), second.mean(axis=0)
     agree, chance = float(equal.mean()), float(p @ q)
-    by_chance = one @ q + two @ p
+    by_chance = first @ q + second @ p
     left = max(1.0 - chance, 1e-12)
     apart = np.sign(np.cumsum(p - q))
 
@@ -1018,8 +1034,8 @@ def _pair_statistics(
     return [
         (equal, lambda means: means[:, 0], (0.0, 1.0)),
         (equal / left + (agree - 1.0) / left**2 * by_chance, kappa, (-1.0, 1.0)),
-        ((one - two) @ np.sign(p - q), distance, (0.0, 1.0)),
-        (np.cumsum(one - two, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
+        ((first - second) @ np.sign(p - q), distance, (0.0, 1.0)),
+        (np.cumsum(first - second, axis=1) @ apart, move, (0.0, MAX_RANK - 1.0)),
     ]
 
 
@@ -1038,6 +1054,6 @@ class KappaParts:
 
 def kappa_parts(measured: IntArray, simulated: IntArray) -> KappaParts:
     """Parts of kappa of paired ranks (n,), each 1 .. ``MAX_RANK``."""
-    equal, one, two = (measured == simulated).astype(np.float64), _indicators(measured), _indicators(simulated)
-    influence, kappa, _ = _pair_statistics(equal, one, two)[1]
-    return KappaParts(columns=np.column_stack([equal, one, two]), influence=influence, kappa=kappa)
+    equal, first, second = (measured == simulated).astype(np.float64), _indicators(measured), _indicators(simulated)
+    influence, kappa, _ = _pair_statistics(equal, first, second)[1]
+    return KappaParts(columns=np.column_stack([equal, first, second]), influence=influence, kappa=kappa)

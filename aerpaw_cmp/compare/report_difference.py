@@ -141,7 +141,7 @@ def level_difference(
     """
     moved = _apart(first[1], second[1])
     both = np.isfinite(first[2]) & np.isfinite(second[2])
-    one, two = first[2][both], second[2][both]
+    first_error, second_error = first[2][both], second[2][both]
     return LevelDifference(
         tower=tower,
         channel=channel,
@@ -151,15 +151,15 @@ def level_difference(
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
-        rmse=paired_difference(two, one, replicates=replicates),
-        mae_db=mae_difference(one, two, replicates=replicates),
+        rmse=paired_difference(second_error, first_error, replicates=replicates),
+        mae_db=mae_difference(first_error, second_error, replicates=replicates),
     )
 
 
-def _apart(one: FloatArray, two: FloatArray) -> FloatArray:
+def _apart(first: FloatArray, second: FloatArray) -> FloatArray:
     """Differences where both sides have a value."""
-    both = np.isfinite(one) & np.isfinite(two)
-    return np.asarray(two[both] - one[both], dtype=np.float64)
+    both = np.isfinite(first) & np.isfinite(second)
+    return np.asarray(second[both] - first[both], dtype=np.float64)
 
 
 def _largest(values: FloatArray) -> float:
@@ -196,13 +196,13 @@ def mae_difference(
     if not len(error_db):
         nan = float("nan")
         return Changed(first=nan, second=nan, difference=nan)
-    one, two = np.abs(error_db - error_db.mean()), np.abs(other_db - other_db.mean())
-    loss = two - one
+    first, second = np.abs(error_db - error_db.mean()), np.abs(other_db - other_db.mean())
+    loss = second - first
     estimate = float(loss.mean())
     known = autocorrelation(loss)
     drawn = bootstrap_means(loss[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
     bounds = interval(estimate, drawn, known)
-    return Changed(first=float(one.mean()), second=float(two.mean()), difference=estimate, ci95=bounds)
+    return Changed(first=float(first.mean()), second=float(second.mean()), difference=estimate, ci95=bounds)
 
 
 def pooled_difference(
@@ -222,17 +222,17 @@ def pooled_difference(
     What a sample adds to the difference of the mean squares is its own difference less the mean of its link. These are
     put in order of time over all links, so that blocks hold what the links share at an instant.
     """
-    time, one, two, added = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    time, errors, other_errors, added = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for instants, first, second in links:
         both = np.isfinite(first) & np.isfinite(second)
         if both.any():
             a, b = first[both] - first[both].mean(), second[both] - second[both].mean()
             loss = b * b - a * a
             time.append(instants[both])
-            one.append(a)
-            two.append(b)
+            errors.append(a)
+            other_errors.append(b)
             added.append(loss - loss.mean())
-    a, b = np.concatenate(one), np.concatenate(two)
+    a, b = np.concatenate(errors), np.concatenate(other_errors)
     if not len(a):
         return paired_difference(b, a)
     influence = np.concatenate(added)[np.argsort(np.concatenate(time), kind="stable")]
@@ -285,8 +285,8 @@ def rank_difference(
     pairs = [np.nan_to_num(np.column_stack(pair)) for pair in (first, second)]
     usable = np.column_stack([*pairs])
     both = (usable >= 1).all(axis=1) & (usable <= MAX_RANK).all(axis=1)
-    one, two = (pair[both].astype(np.int64) for pair in pairs)
-    agree, kappa = _agreement_change(one, two, replicates, seed)
+    first_rank, second_rank = (pair[both].astype(np.int64) for pair in pairs)
+    agree, kappa = _agreement_change(first_rank, second_rank, replicates, seed)
     return RankDifference(
         tower=tower,
         k=k,
@@ -298,13 +298,13 @@ def rank_difference(
     )
 
 
-def _agreement_change(one: IntArray, two: IntArray, replicates: int, seed: int) -> tuple[Changed, Changed]:
+def _agreement_change(first: IntArray, second: IntArray, replicates: int, seed: int) -> tuple[Changed, Changed]:
     """Agreement and kappa of two reports on the same poses, each (n, 2): measured and simulated rank."""
-    agree = [agreement(*pairs.T) for pairs in (one, two)]
-    kappa = [cohen_kappa(*pairs.T) for pairs in (one, two)]
-    if len(one) < 2:
+    agree = [agreement(*pairs.T) for pairs in (first, second)]
+    kappa = [cohen_kappa(*pairs.T) for pairs in (first, second)]
+    if len(first) < 2:
         return _changed(*agree), _changed(*kappa)
-    parts = [kappa_parts(*pairs.T) for pairs in (one, two)]
+    parts = [kappa_parts(*pairs.T) for pairs in (first, second)]
     width = parts[0].columns.shape[1]
     columns = np.column_stack([part.columns for part in parts])
 

@@ -780,14 +780,14 @@ def channel_difference(
     ChannelDifference
         Mean and spread of first minus second [dB], their correlation, and the spans where they part; NaN without pairs.
     """
-    one, two = _levels(first_db), _levels(second_db)
-    ok = np.isfinite(one) & np.isfinite(two)
+    first, second = _levels(first_db), _levels(second_db)
+    ok = np.isfinite(first) & np.isfinite(second)
     if not ok.any():
         nan = float("nan")
         return ChannelDifference(
             n=0, mean_db=nan, std_db=nan, correlation=nan, share_parted=nan, interval_std_db=NO_INTERVAL, spans=[]
         )
-    difference = one - two
+    difference = first - second
     mean = float(difference[ok].mean())
     residual = difference - mean
     spans = error_spans(
@@ -797,8 +797,8 @@ def channel_difference(
         n=int(ok.sum()),
         mean_db=mean,
         std_db=float(residual[ok].std()),
-        correlation=correlation(one, two),
+        correlation=correlation(first, second),
         share_parted=float(np.mean(np.abs(residual[ok]) > part_db)),
-        interval_std_db=error_intervals(two[ok], one[ok]).rmse_db,
+        interval_std_db=error_intervals(second[ok], first[ok]).rmse_db,
         spans=spans,
     )

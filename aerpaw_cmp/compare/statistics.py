@@ -157,8 +157,8 @@ def _exponential(covariance: FloatArray, n: int) -> tuple[float, float]:
         return float(covariance[0]), 0.0
     below = np.flatnonzero(correlation[1:] <= 0.5)
     last = min(max(2, int(below[0]) + 1 if len(below) else len(correlation)), len(correlation) - 1)
-    one, two = correlation[1:last], correlation[2 : last + 1]
-    decay = float(np.clip(one @ two / (one @ one), 0.0, 1.0 - 1.0 / n))
+    earlier, later = correlation[1:last], correlation[2 : last + 1]
+    decay = float(np.clip(earlier @ later / (earlier @ earlier), 0.0, 1.0 - 1.0 / n))
     share = min(1.0, float(correlation[1]) / decay) if decay > 0 else 0.0
     kept = covariance[0] * share * decay
     return float(covariance[0] + 2.0 * kept / (1.0 - decay)), float(kept / (1.0 - decay) ** 2)
@@ -462,9 +462,9 @@ def _correlation_of_residual(spread: float, with_residual: FloatArray, residual:
     return np.asarray(np.where((spread > 0) & (variance > 0), np.clip(r, -1.0, 1.0), np.nan))
 
 
-def correlation(one: ArrayLike, two: ArrayLike) -> float:
+def correlation(first: ArrayLike, second: ArrayLike) -> float:
     """Pearson correlation over pairs without NaN; NaN where a side is constant or fewer than two pairs exist."""
-    a, b = np.asarray(one, dtype=np.float64), np.asarray(two, dtype=np.float64)
+    a, b = np.asarray(first, dtype=np.float64), np.asarray(second, dtype=np.float64)
     ok = np.isfinite(a) & np.isfinite(b)
     if ok.sum() < 2 or np.ptp(a[ok]) == 0.0 or np.ptp(b[ok]) == 0.0:
         return float("nan")
@@ -568,31 +568,34 @@ def paired_difference(
     >>> paired_difference([3.0, -3.0, 3.0, -3.0], [1.0, -1.0, 1.0, -1.0]).difference_db
     2.0
     """
-    one, two = (np.asarray(values, dtype=np.float64).ravel() for values in (error_db, other_error_db))
-    if one.shape != two.shape:
-        raise ValueError(f"errors to compare must be of one length, found {len(one)} and {len(two)}")
-    both = np.isfinite(one) & np.isfinite(two)
-    one, two = one[both], two[both]
-    if not len(one):
+    first, second = (np.asarray(values, dtype=np.float64).ravel() for values in (error_db, other_error_db))
+    if first.shape != second.shape:
+        raise ValueError(f"errors to compare must be of one length, found {len(first)} and {len(second)}")
+    both = np.isfinite(first) & np.isfinite(second)
+    first, second = first[both], second[both]
+    if not len(first):
         return _no_pair()
     if free_offset:
-        one, two = one - one.mean(), two - two.mean()
-    loss = one * one - two * two
+        first, second = first - first.mean(), second - second.mean()
+    loss = first * first - second * second
     known = autocorrelation(loss)
-    if np.ptp(loss) > 0 and min(autocorrelation(one).n_effective, autocorrelation(two).n_effective) < _FEWEST_OF_PAIR:
+    if (
+        np.ptp(loss) > 0
+        and min(autocorrelation(first).n_effective, autocorrelation(second).n_effective) < _FEWEST_OF_PAIR
+    ):
         known = dataclasses.replace(known, n_effective=1.0)
-    columns = np.column_stack([loss, one, two])
+    columns = np.column_stack([loss, first, second])
     drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
     difference = drawn[:, 0]
     if free_offset:
         difference = difference - drawn[:, 1] ** 2 + drawn[:, 2] ** 2
     estimate = float(loss.mean())
     low, high = interval(estimate, difference, known)
-    rmse, other = float(np.sqrt(np.mean(one * one))), float(np.sqrt(np.mean(two * two)))
+    rmse, other = float(np.sqrt(np.mean(first * first))), float(np.sqrt(np.mean(second * second)))
     scale = 1.0 / (rmse + other) if rmse + other > 0 else 0.0
     spread = _spread(difference) * known.half_width / 1.959964 if known.enough else float("nan")
     return PairedDifference(
-        n=len(one),
+        n=len(first),
         rmse_db=rmse,
         other_rmse_db=other,
         difference_db=rmse - other,

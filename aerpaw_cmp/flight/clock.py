@@ -433,11 +433,11 @@ def _held_out(sampled_channels: Sequence[Sampled], estimate: ClockEstimate, lags
             gain += float(np.sum(squares["uncorrected"][-1] - squares["corrected"][-1]))
         improved += gain > 0
     second = np.concatenate([t.t[t.block == block] for block in range(blocks) for t in tables])
-    one, two = (np.concatenate(squares[name]) for name in ("corrected", "uncorrected"))
-    ok = np.isfinite(one) & np.isfinite(two)
+    with_clock, without_clock = (np.concatenate(squares[name]) for name in ("corrected", "uncorrected"))
+    ok = np.isfinite(with_clock) & np.isfinite(without_clock)
     _, place = np.unique(np.floor(second[ok]), return_inverse=True)
     count = np.bincount(place)
-    corrected, uncorrected = (np.sqrt(np.bincount(place, side[ok]) / count) for side in (one, two))
+    corrected, uncorrected = (np.sqrt(np.bincount(place, side[ok]) / count) for side in (with_clock, without_clock))
     paired = paired_difference(corrected, uncorrected, free_offset=False)
     return HeldOutBlocks(blocks=blocks, improved=improved, paired=paired)
 

@@ -125,7 +125,7 @@ def _origin(file: IngestedFile, flight: Flight) -> Origin | None:
 
 
 def _home(file: IngestedFile, groups: list[Flight]) -> Flight:
-    """The flight of a file without a wall clock; a new one is added to ``found``."""
+    """The flight of a file without a wall clock; a new one is added to ``groups``."""
     # what holds both levels and positions is a flight by itself: with another in its own time it shares none
     alone = Flight([file]).complete
     known = [flight for flight in groups if flight.span is not None] if alone else groups

@@ -295,9 +295,9 @@ def _tolerance() -> float:
     return ATTITUDE_TOLERANCE_RAD
 
 
-def _angle(one: FloatArray, two: FloatArray) -> float:
+def _angle(first: FloatArray, second: FloatArray) -> float:
     """Largest difference of two rotations' entries [rad]."""
-    return float(np.abs(one - two).max())
+    return float(np.abs(first - second).max())
 
 
 def _logged_attitudes(files: Sequence[IngestedFile]) -> tuple[AnyArray, FloatArray]:

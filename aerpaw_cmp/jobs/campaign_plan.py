@@ -281,7 +281,7 @@ def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -
 def compute(
     tasks: Sequence[Task], orders: Mapping[int, Order], workers: Workers, progress: Progress, outcomes: Outcomes
 ) -> None:
-    """Let the workers do what is to do; each outcome is put into ``found``.
+    """Let the workers do what is to do; each outcome is put into ``outcomes``.
 
     Parameters
     ----------

@@ -77,8 +77,8 @@ class RankBench:
             reported.append(series.rank[known][said >= 1])
             simulated.append(said[said >= 1])
         joined = (np.concatenate(part) if part else np.zeros(0) for part in (reported, simulated))
-        one, two = (np.minimum(part, MAX_RANK).astype(np.int64) for part in joined)
-        return one, two
+        reported_rank, simulated_rank = (np.minimum(part, MAX_RANK).astype(np.int64) for part in joined)
+        return reported_rank, simulated_rank
 
     def thinned(self, samples: int) -> RankBench:
         """Evenly spread reports of every series."""
@@ -105,13 +105,16 @@ def shares_by_rank(reported: IntArray, simulated: IntArray) -> FloatArray:
 def loss(benches: Sequence[RankBench], point: Point, criterion: Criterion) -> float:
     """What the search lowers, mean over flights: 1 - kappa, total variation, or the log score [nats]."""
     pairs = [bench.pairs(point) for bench in benches]
-    pairs = [(one, two) for one, two in pairs if len(one)]
+    pairs = [(reported, simulated) for reported, simulated in pairs if len(reported)]
     if not pairs:
         return float("nan")
     if criterion == "kappa":
-        each = [1.0 - np.nan_to_num(ranks.cohen_kappa(one, two)) for one, two in pairs]
+        each = [1.0 - np.nan_to_num(ranks.cohen_kappa(reported, simulated)) for reported, simulated in pairs]
     elif criterion == "total_variation":
-        each = [ranks.total_variation(ranks.histogram(one), ranks.histogram(two)) for one, two in pairs]
+        each = [
+            ranks.total_variation(ranks.histogram(reported), ranks.histogram(simulated))
+            for reported, simulated in pairs
+        ]
     else:
         each = [float(np.mean(_log_losses(pairs, i))) for i in range(len(pairs))]
     return float(np.mean(each))
@@ -294,8 +297,8 @@ def _rows(
 
 
 def _joined(pairs: Sequence[tuple[IntArray, IntArray]]) -> tuple[IntArray, IntArray]:
-    one, two = (np.concatenate(part) for part in zip(*pairs, strict=True))
-    return one, two
+    reported, simulated = (np.concatenate(part) for part in zip(*pairs, strict=True))
+    return reported, simulated
 
 
 def _mean(values: Any) -> float:

@@ -354,44 +354,44 @@ def _repeatability(
 def pairs_of(results: Sequence[RssResult]) -> list[PairResult]:
     """Every two channels of a tower against each other, where they have instants in common."""
     out = []
-    for one, two in combinations(results, 2):
-        if one.tower != two.tower:
+    for channel, other_channel in combinations(results, 2):
+        if channel.tower != other_channel.tower:
             continue
-        here, there = _same_instants(one.time, two.time)
+        here, there = _same_instants(channel.time, other_channel.time)
         if not len(here):
             continue
-        first, second = one.calibrated_db[here], two.calibrated_db[there]
-        position = one.position_m[here]
-        context = {"height_m": position[:, 2], "elevation_deg": one.geometry["elevation_deg"][here]}
-        if "heading_deg" in one.geometry:
-            context["heading_deg"] = one.geometry["heading_deg"][here]
+        first, second = channel.calibrated_db[here], other_channel.calibrated_db[there]
+        position = channel.position_m[here]
+        context = {"height_m": position[:, 2], "elevation_deg": channel.geometry["elevation_deg"][here]}
+        if "heading_deg" in channel.geometry:
+            context["heading_deg"] = channel.geometry["heading_deg"][here]
         out.append(
             PairResult(
-                tower=one.tower,
-                first=one.channel,
-                second=two.channel,
-                time=one.time[here],
+                tower=channel.tower,
+                first=channel.channel,
+                second=other_channel.channel,
+                time=channel.time[here],
                 difference_db=first - second,
-                simulated_difference_db=one.simulated_dbm[here] - two.simulated_dbm[there],
-                score=rss.channel_difference(one.time[here], first, second, position_m=position, context=context),
+                simulated_difference_db=channel.simulated_dbm[here] - other_channel.simulated_dbm[there],
+                score=rss.channel_difference(channel.time[here], first, second, position_m=position, context=context),
             )
         )
     return out
 
 
-def _same_instants(one: Any, two: Any) -> tuple[IntArray, IntArray]:
+def _same_instants(first: Any, second: Any) -> tuple[IntArray, IntArray]:
     """Samples of two series that were taken within half a sampling interval of each other."""
-    if len(one) == len(two) and (one == two).all():
-        return np.arange(len(one)), np.arange(len(two))
-    if len(one) < 2 or not len(two):
+    if len(first) == len(second) and (first == second).all():
+        return np.arange(len(first)), np.arange(len(second))
+    if len(first) < 2 or not len(second):
         return np.arange(0), np.arange(0)
-    order = np.argsort(two, kind="stable")
-    ahead = np.clip(np.searchsorted(two[order], one), 0, len(two) - 1)
+    order = np.argsort(second, kind="stable")
+    ahead = np.clip(np.searchsorted(second[order], first), 0, len(second) - 1)
     before = np.maximum(ahead - 1, 0)
-    nearer = np.abs(two[order[before]] - one) < np.abs(two[order[ahead]] - one)
+    nearer = np.abs(second[order[before]] - first) < np.abs(second[order[ahead]] - first)
     nearest = order[np.where(nearer, before, ahead)]
-    limit = 0.5 * np.median(np.abs(np.diff(one)))
-    here = np.flatnonzero(np.abs(two[nearest] - one) <= limit)
+    limit = 0.5 * np.median(np.abs(np.diff(first)))
+    here = np.flatnonzero(np.abs(second[nearest] - first) <= limit)
     return here, nearest[here]
 
 

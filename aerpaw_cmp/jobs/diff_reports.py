@@ -80,14 +80,14 @@ def run_diff(
     """
     if not tolerance_db >= 0:
         raise UsageError(f"a tolerance of {tolerance_db} dB", expected="0 or more")
-    one, two = read_report(first), read_report(second)
-    _same_flight(one, two)
+    first_report, second_report = read_report(first), read_report(second)
+    _same_flight(first_report, second_report)
     if out is None:
-        return compare_reports(one, two, tolerance_db)
+        return compare_reports(first_report, second_report, tolerance_db)
     from ..report.diff_html import write_diff
 
-    with OutputFolder(out, job="diff", inputs=[*one.files, *two.files], force=force) as output:
-        diff = compare_reports(one, two, tolerance_db)
+    with OutputFolder(out, job="diff", inputs=[*first_report.files, *second_report.files], force=force) as output:
+        diff = compare_reports(first_report, second_report, tolerance_db)
         with output.filling() as place:
             write_diff(diff, place)
     return diff
@@ -240,45 +240,45 @@ def _against_metrics(metrics: Mapping[str, Any], rss: Any, folder: Path) -> list
     return [f"{folder}: rss.csv and metrics.json do not have the same number of scored samples: {', '.join(wrong)}."]
 
 
-def _same_flight(one: ReadReport, two: ReadReport) -> None:
+def _same_flight(first: ReadReport, second: ReadReport) -> None:
     """UsageError for reports that have neither name nor log in common."""
-    names = [side.metrics["flight"] for side in (one, two)]
-    logs = [{i.get("sha256") for i in side.metrics["inputs"] if i.get("reader")} for side in (one, two)]
+    names = [side.metrics["flight"] for side in (first, second)]
+    logs = [{i.get("sha256") for i in side.metrics["inputs"] if i.get("reader")} for side in (first, second)]
     if names[0] != names[1] and not logs[0] & logs[1]:
         raise UsageError(
             f"reports of different flights: {one_line(str(names[0]))} and {one_line(str(names[1]))}, without a log "
             "in common",
             expected="two reports of one flight (campaign compares flights)",
-            path=two.place,
+            path=second.place,
         )
 
 
 # --- comparing ------------------------------------------------------------------------------------------------------
 
 
-def compare_reports(one: ReadReport, two: ReadReport, tolerance_db: float = TOLERANCE_DB) -> ReportDiff:
+def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float = TOLERANCE_DB) -> ReportDiff:
     """Everything that differs between two reports."""
-    levels, residuals = _levels(one, two)
-    first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (one, two))
-    pooled = sum(len(one[0]) for one in residuals)
-    alone = [sorted(_links(a) - _links(b)) for a, b in ((one, two), (two, one))]
+    levels, residuals = _levels(first, second)
+    first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (first, second))
+    pooled = sum(len(of_link[0]) for of_link in residuals)
+    alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
-        first=_side(one),
-        second=_side(two),
-        settings=tuple(_entries(one.metrics["settings"], two.metrics["settings"])),
-        inputs=tuple(_inputs(one.metrics["inputs"], two.metrics["inputs"])),
-        versions=tuple(_entries(one.metrics["versions"], two.metrics["versions"])),
-        stages=tuple(_stages(one.metrics["stages"], two.metrics["stages"])),
-        numbers=tuple(_numbers(one.metrics, two.metrics, tolerance_db)),
+        first=_side(first),
+        second=_side(second),
+        settings=tuple(_entries(first.metrics["settings"], second.metrics["settings"])),
+        inputs=tuple(_inputs(first.metrics["inputs"], second.metrics["inputs"])),
+        versions=tuple(_entries(first.metrics["versions"], second.metrics["versions"])),
+        stages=tuple(_stages(first.metrics["stages"], second.metrics["stages"])),
+        numbers=tuple(_numbers(first.metrics, second.metrics, tolerance_db)),
         levels=tuple(levels),
-        ranks=tuple(_ranks(one, two)),
+        ranks=tuple(_ranks(first, second)),
         pooled=pooled_difference(residuals, replicates=_replicates(pooled)) if residuals else None,
         new_warnings=tuple(text for text in second_warnings if text not in first_warnings),
         gone_warnings=tuple(text for text in first_warnings if text not in second_warnings),
         links_first_only=tuple(alone[0]),
         links_second_only=tuple(alone[1]),
         tolerance_db=tolerance_db,
-        remarks=(*one.remarks, *two.remarks),
+        remarks=(*first.remarks, *second.remarks),
     )
 
 
@@ -311,10 +311,10 @@ def flat(value: Any, key: str = "") -> Iterator[tuple[str, Any]]:
 
 def _entries(first: Any, second: Any) -> Iterator[Entry]:
     """Keys whose values differ."""
-    one, two = dict(flat(first)), dict(flat(second))
-    for key in [*one, *(key for key in two if key not in one)]:
-        if (key in one) != (key in two) or one[key] != two[key]:
-            yield Entry(key=key, first=one.get(key), second=two.get(key))
+    first_values, second_values = dict(flat(first)), dict(flat(second))
+    for key in [*first_values, *(key for key in second_values if key not in first_values)]:
+        if (key in first_values) != (key in second_values) or first_values[key] != second_values[key]:
+            yield Entry(key=key, first=first_values.get(key), second=second_values.get(key))
 
 
 def _stages(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[Entry]:
@@ -324,9 +324,9 @@ def _stages(first: Mapping[str, Any], second: Mapping[str, Any]) -> Iterator[Ent
 
 def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterator[InputEntry]:
     """Files that were added, removed or changed; one that lies elsewhere with the same content is the same."""
-    one, two = ({(i.get("role", ""), i["path"]): i for i in side} for side in (first, second))
-    for key in dict.fromkeys([*one, *two]):
-        a, b = one.get(key), two.get(key)
+    first_inputs, second_inputs = ({(i.get("role", ""), i["path"]): i for i in side} for side in (first, second))
+    for key in dict.fromkeys([*first_inputs, *second_inputs]):
+        a, b = first_inputs.get(key), second_inputs.get(key)
         if a is not None and b is not None and a.get("sha256") == b.get("sha256"):
             continue
         here = a or b or {}
@@ -347,10 +347,12 @@ def _inputs(first: list[dict[str, Any]], second: list[dict[str, Any]]) -> Iterat
 
 def _numbers(first: Mapping[str, Any], second: Mapping[str, Any], tolerance_db: float) -> Iterator[Entry]:
     """Reported numbers that differ by more than the tolerance; words, and numbers of time, take no part."""
-    one, two = (dict(flat({k: v for k, v in side.items() if k not in _VOLATILE})) for side in (first, second))
-    for key in dict.fromkeys([*one, *two]):
-        a, b = one.get(key), two.get(key)
-        if "seconds" in key or ((key in one) != (key in two) and (a is None and b is None)):
+    first_numbers, second_numbers = (
+        dict(flat({k: v for k, v in side.items() if k not in _VOLATILE})) for side in (first, second)
+    )
+    for key in dict.fromkeys([*first_numbers, *second_numbers]):
+        a, b = first_numbers.get(key), second_numbers.get(key)
+        if "seconds" in key or ((key in first_numbers) != (key in second_numbers) and (a is None and b is None)):
             continue
         if _apart(a, b, tolerance_db):
             yield Entry(key=key, first=a, second=b)
@@ -370,7 +372,7 @@ def _apart(a: Any, b: Any, tolerance: float) -> bool:
 # --- samples --------------------------------------------------------------------------------------------------------
 
 
-def _matched(one: Any, two: Any) -> tuple[Overlap, Any, Any]:
+def _matched(mine: Any, theirs: Any) -> tuple[Overlap, Any, Any]:
     """Rows of two tables of one link at the same instant, in time order; several at one instant in their order."""
 
     def keyed(table: Any) -> Any:
@@ -378,7 +380,7 @@ def _matched(one: Any, two: Any) -> tuple[Overlap, Any, Any]:
         instant = table["time_utc"].where(table["time_utc"] != "", table["time_s"].map("{:.4f}".format))
         return table.assign(_key=instant, _turn=instant.groupby(instant).cumcount()).set_index(["_key", "_turn"])
 
-    first, second = keyed(one), keyed(two)
+    first, second = keyed(mine), keyed(theirs)
     if first.index.equals(second.index):
         return Overlap(first=len(first), second=len(second), common=len(first)), first, second
     common = first.index.intersection(second.index, sort=False)
@@ -418,19 +420,19 @@ def _instants(table: Any) -> FloatArray:
     return np.asarray(seconds.fillna(table["time_s"]), dtype=np.float64)
 
 
-def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
+def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference], list[_Residuals]]:
     """Each link that both have, and the residuals of its common samples."""
     differences: list[LevelDifference] = []
     residuals: list[_Residuals] = []
-    if one.rss is None or two.rss is None:
+    if mine.rss is None or theirs.rss is None:
         return differences, residuals
     names = ("measured_db", "simulated_dbm", "residual_db")
-    for tower, channels in one.metrics["rss"].items():
+    for tower, channels in mine.metrics["rss"].items():
         for channel, numbers in channels.items():
-            other = two.metrics["rss"].get(tower, {}).get(channel)
+            other = theirs.metrics["rss"].get(tower, {}).get(channel)
             if other is None:
                 continue
-            tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (one, two)]
+            tables = [s.rss[(s.rss["tower"] == tower) & (s.rss["channel"] == channel)] for s in (mine, theirs)]
             overlap, a, b = _matched(*tables)
             first, second = ((_values(t, names[0]), _values(t, names[1]), _values(t, names[2])) for t in (a, b))
             offsets = [np.nan if n.get("offset_db") is None else float(n["offset_db"]) for n in (numbers, other)]
@@ -446,14 +448,16 @@ def _levels(one: ReadReport, two: ReadReport) -> tuple[list[LevelDifference], li
     return differences, residuals
 
 
-def _ranks(one: ReadReport, two: ReadReport) -> Iterator[RankDifference]:
-    if one.rank is None or two.rank is None:
+def _ranks(first: ReadReport, second: ReadReport) -> Iterator[RankDifference]:
+    if first.rank is None or second.rank is None:
         return
-    ks = [c.removeprefix(_SIMULATED) for c in one.rank.columns if c.startswith(_SIMULATED) and c in two.rank.columns]
-    for tower in one.metrics["rank"]:
-        if tower not in two.metrics["rank"]:
+    ks = [
+        c.removeprefix(_SIMULATED) for c in first.rank.columns if c.startswith(_SIMULATED) and c in second.rank.columns
+    ]
+    for tower in first.metrics["rank"]:
+        if tower not in second.metrics["rank"]:
             continue
-        overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (one, two)))
+        overlap, a, b = _matched(*(s.rank[s.rank["tower"] == tower] for s in (first, second)))
         for k in ks:
             pairs = [(_values(t, "measured_rank"), _values(t, f"{_SIMULATED}{k}")) for t in (a, b)]
             yield rank_difference(tower, k, overlap, pairs[0], pairs[1])

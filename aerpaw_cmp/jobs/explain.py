@@ -397,11 +397,11 @@ def _level(value: float) -> float | None:
 _Rows = dict[tuple[int, ...], tuple[int, ...]]
 
 
-def _by_plane(one: Replay, two: Replay) -> tuple[_Rows, _Rows]:
+def _by_plane(first: Replay, second: Replay) -> tuple[_Rows, _Rows]:
     """Face sequences of two replays by their planes: coplanar faces are the same mirror."""
-    plane = np.split(planes_of(joined(one.faces, two.faces)), [len(one.faces)])
+    plane = np.split(planes_of(joined(first.faces, second.faces)), [len(first.faces)])
     rows: list[_Rows] = []
-    for replay, number in zip((one, two), plane, strict=True):
+    for replay, number in zip((first, second), plane, strict=True):
         sequences = [tuple(row[row >= 0].tolist()) for row in replay.paths.faces]
         rows.append({tuple(number[list(s)].tolist()) if s else (): s for s in sequences})
     return rows[0], rows[1]

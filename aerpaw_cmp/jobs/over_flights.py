@@ -296,8 +296,8 @@ def _box(position_m: FloatArray) -> tuple[FloatArray, FloatArray]:
     return placed.min(axis=0, initial=np.inf), placed.max(axis=0, initial=-np.inf)
 
 
-def _near(one: tuple[FloatArray, FloatArray], two: tuple[FloatArray, FloatArray], radius_m: float) -> bool:
-    return bool((one[0] <= two[1] + radius_m).all() and (two[0] <= one[1] + radius_m).all())
+def _near(first: tuple[FloatArray, FloatArray], second: tuple[FloatArray, FloatArray], radius_m: float) -> bool:
+    return bool((first[0] <= second[1] + radius_m).all() and (second[0] <= first[1] + radius_m).all())
 
 
 def transfer_ranks(rows: Sequence[RankRow]) -> list[RankTransfer]:

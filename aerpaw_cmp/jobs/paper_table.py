@@ -75,7 +75,7 @@ def _spans(values: Any) -> str:
     return f"{low:g} m" if low == high else f"{low:g} to {high:g} m"
 
 
-def _rss_plate(outcome: MapOutcome, antennas: str, height: float) -> str:
+def _rss_figure(outcome: MapOutcome, antennas: str, height: float) -> str:
     return f"rss_map_{safe_name(f'{antennas}, foliage {outcome.settings.shown}, {height:g} m')}"
 
 
@@ -84,34 +84,34 @@ def _rss(outcome: MapOutcome) -> Iterator[PaperRow]:
     if not result.rss_altitudes_m:
         return
     low, high = result.rss_altitudes_m[0], result.rss_altitudes_m[-1]
-    plate = _rss_plate(outcome, "MIMO", low)
+    figure = _rss_figure(outcome, "MIMO", low)
     blocked = {tower: 1.0 - float(result.coverage("siso", tower)[0]) for tower in result.tower_names}
     worst, best = max(blocked, key=blocked.__getitem__), min(blocked, key=blocked.__getitem__)
     shares = ", ".join(f"{tower} {_percent(share)}" for tower, share in blocked.items())
     yield PaperRow(
         where="Fig. 10", what=f"tower with the largest blocked area ({low:g} m, Z of each tower)", paper="LW3",
-        ours=f"{worst} ({shares})", plate=plate,
+        ours=f"{worst} ({shares})", figure=figure,
     )  # fmt: skip
     yield PaperRow(
         where="Fig. 10", what="tower with the least blockage", paper="LW1",
-        ours=f"{best}", plate=plate,
+        ours=f"{best}", figure=figure,
     )  # fmt: skip
     alone = [float(np.mean([1.0 - result.coverage("siso", t)[i] for t in result.tower_names])) for i in _rows(result)]
     yield PaperRow(
         where="Fig. 10", what="blockage against height (mean Z of the towers)", paper="falls as the height grows",
-        ours=_by_height(result.rss_altitudes_m, alone), plate=f"rss_cdf_{safe_name(f'SISO, foliage {s.shown}')}",
+        ours=_by_height(result.rss_altitudes_m, alone), figure=f"rss_cdf_{safe_name(f'SISO, foliage {s.shown}')}",
     )  # fmt: skip
     joint = [1.0 - float(share) for share in result.coverage("siso")]
     yield PaperRow(
         where="Fig. 10", what="blockage with joint coverage (Z)",
         paper="significantly reduced at 30 m, none at 70 m and 110 m",
-        ours=_by_height(result.rss_altitudes_m, joint), plate=_rss_plate(outcome, "SISO", low),
+        ours=_by_height(result.rss_altitudes_m, joint), figure=_rss_figure(outcome, "SISO", low),
     )  # fmt: skip
     strong = [_spread(result.rss("siso")[i], 99.0) for i in _rows(result)]
     yield PaperRow(
         where="Fig. 10", what="higher values of joint RSS (99th percentile, SISO)",
         paper="slightly degraded at higher altitudes",
-        ours=_by_height(result.rss_altitudes_m, strong, "{:.1f} dBm"), plate=_rss_plate(outcome, "SISO", high),
+        ours=_by_height(result.rss_altitudes_m, strong, "{:.1f} dBm"), figure=_rss_figure(outcome, "SISO", high),
     )  # fmt: skip
     kinds: tuple[Antennas, Antennas] = ("mimo", "siso")
     widths = [[_spread(result.rss(a)[i], 95.0) - _spread(result.rss(a)[i], 5.0) for i in _rows(result)] for a in kinds]
@@ -121,7 +121,7 @@ def _rss(outcome: MapOutcome) -> Iterator[PaperRow]:
             f"{a.upper()} {_by_height(result.rss_altitudes_m, w, '{:.1f} dB')}"
             for a, w in zip(kinds, widths, strict=True)
         ),
-        plate=f"rss_cdf_{safe_name(f'MIMO, foliage {s.shown}')}",
+        figure=f"rss_cdf_{safe_name(f'MIMO, foliage {s.shown}')}",
     )  # fmt: skip
 
 
@@ -148,23 +148,23 @@ def _rank(outcome: MapOutcome) -> Iterator[PaperRow]:
     if not result.rank_altitudes_m:
         return
     shares = result.rank_shares()
-    plate = f"rank_share_{safe_name(f'foliage {outcome.settings.shown}')}"
+    figure = f"rank_share_{safe_name(f'foliage {outcome.settings.shown}')}"
     if 3.0 in result.rank_altitudes_m:
         row = result.rank_altitudes_m.index(3.0)
         yield PaperRow(
             where="Fig. 12", what="out of coverage at 3 m", paper="more than 60 %", ours=_percent(shares[row, 0, 0]),
-            plate=plate,
+            figure=figure,
         )  # fmt: skip
     covered = shares[:, :, 1:].sum(axis=(0, 2))
     one = shares[:, :, 1].sum(axis=0) / np.maximum(covered, 1e-300)
     low = shares[:, :, 1:3].sum(axis=(0, 2)) / np.maximum(covered, 1e-300)
     yield PaperRow(
         where="Fig. 12", what="share of rank 1 among covered positions, all heights", paper="falls as K grows",
-        ours=_by_k(result.ks, one), plate=plate,
+        ours=_by_k(result.ks, one), figure=figure,
     )  # fmt: skip
     yield PaperRow(
         where="Fig. 12", what="share of rank 1 or 2 among covered positions", paper="most receiver sites",
-        ours=_by_k(result.ks, low), plate=plate,
+        ours=_by_k(result.ks, low), figure=figure,
     )  # fmt: skip
     towers = result.towers_m[result.serving, :2]
     near = np.hypot(*(result.grid.points_m - towers).T) <= NEAR_M
@@ -176,7 +176,7 @@ def _rank(outcome: MapOutcome) -> Iterator[PaperRow]:
         where="Fig. 11", what=f"share of rank 2 or more within {NEAR_M:g} m of the serving tower",
         paper="rank 2 near the tower, an area that widens from K1 to K3",
         ours=f"{_by_k(result.ks, inside)}; beyond: {_by_k(result.ks, outside)}",
-        plate=f"rank_map_{safe_name(f'K = {k_key(result.ks[0])}, foliage {outcome.settings.shown}')}",
+        figure=f"rank_map_{safe_name(f'K = {k_key(result.ks[0])}, foliage {outcome.settings.shown}')}",
     )  # fmt: skip
 
 
@@ -199,12 +199,12 @@ def _correlation(outcome: MapOutcome) -> Iterator[PaperRow]:
             what={"rmse": "RMSE of the bi-exponential model"}.get(name, f"{name} of the bi-exponential model"),
             paper=f"{getattr(paper, name):g}",
             ours="; ".join(f"{getattr(outcome.studies[k].fit, name):.{digits}f} ({w})" for k, w in fits.items()),
-            plate="correlation",
+            figure="correlation",
         )
     at = np.array([30.0, 150.0, 500.0])
     yield PaperRow(
         where="Fig. 13", what="the model at 30 m, 150 m, 500 m", paper=_values(paper(at)),
-        ours="; ".join(f"{_values(outcome.studies[k].fit(at))} ({w})" for k, w in fits.items()), plate="correlation",
+        ours="; ".join(f"{_values(outcome.studies[k].fit(at))} ({w})" for k, w in fits.items()), figure="correlation",
     )  # fmt: skip
 
 
@@ -220,7 +220,7 @@ def _mean(values: Any) -> float:
 def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
     s, heights = outcome.settings, rank_fields(outcome.shown)[0]
     study: Study = outcome.studies["random"]
-    plate = "mae_leave_one_out_Z_as_rank_0_random_samples"
+    figure = "mae_leave_one_out_Z_as_rank_0_random_samples"
     yield PaperRow(
         where="section VII-C",
         what="samples M and radius r0",
@@ -238,24 +238,24 @@ def _interpolation(outcome: MapOutcome) -> Iterator[PaperRow]:
                 where="Fig. 14",
                 what=f"{measure.upper()} of Kriging, makima, spline, mean over heights and K, {samples}",
                 paper="Kriging below both" if measure == "mae" else "not stated",
-                ours=", ".join(f"{n} {m:.3f}" for n, m in means.items()), plate=where,
+                ours=", ".join(f"{n} {m:.3f}" for n, m in means.items()), figure=where,
             )  # fmt: skip
         kriging, makima, spline = (scores[name].mae for name in ("Kriging", "makima", "spline"))
         wins = int(((kriging <= makima) & (kriging <= spline)).sum())
         yield PaperRow(
             where="Fig. 14", what=f"combinations of height and K at which Kriging has the least MAE, {samples}",
-            paper="all", ours=f"{wins} of {kriging.size}", plate=where,
+            paper="all", ours=f"{wins} of {kriging.size}", figure=where,
         )  # fmt: skip
     kriging = study.scores["Kriging"].mae
     by_k = [_mean(column) for column in kriging.T]
     yield PaperRow(
         where="Fig. 14", what="MAE of Kriging by K, M random samples", paper="lowest for K1",
-        ours=", ".join(f"K = {k_key(k)}: {m:.3f}" for k, m in zip(outcome.shown.ks, by_k, strict=True)), plate=plate,
+        ours=", ".join(f"K = {k_key(k)}: {m:.3f}" for k, m in zip(outcome.shown.ks, by_k, strict=True)), figure=figure,
     )  # fmt: skip
     worst = [heights[int(np.nan_to_num(kriging[:, column], nan=-1.0).argmax())] for column in range(kriging.shape[1])]
     yield PaperRow(
         where="Fig. 14", what="height with the largest MAE of Kriging, M random samples", paper="30 m for every K",
-        ours=", ".join(f"K = {k_key(k)}: {h:g} m" for k, h in zip(outcome.shown.ks, worst, strict=True)), plate=plate,
+        ours=", ".join(f"K = {k_key(k)}: {h:g} m" for k, h in zip(outcome.shown.ks, worst, strict=True)), figure=figure,
     )  # fmt: skip
 
 
@@ -263,6 +263,6 @@ def paper_markdown(rows: Iterable[PaperRow]) -> str:
     """The rows as a Markdown table."""
     lines = ["| where | what | paper | here | figure |", "| --- | --- | --- | --- | --- |"]
     for row in rows:
-        figure = f"`figures/{row.plate}.svg`" if row.plate else ""
+        figure = f"`figures/{row.figure}.svg`" if row.figure else ""
         lines.append(f"| {row.where} | {row.what} | {row.paper} | {row.ours} | {figure} |")
     return "\n".join(lines) + "\n"

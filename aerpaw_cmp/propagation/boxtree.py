@@ -98,7 +98,7 @@ def _opened(tree, node, todo, waiting, hits, total):  # type: ignore[no-untyped-
 
 @njit(**OPTIONS)
 def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
-    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``found``; how many.
+    """Items whose leaf meets the box ``low``, ``high`` (3,), into ``hits``; how many.
 
     Parameters
     ----------
@@ -132,7 +132,7 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
 
 @njit(**OPTIONS)
 def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-def]
-    """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``found``; how many.
+    """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``hits``; how many.
 
     A plane (4,) is ``a x + b y + c z + d >= 0`` inside.
 
@@ -247,11 +247,11 @@ def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
     """
     enter, leave = 0.0, 1.0
     for axis in range(3):
-        one = (lower[node, axis] - a[axis]) * inverse[axis]
-        two = (upper[node, axis] - a[axis]) * inverse[axis]
-        if one > two:
-            one, two = two, one
+        at_lower = (lower[node, axis] - a[axis]) * inverse[axis]
+        at_upper = (upper[node, axis] - a[axis]) * inverse[axis]
+        if at_lower > at_upper:
+            at_lower, at_upper = at_upper, at_lower
         # rounding must not lose a box that is only just met
-        enter = max(enter, one - 1e-12 * abs(one))
-        leave = min(leave, two + 1e-12 * abs(two))
+        enter = max(enter, at_lower - 1e-12 * abs(at_lower))
+        leave = min(leave, at_upper + 1e-12 * abs(at_upper))
     return enter > leave

@@ -69,8 +69,8 @@ class _Facets:
 
     @classmethod
     def of(cls, corners_m: FloatArray, number: IntArray) -> _Facets:
-        one, two = corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]
-        normal = np.cross(one, two)
+        edge, other_edge = corners_m[:, 1] - corners_m[:, 0], corners_m[:, 2] - corners_m[:, 0]
+        normal = np.cross(edge, other_edge)
         normal /= np.linalg.norm(normal, axis=1, keepdims=True)
         offset = np.einsum("fi,fi->f", normal, corners_m[:, 0])
         inward = np.cross(normal[:, None], np.roll(corners_m, -1, axis=1) - corners_m)
@@ -443,8 +443,8 @@ def _shadows(beams: _Beams, rows: IntArray, low_m: float, high_m: float) -> tupl
     rise = ray[:, 2]
     endless = np.isinf(beams.floor_m[rows]) & np.isinf(beams.ceiling_m[rows])
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, two = (low_m - image[2]) / rise, (high_m - image[2]) / rise
-    first, last = np.minimum(one, two), np.maximum(one, two)  # 1 is the facet
+        at_low, at_high = (low_m - image[2]) / rise, (high_m - image[2]) / rise
+    first, last = np.minimum(at_low, at_high), np.maximum(at_low, at_high)  # 1 is the facet
     across = (first < 1.0).any(axis=0)  # the facet itself may take part in the bounds
     share = np.stack([np.maximum(first, 1.0), np.maximum(last, 1.0), np.where(across, 1.0, first)])
     share[..., endless] = 1.0

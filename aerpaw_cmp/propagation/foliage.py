@@ -454,11 +454,11 @@ class CrownIndex:
 def _slab(at: FloatArray, step: FloatArray, low: AnyArray, high: AnyArray) -> tuple[FloatArray, FloatArray]:
     """Interval of t in [0, 1] with ``low <= at + t step <= high``; first > last when there is none."""
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, two = (low - at) / step, (high - at) / step
+        at_low, at_high = (low - at) / step, (high - at) / step
     level = step == 0
     inside = (at >= low) & (at <= high)
-    first = np.where(level, np.where(inside, 0.0, 1.0), np.maximum(np.minimum(one, two), 0.0))
-    last = np.where(level, np.where(inside, 1.0, 0.0), np.minimum(np.maximum(one, two), 1.0))
+    first = np.where(level, np.where(inside, 0.0, 1.0), np.maximum(np.minimum(at_low, at_high), 0.0))
+    last = np.where(level, np.where(inside, 1.0, 0.0), np.minimum(np.maximum(at_low, at_high), 1.0))
     return first, last
 
 
@@ -496,10 +496,10 @@ def _quadric_share(
     # q avoids the cancellation of -b + sqrt(...); a = 0 (parallel to the cone's side) gives one root at infinity
     q = -(b + np.copysign(np.sqrt(np.maximum(root2, 0.0)), b))
     with np.errstate(divide="ignore", invalid="ignore"):
-        one, two = q / np.where(a == 0, 0.0, a), c / q
+        root, other_root = q / np.where(a == 0, 0.0, a), c / q
     nothing = q == 0  # b = 0 and a c = 0
-    one, two = np.where(nothing, 0.0, one), np.where(nothing, 0.0, two)
-    lower, upper = np.minimum(one, two), np.maximum(one, two)
+    root, other_root = np.where(nothing, 0.0, root), np.where(nothing, 0.0, other_root)
+    lower, upper = np.minimum(root, other_root), np.maximum(root, other_root)
     steep = a < 0  # steeper than the cone's side: inside before the first root (rising) or after the second (falling)
     lower, upper = (
         np.where(steep, np.where(rise > 0, -np.inf, upper), lower),

@@ -414,8 +414,8 @@ def without_coincident(paths: PathSet, surfaces: Surfaces) -> PathSet:
         apart = np.abs(points[:, None] - points[None]).max(axis=(2, 3))
         normal = surfaces.faces.normal[paths.faces[rows, :depth]]
         alike = (np.abs(np.einsum("akc,bkc->abk", normal, normal)) > 0.999).all(axis=2)
-        one, two = np.nonzero(np.triu((apart < COINCIDENT_M) & alike, 1))
-        for i, j in zip(one, two, strict=True):
+        first, second = np.nonzero(np.triu((apart < COINCIDENT_M) & alike, 1))
+        for i, j in zip(first, second, strict=True):
             if not gone[rows[i]]:
                 gone[rows[j]] = True
     return paths.select(~gone)

@@ -74,11 +74,11 @@ def turn_sine_cosine(turns: float) -> tuple[float, float]:
         )
     )
     odd = quarter * quarter == 1.0
-    one = cosine if odd else sine
-    two = sine if odd else cosine
+    sine_there = cosine if odd else sine
+    cosine_there = sine if odd else cosine
     return (
-        -one if quarter < 0.0 or quarter > 1.5 else one,
-        -two if quarter > 0.5 or quarter < -1.5 else two,
+        -sine_there if quarter < 0.0 or quarter > 1.5 else sine_there,
+        -cosine_there if quarter > 0.5 or quarter < -1.5 else cosine_there,
     )
 
 

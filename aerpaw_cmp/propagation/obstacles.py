@@ -69,15 +69,15 @@ def first_obstacle(surfaces: Surfaces, corners_m: FloatArray, sequence: IntArray
 def _hits(surfaces: Surfaces, a: FloatArray, b: FloatArray) -> tuple[IntArray, FloatArray]:
     """Faces whose triangles a segment meets, and where along it: Moeller and Trumbore (1997)."""
     corner = surfaces.corners_m
-    one, two = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
-    across = np.cross(b - a, two)
+    edge, other_edge = corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0]
+    across = np.cross(b - a, other_edge)
     with np.errstate(divide="ignore", invalid="ignore"):
-        inverse = 1.0 / np.einsum("ti,ti->t", one, across)
+        inverse = 1.0 / np.einsum("ti,ti->t", edge, across)
         away = a - corner[:, 0]
         u = np.einsum("ti,ti->t", away, across) * inverse
-        other = np.cross(away, one)
+        other = np.cross(away, edge)
         v = np.einsum("i,ti->t", b - a, other) * inverse
-        share = np.einsum("ti,ti->t", two, other) * inverse
+        share = np.einsum("ti,ti->t", other_edge, other) * inverse
         hit = (u >= -1e-9) & (v >= -1e-9) & (u + v <= 1.0 + 1e-9) & (share > 0.0) & (share < 1.0)
     rows = np.flatnonzero(hit)
     return surfaces.face[rows], share[rows]

@@ -73,14 +73,14 @@ class Faces:
         return len(self.normal)
 
 
-def joined(one: Faces, two: Faces) -> Faces:
+def joined(first: Faces, second: Faces) -> Faces:
     """The faces of both, the first keeping their numbers."""
     columns = ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
     return Faces(
-        material=one.material + two.material,
-        label=one.label + two.label,
-        polygon=one.polygon + two.polygon,
-        **{name: np.concatenate([getattr(one, name), getattr(two, name)]) for name in columns},
+        material=first.material + second.material,
+        label=first.label + second.label,
+        polygon=first.polygon + second.polygon,
+        **{name: np.concatenate([getattr(first, name), getattr(second, name)]) for name in columns},
     )
 
 

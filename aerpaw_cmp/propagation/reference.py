@@ -703,9 +703,9 @@ def crown_depth_m(trees: Trees, a: Vector, b: Vector, without: set[int], *, trun
 
     left, right, ratio = np.zeros(len(rows)), np.ones(len(rows)), (math.sqrt(5) - 1) / 2
     for _ in range(70):
-        one, two = right - ratio * (right - left), left + ratio * (right - left)
-        lower = outside(one) < outside(two)
-        left, right = np.where(lower, left, one), np.where(lower, two, right)
+        near_left, near_right = right - ratio * (right - left), left + ratio * (right - left)
+        lower = outside(near_left) < outside(near_right)
+        left, right = np.where(lower, left, near_left), np.where(lower, near_right, right)
     middle = (left + right) / 2
     inside = outside(middle) < 0
     ends = []

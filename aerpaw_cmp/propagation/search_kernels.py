@@ -39,9 +39,9 @@ def through_box(start: FloatArray, end: FloatArray, low: FloatArray, high: Float
         axis = 2 - step  # most segments pass above the roofs
         move = end[axis] - start[axis]
         inverse = 1.0 / (move if move != 0.0 else 1e-300)
-        one, two = (low[axis] - start[axis]) * inverse, (high[axis] - start[axis]) * inverse
-        enter = max(enter, min(one, two))
-        leave = min(leave, max(one, two))
+        at_low, at_high = (low[axis] - start[axis]) * inverse, (high[axis] - start[axis]) * inverse
+        enter = max(enter, min(at_low, at_high))
+        leave = min(leave, max(at_low, at_high))
         if enter > leave:
             return False
     return True

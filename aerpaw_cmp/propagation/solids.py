@@ -117,10 +117,10 @@ class Occlusion:
         with np.errstate(over="ignore"):
             for axis in range(3):
                 inverse = 1.0 / direction[:, axis, None]
-                one = (self.low[:, axis] - start[:, axis, None]) * inverse
-                two = (self.high[:, axis] - start[:, axis, None]) * inverse
-                np.maximum(enter, np.minimum(one, two), out=enter)
-                np.minimum(leave, np.maximum(one, two), out=leave)
+                at_low = (self.low[:, axis] - start[:, axis, None]) * inverse
+                at_high = (self.high[:, axis] - start[:, axis, None]) * inverse
+                np.maximum(enter, np.minimum(at_low, at_high), out=enter)
+                np.minimum(leave, np.maximum(at_low, at_high), out=leave)
         return np.asarray(enter <= leave)
 
     def _seams(
@@ -303,6 +303,6 @@ def _abutting(footprints: list[Polygon], tolerance_m: float) -> BoolArray:
     """For each piece, whether another piece comes within the tolerance."""
     touched = np.zeros(len(footprints), dtype=np.bool_)
     if len(footprints) > 1:
-        one, two = shapely.STRtree(footprints).query(footprints, predicate="dwithin", distance=tolerance_m)
-        touched[one[one != two]] = True
+        first, second = shapely.STRtree(footprints).query(footprints, predicate="dwithin", distance=tolerance_m)
+        touched[first[first != second]] = True
     return touched

@@ -219,7 +219,7 @@ def season_places(data: CampaignData) -> Figure:
     return fig
 
 
-def season_plates(data: CampaignData) -> list[FigureSpec]:
+def season_specs(data: CampaignData) -> list[FigureSpec]:
     """What stands on the page where no script runs, and in print."""
     if not data.season.over_all():
         return []
@@ -408,7 +408,7 @@ def held_out_curves(fold: HeldOutFold, numbers: dict[str, int]) -> Figure:
 def figure_specs(data: CampaignData) -> list[FigureSpec]:
     """Every figure that the campaign has numbers for."""
     numbers = {track.flight: number for number, track in enumerate(data.tracks)}
-    figures: list[FigureSpec] = season_plates(data)
+    figures: list[FigureSpec] = season_specs(data)
     if data.rss and len(data.rss) <= MOST_BARS:
         figures.append(
             FigureSpec(
@@ -447,13 +447,13 @@ def figure_specs(data: CampaignData) -> list[FigureSpec]:
             )
         )
     for link, rows in grouped(data.reference_rows, lambda r: r.link).items():
-        figures += _link_plates(data, link, rows, numbers)
+        figures += _link_specs(data, link, rows, numbers)
     for number, fold in enumerate(data.held_out[:MOST_FLIGHTS]):
-        figures.append(_fold_plate(fold, number, numbers))
+        figures.append(_fold_spec(fold, number, numbers))
     return figures
 
 
-def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[FigureSpec]:
+def _link_specs(data: CampaignData, link: str, rows: list[RssRow], numbers: dict[str, int]) -> list[FigureSpec]:
     scored = [row for row in rows if row.n > 0]
     if not scored or len(scored) > MOST_FLIGHTS:
         return []
@@ -481,7 +481,7 @@ def _link_plates(data: CampaignData, link: str, rows: list[RssRow], numbers: dic
     ]
 
 
-def _fold_plate(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> FigureSpec:
+def _fold_spec(fold: HeldOutFold, number: int, numbers: dict[str, int]) -> FigureSpec:
     on = ", ".join(fold.fitted_on)
     return FigureSpec(
         name=f"held_out_{number + 1}",

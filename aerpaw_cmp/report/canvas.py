@@ -68,7 +68,7 @@ class FigureSpec:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Picture:
-    """A drawn plate: its words, the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
+    """A drawn figure: its words, the picture by format ("png", "svg", "pdf"), and the smaller PNG that a page holds."""
 
     name: str
     section: str
@@ -186,23 +186,23 @@ def smaller(png: bytes, colours: int = 256) -> bytes:
     return min(out.getvalue(), png, key=len)
 
 
-def render(plate: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
-    """Draw a plate and forget the figure."""
+def render(spec: FigureSpec, formats: Sequence[str] = ("svg", "png"), kind: str = "screen") -> Picture:
+    """Draw a figure and forget it; its pictures stay."""
     with style(kind):
-        files = save_as(plate.draw(), formats, kind)
+        files = save_as(spec.draw(), formats, kind)
     return Picture(
-        name=plate.name,
-        section=plate.section,
-        title=plate.title,
-        caption=plate.caption,
-        alt=plate.alt,
+        name=spec.name,
+        section=spec.section,
+        title=spec.title,
+        caption=spec.caption,
+        alt=spec.alt,
         formats=files,
         inline=smaller(files["png"]) if "png" in files else b"",
     )
 
 
 def write_figures(
-    plates: Sequence[FigureSpec],
+    specs: Sequence[FigureSpec],
     folder: Path,
     formats: Sequence[str] = ("svg", "png"),
     kind: str = "screen",
@@ -210,11 +210,11 @@ def write_figures(
     *,
     meanwhile: Callable[[], object] | None = None,
 ) -> tuple[list[Picture], list[Path]]:
-    """Draw plates and write each in its formats; gives the pictures and the files.
+    """Draw figures and write each in its formats; gives the pictures and the files.
 
     Parameters
     ----------
-    plates : sequence of FigureSpec
+    specs : sequence of FigureSpec
     folder : Path
         Made when missing.
     formats : sequence of str
@@ -233,16 +233,16 @@ def write_figures(
     """
     drawn: list[Picture] = []
     written: list[Path] = []
-    if plates:
+    if specs:
         load_matplotlib()
-    with ahead([partial(render, plate, formats, kind) for plate in plates], fewest=FEWEST_FIGURES) as pictures:
+    with ahead([partial(render, spec, formats, kind) for spec in specs], fewest=FEWEST_FIGURES) as pictures:
         if meanwhile is not None:
             meanwhile()
         for picture in pictures:
-            progress("figures", len(drawn) / len(plates))
+            progress("figures", len(drawn) / len(specs))
             drawn.append(picture)
             written += [write_file(folder / f"{picture.name}.{kind}", one) for kind, one in picture.formats.items()]
-    if plates:
+    if specs:
         progress("figures", 1.0)
     return drawn, written
 

@@ -23,28 +23,28 @@ from .rss_figures import (
     seen_from_antennas,
     trajectory,
 )
-from .serving_figures import serving_plate
+from .serving_figures import serving_spec
 from .speed_figures import pareto, rank_changes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-# --- all plates of a report ---------------------------------------------------------------------
+# --- all figures of a report -------------------------------------------------------------------
 
 
 def figure_specs(data: ReportData) -> list[FigureSpec]:
     """Every figure that the data allow, in reading order."""
     result: list[FigureSpec] = []
     if data.rss or data.rank:
-        result += _overview_plate(data)
+        result += _overview_spec(data)
     if data.track is not None and len(data.track.time):
-        result += _track_plates(data, data.track)
+        result += _track_specs(data, data.track)
     for panel in data.rss:
         if len(panel.time):
-            result += _rss_plates(data, panel)
+            result += _rss_specs(data, panel)
     for pair in data.pairs:
-        result.append(_pair_plate(data, pair))
+        result.append(_pair_spec(data, pair))
     if any(np.isfinite(row.rmse_heldout_db) for row in data.ladder):
         result.append(
             FigureSpec(
@@ -59,10 +59,10 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
             )
         )
     if data.serving is not None and data.serving.n:
-        result.append(serving_plate(data.serving))
+        result.append(serving_spec(data.serving))
     for rank in data.rank:
         if len(rank.time):
-            result += _rank_plates(data, rank)
+            result += _rank_specs(data, rank)
     if data.speed:
         result.append(
             FigureSpec(
@@ -81,16 +81,16 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
 
 
 def _with_own_names(figures: list[FigureSpec]) -> list[FigureSpec]:
-    """The same plates, a number added where two names became one file name."""
+    """The same figures, a number added where two names became one file name."""
     seen: dict[str, int] = {}
     result = []
-    for plate in figures:
-        count = seen[plate.name] = seen.get(plate.name, 0) + 1
-        result.append(plate if count == 1 else replace(plate, name=f"{plate.name}_{count}"))
+    for spec in figures:
+        count = seen[spec.name] = seen.get(spec.name, 0) + 1
+        result.append(spec if count == 1 else replace(spec, name=f"{spec.name}_{count}"))
     return result
 
 
-def _overview_plate(data: ReportData) -> list[FigureSpec]:
+def _overview_spec(data: ReportData) -> list[FigureSpec]:
     """The picture of the first screen where no script runs: the first channel, or the first rank."""
     panels = [panel for panel in data.rss if len(panel.time) and panel.n]
     if not panels:
@@ -109,7 +109,7 @@ def _overview_plate(data: ReportData) -> list[FigureSpec]:
     ]
 
 
-def _track_plates(data: ReportData, track: Track) -> list[FigureSpec]:
+def _track_specs(data: ReportData, track: Track) -> list[FigureSpec]:
     there = [word for word, some in (("buildings", data.site.buildings), ("forests", data.site.forests)) if some]
     invented = (
         f" {' and '.join(there).capitalize()} are illustrative: they were invented to show the method."
@@ -139,7 +139,7 @@ def _track_plates(data: ReportData, track: Track) -> list[FigureSpec]:
     ]
 
 
-def _rss_plates(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
+def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
     result = [
@@ -202,7 +202,7 @@ def _rss_plates(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     return result
 
 
-def _pair_plate(data: ReportData, pair: ChannelPair) -> FigureSpec:
+def _pair_spec(data: ReportData, pair: ChannelPair) -> FigureSpec:
     words = f"{pair.first} against {pair.second}"
     return FigureSpec(
         name=f"pair_{safe_name(pair.tower)}_{safe_name(pair.first)}_{safe_name(pair.second)}",
@@ -215,10 +215,10 @@ def _pair_plate(data: ReportData, pair: ChannelPair) -> FigureSpec:
     )
 
 
-def _rank_plates(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
+def _rank_specs(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
     stem, section = safe_name(panel.tower), f"rank/{panel.tower}"
 
-    def plate(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> FigureSpec:
+    def spec(name: str, title: str, caption: str, alt: str, draw: Callable[[], Figure]) -> FigureSpec:
         return FigureSpec(
             name=f"{name}_{stem}",
             section=section,
@@ -230,21 +230,21 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
         )
 
     result = [
-        plate(
+        spec(
             "rank_histogram",
             "how often each rank",
             "Shares of rank 1 to 4 among samples in coverage, measured beside every K. Whiskers: 95 % intervals.",
             f"Bar chart of rank shares for {panel.tower}, measured and simulated.",
             lambda: rank_histograms(panel),
         ),
-        plate(
+        spec(
             "rank_map",
             "rank along the flight",
             "Rank at every sample. Colour and marker give the rank; crosses marked Z had no path in the simulation.",
             f"Maps of measured and simulated rank around {panel.tower}.",
             lambda: rank_maps(data, panel),
         ),
-        plate(
+        spec(
             "rank_time",
             "rank over time",
             "Each row is one source. The lowest plot, where present, shows the singular values that decide the rank.",
@@ -254,7 +254,7 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
     ]
     if any(at.confusion is not None for at in panel.simulated):
         result.append(
-            plate(
+            spec(
                 "rank_confusion",
                 "which ranks are mistaken for which",
                 "Counts; colour is the share of each measured rank (rows). Frames: equal ranks. "
@@ -265,7 +265,7 @@ def _rank_plates(data: ReportData, panel: RankPanel) -> list[FigureSpec]:
         )
     if panel.curve is not None:
         result.append(
-            plate(
+            spec(
                 "rank_k",
                 "which K explains the modem",
                 "Agreement by pose and distance between the histograms as the threshold K varies. "

@@ -194,7 +194,7 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
     ----------
     data : ReportData
     pictures : sequence of Picture
-        Drawn plates; each stands in its section.
+        Drawn figures; each stands in its section.
     files : sequence of str
         Names of the files beside the page.
     """

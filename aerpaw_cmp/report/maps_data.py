@@ -128,7 +128,7 @@ class PaperRow:
     what: str
     paper: str
     ours: str
-    plate: str = ""
+    figure: str = ""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

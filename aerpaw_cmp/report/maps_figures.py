@@ -315,7 +315,7 @@ def learning_curves(curves: Sequence[LearningCurve]) -> Figure:
     return fig
 
 
-# --- all plates ---------------------------------------------------------------------------------
+# --- all figures ---------------------------------------------------------------------------------
 
 
 def level_limits(maps: Sequence[RssMap]) -> tuple[float, float]:
@@ -336,7 +336,7 @@ def figure_specs(data: MapsData) -> list[FigureSpec]:
         data.rss, lambda one: (one.antennas, one.foliage, one.altitude_m)
     ).items():
         words = f"{antennas}{f', foliage {foliage}' if foliage else ''}, {height:g} m"
-        result.append(_rss_plate(data, maps, limits, words))
+        result.append(_rss_spec(data, maps, limits, words))
     for (antennas, foliage), maps in grouped(data.rss, lambda one: (one.antennas, one.foliage)).items():
         words = f"{antennas}{f', foliage {foliage}' if foliage else ''}"
         result.append(
@@ -349,10 +349,10 @@ def figure_specs(data: MapsData) -> list[FigureSpec]:
                 draw=lambda maps=maps: cdfs(maps),  # type: ignore[misc]
             )
         )
-    return result + _rank_plates(data) + _layer_plates(data) + _kriging_plates(data)
+    return result + _rank_specs(data) + _layer_specs(data) + _kriging_specs(data)
 
 
-def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> FigureSpec:
+def _rss_spec(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, float], words: str) -> FigureSpec:
     return FigureSpec(
         name=f"rss_map_{safe_name(words)}",
         section="rss",
@@ -364,7 +364,7 @@ def _rss_plate(data: MapsData, maps: Sequence[RssMap], limits: tuple[float, floa
     )
 
 
-def _rank_plates(data: MapsData) -> list[FigureSpec]:
+def _rank_specs(data: MapsData) -> list[FigureSpec]:
     result = []
     for (k, foliage), maps in grouped(data.rank, lambda one: (one.k, one.foliage)).items():
         words = f"K = {k_key(k)}{f', foliage {foliage}' if foliage else ''}"
@@ -393,7 +393,7 @@ def _rank_plates(data: MapsData) -> list[FigureSpec]:
     return result
 
 
-def _layer_plates(data: MapsData) -> list[FigureSpec]:
+def _layer_specs(data: MapsData) -> list[FigureSpec]:
     return [
         FigureSpec(
             name=f"layer_{safe_name(name)}",
@@ -407,7 +407,7 @@ def _layer_plates(data: MapsData) -> list[FigureSpec]:
     ]
 
 
-def _kriging_plates(data: MapsData) -> list[FigureSpec]:
+def _kriging_specs(data: MapsData) -> list[FigureSpec]:
     result = []
     if data.correlation:
         result.append(

@@ -69,7 +69,7 @@ def _frame(place: int) -> Any:
     return Rectangle((place - 0.47, place - 0.46), 0.94, 0.92, fill=False, edgecolor=TOWER, linewidth=1.4)
 
 
-def serving_plate(serving: ServingComparison) -> FigureSpec:
+def serving_spec(serving: ServingComparison) -> FigureSpec:
     """The matrix with its words."""
     n_cells = int((np.asarray(serving.confusion).sum(axis=1) > 0).sum())
     return FigureSpec(

@@ -74,7 +74,7 @@ def write_report(
     folder, stages = Path(folder), stages or Stages(seconds=dict(data.stages_s))
     written: list[Path] = []
     with stages("report"):
-        plates = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
+        specs = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
 
         def tables() -> None:
@@ -82,7 +82,7 @@ def write_report(
                 # written even without rows: a reader finds the same files in every report
                 written.append(write_file(folder / name, text))
 
-        pictures, paths = write_figures(plates, folder / "figures", formats, style, stages.progress, meanwhile=tables)
+        pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress, meanwhile=tables)
     written += paths
     if exports:
         from .exports.samples import of_report

@@ -446,7 +446,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
     if not shapes:
         return []
     tree = shapely.STRtree([shape.area for shape in shapes])
-    one, two = tree.query([shape.area for shape in shapes], predicate="intersects")
+    first, second = tree.query([shape.area for shape in shapes], predicate="intersects")
     home = list(range(len(shapes)))
 
     def root(i: int) -> int:
@@ -455,7 +455,7 @@ def _groups(shapes: list[_Shape]) -> list[list[_Shape]]:
             i = home[i]
         return i
 
-    for i, j in zip(one.tolist(), two.tolist(), strict=True):
+    for i, j in zip(first.tolist(), second.tolist(), strict=True):
         if i < j and shapes[i].area.intersection(shapes[j].area).area > 0.01:
             home[root(j)] = root(i)
     groups: dict[int, list[_Shape]] = {}

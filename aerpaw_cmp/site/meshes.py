@@ -66,8 +66,8 @@ def building_mesh(building: Building) -> tuple[FloatArray, IntArray]:
         count += 2 * n
     roof = np.stack([np.asarray(t.exterior.coords)[:3, :2] for t in _triangulated(footprint)])
     flat = roof.reshape(-1, 2)
-    one, two = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
-    turn = one[:, 0] * two[:, 1] < one[:, 1] * two[:, 0]
+    edge, other_edge = roof[:, 1] - roof[:, 0], roof[:, 2] - roof[:, 0]
+    turn = edge[:, 0] * other_edge[:, 1] < edge[:, 1] * other_edge[:, 0]
     order = np.arange(len(flat)).reshape(-1, 3)
     order[turn] = order[turn][:, ::-1]
     vertices.append(np.column_stack([flat, np.full(len(flat), high)]))

@@ -198,8 +198,8 @@ def _inside(ring: list[Position], other: list[Position]) -> bool:
     shapes = [Polygon(line) for line in (ring, other)]
     if any(not shape.is_valid and is_tangled(shape) for shape in shapes):
         return False
-    one, two = (shapely.make_valid(shape) for shape in shapes)
-    return bool(one.area < two.area and shapely.covers(two, one))
+    inner, outer = (shapely.make_valid(shape) for shape in shapes)
+    return bool(inner.area < outer.area and shapely.covers(outer, inner))
 
 
 def _by_nesting(rings: list[list[Position]]) -> tuple[list[list[Position]], list[list[Position]]]:

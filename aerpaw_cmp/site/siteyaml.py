@@ -520,8 +520,8 @@ def _overlaps(buildings: tuple[Building, ...]) -> list[str]:
     if len(buildings) < 2:
         return []
     shapes = [building.footprint for building in buildings]
-    one, two = shapely.STRtree(shapes).query(shapes, predicate="intersects")
-    pairs = [(int(i), int(j)) for i, j in zip(one, two, strict=True) if i < j]
+    left, right = shapely.STRtree(shapes).query(shapes, predicate="intersects")
+    pairs = [(int(i), int(j)) for i, j in zip(left, right, strict=True) if i < j]
     # outlines simplified by 'site import' may still overlap by some decimetres
     overlapping = [(i, j) for i, j in pairs if not shapes[i].intersection(shapes[j]).buffer(-OVERLAP_M / 2).is_empty]
     if not overlapping:

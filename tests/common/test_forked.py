@@ -25,7 +25,7 @@ linux = pytest.mark.skipif(
 )
 
 
-def plate(number: int) -> canvas.FigureSpec:
+def spec(number: int) -> canvas.FigureSpec:
     def draw():
         fig = canvas.figure((3.0, 2.0))
         fig.subplots().plot(np.arange(5) * number)
@@ -36,7 +36,7 @@ def plate(number: int) -> canvas.FigureSpec:
 
 @linux
 def test_bytes_and_order_are_those_of_one_process() -> None:
-    draws = [partial(canvas.render, plate(n), ("svg", "png")) for n in range(5)]
+    draws = [partial(canvas.render, spec(n), ("svg", "png")) for n in range(5)]
     alone = list(forked.in_order(draws, 1))
     shared = list(forked.in_order(draws, 2))
     assert [p.name for p in shared] == [f"p{n}" for n in range(5)]

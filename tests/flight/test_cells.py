@@ -96,9 +96,9 @@ def test_the_report_of_a_phone_shows_the_matrix_of_metrics_json(phone: Path) -> 
     record = report_data(found.data, found.result)
     assert record.serving is not None
     entry = record.extra_metrics["serving"]
-    (plate,) = (p for p in figures.figure_specs(record) if p.section == "serving")
-    assert plate.page
+    (spec,) = (p for p in figures.figure_specs(record) if p.section == "serving")
+    assert spec.page
     names, table = shown_confusion(record.serving)
     assert names == entry["cells"]
     assert [list(entry["confusion"][name].values()) for name in names] == table.tolist()
-    assert f"{100 * entry['hit_share']:.0f} % of all" in plate.caption
+    assert f"{100 * entry['hit_share']:.0f} % of all" in spec.caption

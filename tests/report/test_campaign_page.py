@@ -115,12 +115,12 @@ def test_without_pyarrow_a_line_says_what_is_missing(data, tmp_path, monkeypatch
 
 
 def test_figures_of_a_season_are_few_and_can_be_drawn(data):
-    plates = campaign_figures.figure_specs(data)
-    assert {p.name for p in plates} >= {"season_errors", "season_drift", "season_places"}
-    assert len(plates) < 8
-    for plate in plates:
-        if plate.section == "season":
-            assert canvas.render(plate, ("png",)).formats["png"][:4] == b"\x89PNG"
+    specs = campaign_figures.figure_specs(data)
+    assert {p.name for p in specs} >= {"season_errors", "season_drift", "season_places"}
+    assert len(specs) < 8
+    for spec in specs:
+        if spec.section == "season":
+            assert canvas.render(spec, ("png",)).formats["png"][:4] == b"\x89PNG"
 
 
 def many_pairs(count):

@@ -17,10 +17,10 @@ from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, T
 
 
 def drawn(data: ReportData):
-    for plate in figures.figure_specs(data):
+    for spec in figures.figure_specs(data):
         with canvas.style():
-            fig = plate.draw()
-        yield plate, fig
+            fig = spec.draw()
+        yield spec, fig
 
 
 def data_axes(fig):
@@ -29,19 +29,19 @@ def data_axes(fig):
 
 def test_every_figure_has_labels_with_units_and_a_legend(small_report):
     seen = []
-    for plate, fig in drawn(small_report):
-        seen.append(plate.name)
+    for spec, fig in drawn(small_report):
+        seen.append(spec.name)
         axes = data_axes(fig)
-        assert axes, plate.name
-        assert any(ax.get_xlabel() for ax in axes), plate.name
-        assert any(ax.get_ylabel() for ax in axes), plate.name
+        assert axes, spec.name
+        assert any(ax.get_xlabel() for ax in axes), spec.name
+        assert any(ax.get_ylabel() for ax in axes), spec.name
         labels = [ax.get_xlabel() for ax in fig.axes] + [ax.get_ylabel() for ax in fig.axes]
-        assert any("[" in label or "rank" in label.lower() or "K (" in label for label in labels), (plate.name, labels)
+        assert any("[" in label or "rank" in label.lower() or "K (" in label for label in labels), (spec.name, labels)
         has_legend = (
             fig.legends or any(ax.get_legend() for ax in axes) or any(ax.get_label() == "<colorbar>" for ax in fig.axes)
         )
-        assert has_legend, plate.name
-        assert all((plate.alt, plate.caption, plate.title)), plate.name
+        assert has_legend, spec.name
+        assert all((spec.alt, spec.caption, spec.title)), spec.name
     assert {
         "trajectory",
         "altitude",
@@ -81,8 +81,8 @@ def test_svg_stays_small_however_long_the_flight(report_data):
 
 
 def test_svg_has_no_reference_to_elsewhere_and_is_the_same_twice(small_report):
-    plate = next(p for p in figures.figure_specs(small_report) if p.name == "altitude")
-    one, two = canvas.render(plate), canvas.render(plate)
+    spec = next(p for p in figures.figure_specs(small_report) if p.name == "altitude")
+    one, two = canvas.render(spec), canvas.render(spec)
     assert one.formats["svg"] == two.formats["svg"]
     fetched = re.findall(rb'(?:href|src)="([^"]*)"', one.formats["svg"])
     assert all(f.startswith((b"#", b"data:")) for f in fetched)
@@ -195,14 +195,14 @@ def drawn_before():
 def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, change):
     data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
     left_alone = data.track is report_data.track and data.site is report_data.site
-    for plate in figures.figure_specs(data):
-        if left_alone and plate.section.startswith(("flight", "pair/")):  # these have of the panels only what is named:
-            what = (plate.name, canvas.start_of(data), *canvas.used_towers(data))
+    for spec in figures.figure_specs(data):
+        if left_alone and spec.section.startswith(("flight", "pair/")):  # these have of the panels only what is named:
+            what = (spec.name, canvas.start_of(data), *canvas.used_towers(data))
             if what in drawn_before:
                 continue
             drawn_before.add(what)
         with canvas.style():
-            plate.draw().draw_without_rendering()  # lays out and draws every part; warnings are errors
+            spec.draw().draw_without_rendering()  # lays out and draws every part; warnings are errors
 
 
 @given(arrays(bool, st.integers(0, 60)))
@@ -254,11 +254,11 @@ def test_grey_steps_of_the_ranks_are_apart():
 
 def test_drawing_without_the_unseen_pass_gives_the_same_picture(small_report):
     """``Figure.savefig`` draws once more before each file; leaving that out must not move anything."""
-    plate = next(p for p in figures.figure_specs(small_report) if p.name == "trajectory")
+    spec = next(p for p in figures.figure_specs(small_report) if p.name == "trajectory")
     with canvas.style():
-        ours = canvas.save(plate.draw())[1]
+        ours = canvas.save(spec.draw())[1]
         theirs = io.BytesIO()
-        plate.draw().savefig(theirs, format="png")
+        spec.draw().savefig(theirs, format="png")
     one, two = (np.asarray(Image.open(io.BytesIO(png))) for png in (ours, theirs.getvalue()))
     np.testing.assert_array_equal(one, two)
 
@@ -312,8 +312,8 @@ def test_no_empty_rank_plane_where_no_setting_changes_a_rank(report_data):
     with canvas.style():
         fig = speed_figures.pareto(same)
     assert len(fig.axes) == 1
-    plate = next(p for p in figures.figure_specs(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
-    assert plate.caption.endswith("No setting changes the rank of a link.")
+    spec = next(p for p in figures.figure_specs(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
+    assert spec.caption.endswith("No setting changes the rank of a link.")
 
 
 def test_captions_speak_of_what_is_drawn(report_data):
@@ -329,9 +329,9 @@ def test_captions_speak_of_what_is_drawn(report_data):
 
 
 def test_a_log_axis_says_plain_numbers(small_report):
-    plate = next(p for p in figures.figure_specs(small_report) if p.name.startswith("rank_k_"))
+    spec = next(p for p in figures.figure_specs(small_report) if p.name.startswith("rank_k_"))
     with canvas.style():
-        fig = plate.draw()
+        fig = spec.draw()
         fig.draw_without_rendering()
     shown = [t.get_text() for t in fig.axes[0].get_xticklabels() if t.get_text()]
     assert "100" in shown
@@ -377,11 +377,11 @@ def test_names_are_drawn_as_they_are(small_report):
         rank=tuple(dataclasses.replace(p, tower=r"$\alpha") for p in small_report.rank[:1]),
     )
     seen = set()
-    for plate, fig in drawn(data):
+    for spec, fig in drawn(data):
         texts = [text for text in fig.findobj(Text) if text.get_text()]
-        assert not any(text.get_parse_math() for text in texts), plate.name
+        assert not any(text.get_parse_math() for text in texts), spec.name
         seen |= {text.get_text() for text in texts}
-        if plate.name == "trajectory" or plate.name.startswith("rank_singular"):
+        if spec.name == "trajectory" or spec.name.startswith("rank_singular"):
             FigureCanvasAgg(fig).draw()
     assert "A_$" in seen
     assert "σ₂/σ₁" in seen

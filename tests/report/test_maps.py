@@ -41,12 +41,12 @@ def test_files(few_maps, tmp_path):
 
 
 def test_every_map_figure_has_units_and_a_legend(few_maps):
-    for plate in maps_figures.figure_specs(few_maps):
+    for spec in maps_figures.figure_specs(few_maps):
         with canvas.style():
-            fig = plate.draw()
+            fig = spec.draw()
         labels = [ax.get_xlabel() + ax.get_ylabel() for ax in fig.axes]
-        assert any("[" in label or "Number" in label for label in labels), plate.name
-        assert fig.legends or any(ax.get_legend() for ax in fig.axes), plate.name
+        assert any("[" in label or "Number" in label for label in labels), spec.name
+        assert fig.legends or any(ax.get_legend() for ax in fig.axes), spec.name
 
 
 def test_north_is_up_and_east_is_right(maps_data):
@@ -113,7 +113,7 @@ def test_hostile_names_are_escaped(maps_data):
         notes=(text,),
         site=dataclasses.replace(maps_data.site, name=text),
         errors=(dataclasses.replace(maps_data.errors[0], method=text, evaluation=text),),
-        paper=(dataclasses.replace(maps_data.paper[0], what=text, plate=text),),
+        paper=(dataclasses.replace(maps_data.paper[0], what=text, figure=text),),
     )
     page = maps_html.maps_page(data, pictures(data), [text])
     assert "alert(1)</script>" not in page
@@ -135,5 +135,5 @@ def test_nothing_at_all_and_nothing_covered(maps_data):
     )
     maps_html.maps_page(empty, pictures(empty), [])
     dark = dataclasses.replace(maps_data.rss[0], rss_dbm=np.full_like(maps_data.rss[0].rss_dbm, np.nan), coverage=0.0)
-    for plate in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
-        canvas.render(plate)
+    for spec in maps_figures.figure_specs(dataclasses.replace(empty, rss=(dark,))):
+        canvas.render(spec)

@@ -9,7 +9,7 @@ import pytest
 
 from aerpaw_cmp.compare.serving import compare_serving
 from aerpaw_cmp.report import canvas, figures, html
-from aerpaw_cmp.report.serving_figures import confusion, serving_plate, shown_confusion
+from aerpaw_cmp.report.serving_figures import confusion, serving_spec, shown_confusion
 
 
 @pytest.fixture
@@ -34,10 +34,10 @@ def test_counts_stand_in_the_row_that_served_and_the_column_predicted(serving):
 
 
 def test_words_are_those_of_the_numbers(serving):
-    plate = serving_plate(serving)
-    assert "5 samples" in plate.caption
-    assert "40 % of all" in plate.caption  # 2 of 5
-    assert "most hits 60 %" in plate.caption  # LW2 served 3 of 5
+    spec = serving_spec(serving)
+    assert "5 samples" in spec.caption
+    assert "40 % of all" in spec.caption  # 2 of 5
+    assert "most hits 60 %" in spec.caption  # LW2 served 3 of 5
 
 
 def test_many_cells_are_gathered_without_losing_a_sample():
@@ -58,9 +58,9 @@ def test_many_cells_are_gathered_without_losing_a_sample():
 
 def test_it_stands_in_the_report(report_data, serving):
     data = dataclasses.replace(report_data, serving=serving)
-    plates = [p for p in figures.figure_specs(data) if p.section == "serving"]
-    assert [p.name for p in plates] == ["serving_confusion"]
-    pictures = [canvas.render(p, ("png",)) for p in plates]
+    specs = [p for p in figures.figure_specs(data) if p.section == "serving"]
+    assert [p.name for p in specs] == ["serving_confusion"]
+    pictures = [canvas.render(p, ("png",)) for p in specs]
     page = html.page(data, pictures, [])
     assert 'id="serving_confusion"' in page
     assert "The prediction is no better than that." in page

@@ -48,10 +48,10 @@ def noted() -> Iterator[None]:
     if not _is_ours_to_set() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         yield
         return
-    told = sys.unraisablehook
+    previous = sys.unraisablehook
     signal.signal(signal.SIGINT, _note)
     # Python shows a traceback of what it swallows: this one is not lost
-    sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else told(what)
+    sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
         yield
     except Exception as error:
@@ -60,7 +60,7 @@ def noted() -> Iterator[None]:
         raise KeyboardInterrupt from error
     finally:
         _came = False
-        sys.unraisablehook = told
+        sys.unraisablehook = previous
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 

@@ -328,7 +328,7 @@ def gather(
     telemetry: list[tuple[str, Stream]] = []
     rss: list[tuple[str, RssSeries]] = []
     rank: list[tuple[str, RankSeries]] = []
-    for log, file in zip(settings.logs, files, strict=True):
+    for number, (log, file) in enumerate(zip(settings.logs, files, strict=True)):
         warnings += [f"{log.path}: {text}" for text in file.result.warnings]
         for stream in file.result.streams:
             if stream.name in log.skip:
@@ -336,7 +336,7 @@ def gather(
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss" and not _unnamed_cell(log, stream):
-                rss.append((log.path, _rss_series(settings, log, stream, site)))
+                rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number)))
             elif stream.kind == "rank":
                 rank.append((log.path, _rank_series(log, stream, site, tower=log.node or settings.rank.tower)))
         if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
@@ -346,12 +346,12 @@ def gather(
             warnings.append(
                 f"{log.path}: nothing is skipped by {', '.join(unknown)}: its streams are {', '.join(names)}"
             )
-        warnings += _of_ratios(settings, log, file.result.streams)
+        warnings += _of_ratios(settings.link, log, file.result.streams)
     if idle := set(settings.link.channels) - {series.channel for _, series in rss}:
         warnings.append(f"link.channels names {', '.join(sorted(idle))}: no log is of such a channel")
     if len(telemetry) > 1:
         warnings.append(f"{len(telemetry)} telemetry logs; the track is that of {telemetry[0][0]}")
-    track = _track(settings, site, *telemetry[0], warnings) if telemetry else None
+    track = _track(site, *telemetry[0], warnings, maximum_gap_s=settings.rt.maximum_gap_s) if telemetry else None
     data = FlightData(
         settings=settings,
         folder=logs_root or folder,
@@ -382,10 +382,10 @@ def load_data(settings: FlightFile, folder: Path, logs_root: Path | None = None)
     return gather(settings, folder, read_logs(settings, folder, logs_root), logs_root)
 
 
-def _of_ratios(settings: FlightFile, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
+def _of_ratios(links: LinksSettings, log: LogSettings, streams: Sequence[Stream]) -> list[str]:
     """What is said of streams that are compared with a level over noise, or as if they were one."""
     kept = [s for s in streams if is_ratio(s) and s.name not in log.skip]
-    blind = [s.name for s in kept if _noise(s, _link_of(settings.link, log, s))[0] is None]
+    blind = [s.name for s in kept if _noise(s, _link_of(links, log, s))[0] is None]
     if not blind:
         return []
     shown = ", ".join(map(repr, blind)) + (" is a ratio" if len(blind) == 1 else " are ratios")
@@ -405,11 +405,9 @@ def _channel_of(log: LogSettings, stream: Stream) -> str:
     return log.channel or _text(stream, "channel") or stream.name
 
 
-def _track(settings: FlightFile, site: Site, path: str, stream: Stream, warnings: list[str]) -> Track:
+def _track(site: Site, path: str, stream: Stream, warnings: list[str], *, maximum_gap_s: float) -> Track:
     frame, _ = scored_rows(stream, path)
-    track = Track(
-        frame, site.frame, maximum_gap_s=settings.rt.maximum_gap_s, ground_m=site.datum.takeoff_ground_m
-    )  # fmt: skip
+    track = Track(frame, site.frame, maximum_gap_s=maximum_gap_s, ground_m=site.datum.takeoff_ground_m)
     if not len(track) and lacks_height(stream):
         raise InputError(
             f"none of the {len(stream.frame)} telemetry rows has an altitude",
@@ -527,12 +525,12 @@ def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
     return bool(log.cells) and pci is not None and int(pci) not in log.cells
 
 
-def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Site) -> RssSeries:
+def _rss_series(links: LinksSettings, log: LogSettings, stream: Stream, site: Site, *, number: int) -> RssSeries:
     pci = stream.attributes.get("pci")
     home = log.cells.get(int(pci)) if pci is not None else None
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
     channel = _channel_of(log, stream)
-    noise_dbm, link = _noise(stream, _link_of(settings.link, log, stream))
+    noise_dbm, link = _noise(stream, _link_of(links, log, stream))
     frame, left_out = scored_rows(stream, log.path)
     return RssSeries(
         tower=tower,
@@ -543,7 +541,7 @@ def _rss_series(settings: FlightFile, log: LogSettings, stream: Stream, site: Si
         link=link,
         settings_key=link.model_dump_json(),
         noise_dbm=noise_dbm,
-        log=np.full(len(frame), settings.logs.index(log), dtype=np.int64),
+        log=np.full(len(frame), number, dtype=np.int64),
         line=frame["line"].to_numpy(np.int64),
         flagged=left_out,
         serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,

@@ -289,8 +289,10 @@ class _Entries:
         if any(lacks_height(s) for s in kept if s is self._track or _has_positions(s)):
             height = height_in_name(path)
             entry |= {} if height is None else {"height_m": height}
-            told = "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
-            asked = _also(asked, told)
+            question = (
+                "no altitude in the log: which height_m?" if height is None else "height_m as the file's name says?"
+            )
+            asked = _also(asked, question)
         levels = [
             s for s in kept if s.kind == "rss" and s.attributes.get("quantity") != "RSRP"
         ]  # whole decibels repeat

@@ -199,7 +199,7 @@ def estimate_clocks(
     predict, estimated = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
     calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
-    with ahead(calls) if may_share(data) else ahead(calls, 1) as estimates:
+    with ahead(calls) if may_share(data.rss) else ahead(calls, 1) as estimates:
         if meanwhile is not None:
             meanwhile()
         for tower in towers:
@@ -226,9 +226,9 @@ SHARED_UP_TO = 200_000
 """RSS samples of a flight up to which its series are shared by several processes."""
 
 
-def may_share(data: FlightData) -> bool:
+def may_share(series: Sequence[RssSeries]) -> bool:
     """Whether processes may share the series of a flight: not of a long one, where each would hold much memory."""
-    return sum(len(series.time) for series in data.rss) <= SHARED_UP_TO
+    return sum(len(one.time) for one in series) <= SHARED_UP_TO
 
 
 BLOCK = 100_000

@@ -112,12 +112,14 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
         links = min(count, max(math.ceil(data.settings.rt.audit_links * count / max(total, 1)), 1))
         if links:
             named.append(f"audit {replayed.replay.towers[0]}: {links} links")
-            calls.append(partial(_of_series, data, site, replayed, expected, links=links, reference_links=few))
+            calls.append(
+                partial(_of_series, data.settings.rt, ks, site, replayed, expected, links=links, reference_links=few)
+            )
     if not calls:
         return None
     parts: list[Audit] = []
     # the processes that share the series load the other engine: this one stays free to share its drawings afterwards
-    with ahead(calls, None if may_share(data) else 1) as audits:
+    with ahead(calls, None if may_share(data.rss) else 1) as audits:
         for text in named:
             progress(text)
             parts.append(next(audits))
@@ -139,10 +141,16 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
 
 
 def _of_series(
-    data: FlightData, site: Site, replayed: Replayed, expected: Expected, *, links: int, reference_links: int
+    rt: RtSettings,
+    ks: Sequence[float],
+    site: Site,
+    replayed: Replayed,
+    expected: Expected,
+    *,
+    links: int,
+    reference_links: int,
 ) -> Audit:
     """The audit of one series, as the settings ask for it."""
-    rt = data.settings.rt
     return audit(
         site,
         replayed.link,
@@ -155,7 +163,7 @@ def _of_series(
         loss=path_loss(site, rt, replayed.link.carrier_hz),
         crowns=reflecting_crowns(site.trees, rt),
         cache_dir=None if rt.cache else "",
-        ks=data.settings.rank.k,
+        ks=ks,
         expected=expected,
         power_cut_db=rt.power_cut_db,
         reference_links=reference_links,

@@ -76,7 +76,7 @@ def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
     results = []
-    for one in in_order(calls, None if may_share(data) else 1, fewest=FEWEST_SERIES):
+    for one in in_order(calls, None if may_share(data.rss) else 1, fewest=FEWEST_SERIES):
         results.append(one)
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(

@@ -82,7 +82,7 @@ def run_flight(
         climb: Callable[[], FlightLadder | None] | None = None
         if ladder:
             climb = partial(flight_ladder, data, replays)
-            climb = running.enter_context(beside(climb)) if may_share(data) else climb
+            climb = running.enter_context(beside(climb)) if may_share(data.rss) else climb
         with stages("compare"):
             result = compare_flight(data, replays)
         if audit:

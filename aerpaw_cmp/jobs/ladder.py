@@ -19,10 +19,10 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
-from ..flight.data import FlightData
+from ..flight.data import FlightData, RssSeries
 from ..flight.losses import path_loss
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
-from ..flight.settings import FlightFile
+from ..flight.settings import FlightFile, RssSettings
 from ..propagation.arrays import Link, Poses
 from ..propagation.channel import mean_pair_power, rss_dbm
 from ..propagation.moving import replay_moving
@@ -127,16 +127,16 @@ def flight_ladder(data: FlightData, replays: FlightReplay) -> FlightLadder | Non
     """Climb the ladder; None for a flight without RSS, or replayed by rays of another engine than the image method."""
     if not data.rss or data.settings.rt.engine != "image":
         return None
-    return _Climber(data, [_thin(data, i, r) for i, r in enumerate(replays.rss)]).climb()
+    return _Climber(data, [_thin(data.rss, i, r, data.settings.rss) for i, r in enumerate(replays.rss)]).climb()
 
 
-def _thin(data: FlightData, index: int, replayed: Replayed) -> _Series:
-    levels = levels_of(data.rss[index], replayed, data.settings.rss)
+def _thin(rss: Sequence[RssSeries], index: int, replayed: Replayed, rules: RssSettings) -> _Series:
+    levels = levels_of(rss[index], replayed, rules)
     wanted = np.flatnonzero(levels.posed & np.isfinite(levels.measured_db))
     step = max(1, -(-len(wanted) // MOST_SAMPLES))
     rows = wanted[::step]
     pose_of = np.cumsum(replayed.valid) - 1
-    seconds = (data.rss[index].time - data.rss[0].time[:1]) / np.timedelta64(1, "s")
+    seconds = (rss[index].time - rss[0].time[:1]) / np.timedelta64(1, "s")
     return _Series(replayed=replayed, levels=levels, rows=rows, picked=pose_of[rows], step=step, time_s=seconds[rows])
 
 

@@ -185,8 +185,8 @@ def report_plan(
         seconds = cost["audit"] + links * cost["audit, per link"]
         stages.append(PlannedStage(name="audit", work=f"{links} links by the other engine", seconds=seconds))
     if n_rss and rt.engine == "image":
-        told = [stage.seconds for stage in rss if stage.seconds is not None]
-        seconds = MEASURED["ladder, replays of the RSS"] * sum(told)
+        known_s = [stage.seconds for stage in rss if stage.seconds is not None]
+        seconds = MEASURED["ladder, replays of the RSS"] * sum(known_s)
         stages.append(PlannedStage(name="ladder", work="simpler and richer models", seconds=seconds))
     if audited and settings.report.speed_table:
         stages.append(PlannedStage(name="speed", work="table of speed against error", seconds=cost["speed"]))

@@ -16,7 +16,7 @@ from ..common.errors import AerpawCmpError, UsageError, noting_interrupts
 from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
-from ..flight.settings import FlightFile
+from ..flight.settings import RtSettings
 from ..site.site import Site
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
@@ -569,7 +569,7 @@ def run_site_show(
             data = load_data(settings, flight.parent, logs_root)
             place, track = data.site, track_of(data)
             if pose is not None:
-                paths = _paths_of_pose(settings, place, track, pose)
+                paths = _paths_of_pose(settings.rt, place, track, pose, settings.link.rss.carrier_hz)
         with output.filling() as folder:
             written = write_site_view(place, folder, track=track, paths=paths)
             if export:
@@ -579,7 +579,7 @@ def run_site_show(
     return [out / path.relative_to(folder) for path in written]
 
 
-def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> Any:
+def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz: float) -> Any:
     """Propagation paths of all towers to one point of the track, as polylines."""
     import numpy as np
 
@@ -592,12 +592,12 @@ def _paths_of_pose(settings: FlightFile, site: Site, track: Any, pose: int) -> A
         raise UsageError(f"--pose {pose}", expected=f"0 to {0 if track is None else len(track.time) - 1}")
     point = np.array([[track.east_m[pose], track.north_m[pose], track.up_m[pose]]])
     # paths join the centres of the arrays: which elements they have does not matter
-    link = Link(settings.link.rss.carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
-    crowns, depth = reflecting_crowns(site.trees, settings.rt), settings.rt.max_depth
+    link = Link(carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
+    crowns, depth = reflecting_crowns(site.trees, rt), rt.max_depth
     paths = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
     towers = list(site.towers)
-    loss = path_loss(site, settings.rt, link.carrier_hz)
-    if settings.rt.foliage == "opaque" and loss is not None:
+    loss = path_loss(site, rt, link.carrier_hz)
+    if rt.foliage == "opaque" and loss is not None:
         sources = np.array([site.towers[name].position_m for name in towers])
         paths = paths.select(np.isfinite(loss(paths, sources, point)))
     lines = []

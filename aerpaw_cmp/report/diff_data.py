@@ -128,12 +128,12 @@ def _level_clauses(one: LevelDifference, tolerance_db: float) -> Iterator[str]:
 def _alone(samples: Overlap) -> str:
     """How many samples are in one report alone, and when."""
     sides = ((samples.only_first, samples.first_span, "first"), (samples.only_second, samples.second_span, "second"))
-    told = [
+    sentences = [
         f"{n} samples only in the {name}" + (f" ({span[0]} to {span[1]})" if span else "")
         for n, span, name in sides
         if n
     ]
-    return ", ".join(told)
+    return ", ".join(sentences)
 
 
 def _rank_clauses(one: RankDifference) -> Iterator[str]:
@@ -188,9 +188,9 @@ def _level_verdict(diff: ReportDiff) -> str:
         "none given": f"; {pooled.difference_db:+.2f} dB, too few independent samples for an interval",
     }[pooled.verdict]
     if len(scored) > 1:
-        told = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
-        rest = len(scored) - sum(n for _, n in told)
-        text += f" (links: {told[0][1]} better, {told[1][1]} worse, {rest} undecided)"
+        verdicts = [(word, sum(one.rmse.verdict == word for one in scored)) for word in ("better", "worse")]
+        rest = len(scored) - sum(n for _, n in verdicts)
+        text += f" (links: {verdicts[0][1]} better, {verdicts[1][1]} worse, {rest} undecided)"
     return text + "."
 
 

@@ -333,9 +333,8 @@ def test_opaque_crowns_reflect_in_the_flight_and_its_paired_run(tmp_path: Path) 
     pose = int(found.replay.paths.pose[found.replay.paths.off_crown][0])
     east, north, up = found.poses.position_m.T
     track = SimpleNamespace(time=np.arange(len(east)), east_m=east, north_m=north, up_m=up)
-    lines = [
-        line.label for line in _paths_of_pose(data.settings, data.site, track, pose) if line.label.startswith("LW1")
-    ]
+    shown = _paths_of_pose(data.settings.rt, data.site, track, pose, data.settings.link.rss.carrier_hz)
+    lines = [line.label for line in shown if line.label.startswith("LW1")]
     here = found.replay.paths.select(found.replay.paths.pose == pose)
     assert sum("one off a crown" in label for label in lines) == here.off_crown.sum()
     assert len(lines) <= len(here)

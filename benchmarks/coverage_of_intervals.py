@@ -83,7 +83,7 @@ def rss_cell(flights: int, n: int, neighbours: float, noise_db: float, replicate
         ends = np.array([found.offset_db, found.rmse_db, found.correlation, pair.mean_square_ci95_db2])
         given += np.isfinite(ends[:, 0])
         held += (ends[:, 0] <= truth) & (truth <= ends[:, 1])
-        effective.append(found.memory.n_effective)
+        effective.append(found.autocorrelation.n_effective)
     ratio = (1 + neighbours) / (1 - neighbours)
     independent = n * variance / (SHADOW_DB**2 * ratio + noise_db**2)
     return {

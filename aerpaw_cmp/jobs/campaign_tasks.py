@@ -101,15 +101,15 @@ def flight_data(task: Task) -> FlightData:
 def run_task(task: Task) -> Outcome:
     """Replay and compare one flight under one setting; whatever goes wrong becomes a message."""
     try:
-        ran = run_flight(flight_data(task), audit=False)
+        flight_run = run_flight(flight_data(task), audit=False)
     except AerpawCmpError as error:
         return _failed(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
         return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
     return Outcome(
-        rss=tuple(_rss_row(task, ran.data.settings.rss, one) for one in ran.result.rss),
-        rank=tuple(row for one in ran.result.rank for row in _rank_rows(task, one)),
-        track=_flown(task, ran.result),
+        rss=tuple(_rss_row(task, flight_run.data.settings.rss, one) for one in flight_run.result.rss),
+        rank=tuple(row for one in flight_run.result.rank for row in _rank_rows(task, one)),
+        track=_flown(task, flight_run.result),
         flown=tuple(
             FlownRank(
                 flight=task.flight,
@@ -120,7 +120,7 @@ def run_task(task: Task) -> Outcome:
                 time_s=_elapsed_s(one.time),
                 start_ns=_start_ns(one.time),
             )
-            for one in ran.result.rank
+            for one in flight_run.result.rank
         ),
     )
 

@@ -244,14 +244,14 @@ def run_report(
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
         replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
-        ran = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(ran, other_inputs(settings, flight, logs_root), stages)
+        flight_run = run_flight(data, stages, replays=replays, ladder=True)
+        record = report_record(flight_run, other_inputs(settings, flight, logs_root), stages)
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
             refuse_changed(same_inputs, record.inputs)
         if target is not None:
-            target.write(sealed(recommended_text(load_flight(flight), ran.ladder, flight.name)))
+            target.write(sealed(recommended_text(load_flight(flight), flight_run.ladder, flight.name)))
         with output.filling() as place:
             record = write_report(record, place, drawn=figures, style=style, exports=formats, stages=stages).data
     metrics = metrics_of(record)

@@ -272,7 +272,7 @@ def _mirrors(surfaces: Surfaces, usable: BoolArray | None, front_only: BoolArray
     )
 
 
-_Found = tuple[IntArray, IntArray, FloatArray]
+_Level = tuple[IntArray, IntArray, FloatArray]
 """Receivers (n,), faces (n, depth), reflection points (n, depth, 3)."""
 
 
@@ -295,7 +295,7 @@ class _Search:
         self.face_tree = tuple(surfaces.face_tree)
         self.target_tree = tuple(box_tree(self.targets, self.targets))
 
-    def direct(self) -> _Found:
+    def direct(self) -> _Level:
         """Lines of sight."""
         free = _direct(self.corners, self.tree, self.source, self.targets, self.rules)
         pose = np.flatnonzero(free)
@@ -341,9 +341,9 @@ class _Search:
             memory_mib=memory_mib(self),
         )
 
-    def run(self, first: IntArray, threads: int, share: Progress) -> tuple[list[_Found], Effort]:
+    def run(self, first: IntArray, threads: int, share: Progress) -> tuple[list[_Level], Effort]:
         """Follow all sequences that begin with the faces ``first``."""
-        levels: list[_Found] = []
+        levels: list[_Level] = []
         totals = np.zeros(2, np.int64)
         begun = time.perf_counter()
         done, estimate = 0, 0.0
@@ -380,7 +380,7 @@ def _chunks(first: IntArray, threads: int) -> Iterator[tuple[list[IntArray], int
         at += each * 4 * threads
 
 
-def _pad(level: _Found, poses: IntArray, tower: int, max_depth: int) -> PathSet:
+def _pad(level: _Level, poses: IntArray, tower: int, max_depth: int) -> PathSet:
     pose, sequence, points = level
     count, depth = sequence.shape
     faces = np.full((count, max_depth), -1, dtype=np.int64)

@@ -418,7 +418,7 @@ class Reference:
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
         """All sequences whose images lie on the right sides; None when there are more than the budget."""
         facing = [m for m in self.mirrors if m.height(target) >= -MARGIN_M]
-        grown_so_far: list[tuple[Mirror, ...]] = [()]
+        chains: list[tuple[Mirror, ...]] = [()]
         level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
         for depth in range(1, max_depth + 1):
             grown = []
@@ -428,9 +428,9 @@ class Reference:
                         grown.append(((*past, mirror), mirror.mirrored(image)))
             if len(grown) > budget:
                 return None
-            grown_so_far += [s for s, _ in grown if s[-1] in facing]
+            chains += [s for s, _ in grown if s[-1] in facing]
             level = grown if depth < max_depth else []
-        return grown_so_far
+        return chains
 
     def verdict(self, sequence: Sequence[Mirror], target: Vector, margin_m: float = MARGIN_M) -> bool | None:
         """Whether a path over the mirrors exists; None where a change of ``margin_m`` would decide."""

@@ -46,7 +46,7 @@ def missing_module(name: str) -> str:
     """The module that a format needs and that is not there."""
     module = _NEEDS[name]
     try:
-        is_there = not module or importlib.util.find_spec(module) is not None
+        installed = not module or importlib.util.find_spec(module) is not None
     except ValueError:  # a module that is set to None, as an import of it would fail
-        is_there = False
-    return "" if is_there else module
+        installed = False
+    return "" if installed else module

@@ -167,7 +167,7 @@ def models_figure(rows: dict[str, Any]) -> Any:
     """RMSE of every model, as logged and as local means, best on top."""
     names = sorted(rows, key=lambda n: -rows[n]["as_logged"]["mean"])
     fig = figure((9.2, 0.34 * len(names) + 1.2))
-    fig.get_layout_engine().set(w_pad=0.15)  # the viewer's font may be a little wider
+    fig.get_layout_engine().set(w_pad=0.15)  # type: ignore[call-arg]  # the viewer's font may be a little wider
     ax = fig.subplots()
     for i, name in enumerate(names):
         single = [v for key, v in rows[name]["as_logged"].items() if key != "mean"]

@@ -24,6 +24,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -51,7 +52,7 @@ def timed(mode: str, case, threads: int | None = 1) -> tuple[Replay, float, floa
 
 def serial(case) -> tuple[float, float]:
     """CPU seconds of a compiled replay, and those outside the parts that threads share."""
-    modules = (compiled, compiled_field, compiled_search)
+    modules: tuple[Any, ...] = (compiled, compiled_field, compiled_search)
     real, shared = compiled.in_threads, 0.0
 
     def watched(*arguments):

@@ -67,9 +67,9 @@ def flights(data: Path, names: list[str]) -> list[Places]:
                 position = flight.track.pose_at(series.time).position_m
                 trend = replayed.spread(replayed.replay.rss_power_dbm[:, 0])
                 found.append(places(f"{name} RSS {series.channel} [dB]", position, series.measured_db, trend))
-        for series in flight.rank:
-            position, _ = rank_positions(series, flight.track)
-            found.append(places(f"{name} rank", position, series.rank, np.zeros(len(position))))
+        for reported in flight.rank:
+            position, _ = rank_positions(reported, flight.track)
+            found.append(places(f"{name} rank", position, reported.rank, np.zeros(len(position))))
     return found
 
 

@@ -146,7 +146,7 @@ def one_way(train: Flight, test: Flight, step_deg: float, how: str, replicates: 
         "penalty": mixture.members[0].penalty,
         "decision_weight": mixture.decision_weight.tolist(),
         "thresholds_db": limits,
-        "rows": {name: scored(test.rank, *row, constant, replicates) for name, row in rows.items()},
+        "rows": {name: scored(test.rank, p, said, constant, replicates) for name, (p, said) in rows.items()},
         "cross_polar": cross_polar(best, tried.samples[0], other, fitted.timing),
         "sector_left_out": sectors(here, train, receiver.penalty, constant, replicates),
     }

@@ -18,6 +18,7 @@ import resource
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -160,7 +161,7 @@ def main() -> None:
         print(json.dumps(size(options.only_size, 5)))
         return
     quick = options.quick
-    result: dict[str, object] = {
+    result: dict[str, Any] = {
         "machine": platform.processor() or platform.machine(),
         "python": platform.python_version(),
     }

@@ -16,7 +16,7 @@ unexport PYTHONPATH PYTHONHOME PIP_USER
 unexport PYTHONDONTWRITEBYTECODE
 export PIP_DISABLE_PIP_VERSION_CHECK := 1
 
-.PHONY: help setup report test bench bench-all docs clean
+.PHONY: help setup report test bench bench-all bench-check docs clean
 .DEFAULT_GOAL := help
 
 help:
@@ -26,6 +26,7 @@ help:
 	@echo "make docs     the documentation as pages, build/site/index.html"
 	@echo "make bench    speed against error on this machine"
 	@echo "make bench-all  every benchmark with its peers in one run; makes docs/performance.md"
+	@echo "make bench-check  every file of benchmarks/ at its smallest size: does it come to its end?"
 	@echo "make clean    remove .venv, caches and $(REPORT)/"
 
 setup: $(READY_DEV) $(LLVM)
@@ -77,6 +78,10 @@ bench: $(READY_DEV) $(LLVM)
 bench-all: $(READY_DEV) $(LLVM)
 	-$(BIN)/python benchmarks/all.py
 	$(BIN)/python benchmarks/performance.py
+
+# every benchmark at its smallest size: does it come to its end?
+bench-check: $(READY_DEV) $(LLVM)
+	$(BIN)/python benchmarks/all.py --check
 
 clean:
 	rm -rf .venv .pytest_cache .mypy_cache .ruff_cache .hypothesis .import_linter_cache build dist $(REPORT)

@@ -2,10 +2,15 @@
 
     make bench-all                                    # or: python benchmarks/all.py && python benchmarks/performance.py
     python benchmarks/all.py [--only scaling ingest] [--history FILE] [--no-history]
+    make bench-check                                  # or: python benchmarks/all.py --check [NAME ...]
 
 The run takes about ten minutes on two idle cores; conditions (machine, load, versions) stand beside the numbers. A
 benchmark that fails or whose peer is not installed is told and does not stop the others. One line of JSON is appended
 to ``benchmarks/history.jsonl``, from which ``benchmarks/performance.py`` makes docs/performance.md.
+
+``--check`` runs every file of this folder at its smallest size and says which does not come to its end: numbers of such
+sizes mean nothing and are not kept. What needs the field data is left out where AERPAW_CMP_FIELD_DATA is not set. Ten
+minutes.
 """
 
 from __future__ import annotations
@@ -16,6 +21,7 @@ import os
 import platform
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Sequence
 from datetime import datetime, timezone
@@ -59,6 +65,55 @@ COMMANDS: dict[str, list[str]] = {
 }
 """What is run, each in a process of its own; ``scaling`` an axis at a time."""
 
+SMALLEST: dict[str, list[str]] = {
+    "aligned_paths": ["--links", "20"],
+    "all": ["--only", "startup", "--no-history"],
+    "calibrate_scale": ["--flights", "2", "--samples", "500"],
+    "clock_lag": ["--quick"],
+    "clock_verdict": ["--flights", "1"],
+    "compare": ["--quick"],
+    "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
+    "estimate": [],
+    "exports": ["--samples", "20000"],
+    "fabricated": [],
+    "field_held_out": [],
+    "field_models": ["--quick"],
+    "field_table": ["--quick", "--out", "{folder}"],
+    "fuzz_inputs": ["--inputs", "20"],
+    "ingest": ["--quick"],
+    "kernel": ["--poses", "200", "--pairs", "2000", "--long", "2000"],
+    "kriging": ["--quick", "--pairs", "60"],
+    "kriging_field": ["--quick"],
+    "libraries": ["--trees", "200", "--folders", "5", "--series", "3"],
+    "long_flight": ["--hours", "0.3", "--shares", "1"],
+    "map_job": ["--quick"],
+    "mutation": ["--each", "1", "--seed", "5", "--only", "offset.py"],
+    "output_faults": ["--kills", "5"],
+    "pages": ["--only", "long", "--repeats", "1"],
+    "performance": ["--docs", "{folder}/performance.md"],
+    "planted_faults": ["--only", "foliage", "--every", "20"],
+    "rank_receiver": ["--step", "30", "--replicates", "100"],
+    "repeats": ["--flights", "4", "--samples", "500"],
+    "replay": ["--quick"],
+    "report": ["--quick"],
+    "sample_report": ["--runs", "1"],
+    "scaling": ["--axes", "poses"],
+    "scenes": ["--scenes", "canyon", "--depths", "1", "--receivers", "10"],
+    "season": ["--flights", "6", "--samples", "200", "--part", "speed"],
+    "season_flights": [],
+    "site": ["--quick"],
+    "startup": ["--quick"],
+    "tap_common": [],
+    "tap_cpu": ["--quick"],
+    "tap_replug": ["--quick"],
+    "tap_sigkill": ["--quick"],
+    "tap_soak": ["--quick"],
+    "whole_comparison": ["--quick"],
+}
+"""How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""
+
+ON_FIELD_DATA = ("clock_verdict", "field_held_out", "field_models", "field_table", "kriging_field", "rank_receiver")
+
 AXES = ("poses", "towers", "faces", "samples", "report", "flights", "workers")
 
 LIMIT_S = 600.0
@@ -98,25 +153,33 @@ def version() -> str:
     return f"{__version__} ({done.stdout.strip()})" if done.returncode == 0 else __version__
 
 
-def run_one(name: str, command: list[str]) -> dict[str, Any]:
-    """The JSON of one benchmark, its seconds and the load before it; its last words where it fails."""
+def _run(command: list[str]) -> tuple[str, str | None]:
+    """What a benchmark prints, and its last words where it fails."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join([str(ROOT), str(ROOT / "parsers")])}
     environment |= dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), "1")
-    load, start = os.getloadavg()[0], time.perf_counter()
-    print(f"{name} ...", file=sys.stderr, flush=True)
     try:
         done = subprocess.run(
             [sys.executable, *command], cwd=ROOT, env=environment, capture_output=True, text=True, check=False,
             timeout=LIMIT_S,
         )  # fmt: skip
-        text, failed = done.stdout, done.returncode != 0
-        why = (done.stderr.strip().splitlines() or ["no message"])[-1][:300]
     except subprocess.TimeoutExpired:
-        text, failed, why = "", True, f"not done in {LIMIT_S:g} s"
+        return "", f"not done in {LIMIT_S:g} s"
+    if done.returncode == 0:
+        return done.stdout, None
+    return done.stdout, (done.stderr.strip().splitlines() or done.stdout.strip().splitlines() or ["no message"])[-1][
+        :300
+    ]
+
+
+def run_one(name: str, command: list[str]) -> dict[str, Any]:
+    """The JSON of one benchmark, its seconds and the load before it; its last words where it fails."""
+    load, start = os.getloadavg()[0], time.perf_counter()
+    print(f"{name} ...", file=sys.stderr, flush=True)
+    text, why = _run(command)
     seconds = round(time.perf_counter() - start, 1)
     found: dict[str, Any] = {"seconds": seconds, "load_before": round(load, 2)}
     try:
-        return {**found, "failed": why} if failed else {**found, "result": json.loads(text[text.index("{") :])}
+        return {**found, "failed": why} if why else {**found, "result": json.loads(text[text.index("{") :])}
     except ValueError:
         return {**found, "failed": "no JSON on standard output"}
 
@@ -134,6 +197,23 @@ def run_axes(command: list[str], axes: Sequence[str] = AXES) -> dict[str, Any]:
     return found
 
 
+def check(names: Sequence[str]) -> int:
+    """Run each at its smallest size; 1 where one does not come to its end."""
+    without = () if os.environ.get("AERPAW_CMP_FIELD_DATA") else ON_FIELD_DATA
+    failed = 0
+    for name in names or list(SMALLEST):
+        if name in without:
+            print(f"{name:<22} left out: AERPAW_CMP_FIELD_DATA is not set", flush=True)
+            continue
+        start = time.perf_counter()
+        with tempfile.TemporaryDirectory() as folder:
+            options = [word.replace("{folder}", folder) for word in SMALLEST[name]]
+            why = _run([f"benchmarks/{name}.py", *options])[1]
+        failed += why is not None
+        print(f"{name:<22} {time.perf_counter() - start:6.1f} s  {why or 'done'}", flush=True)
+    return int(failed > 0)
+
+
 def main() -> int:
     """Run, tell, remember."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -141,7 +221,10 @@ def main() -> int:
     parser.add_argument("--axes", nargs="+", choices=AXES, default=AXES, help="of the scaling")
     parser.add_argument("--history", type=Path, default=HISTORY)
     parser.add_argument("--no-history", action="store_true", help="print only")
+    parser.add_argument("--check", nargs="*", choices=list(SMALLEST), help="all, or these, at the smallest size")
     arguments = parser.parse_args()
+    if arguments.check is not None:
+        return check(arguments.check)
     sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
     start = time.perf_counter()
     entry: dict[str, Any] = {

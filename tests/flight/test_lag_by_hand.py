@@ -1,0 +1,430 @@
+"""The search for a lag against a second way to its numbers: plain loops, SciPy's splines and minimisers."""
+
+from __future__ import annotations
+
+import dataclasses
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+from scipy.interpolate import CubicHermiteSpline
+from scipy.optimize import minimize, root
+
+from aerpaw_cmp.flight import lag
+from aerpaw_cmp.flight.lag import DRIFT_LIMIT, combine_lags, estimate_lag, fit_lag
+from tests.flight.test_lag import patterned_flight, two_ray_flight
+
+LAGS = np.round(np.arange(-120, 121) * 0.1, 9)
+
+
+class ByHand:
+    """Costs of lags and drifts of one record, one after the other."""
+
+    def __init__(self, t, m, prediction, most=6000):
+        every = int(np.ceil(len(t) / most))
+        self.t, self.m, self.prediction = t[::every], m[::every], prediction
+        self.middle = (t[0] + t[-1]) / 2
+        self.least = max(30, len(self.t) // 2)
+
+    def residual(self, shift, rate=0.0):
+        at = self.t - shift - rate * (self.t - self.middle)
+        known = self.prediction.times()
+        return self.m - np.interp(at, known, self.prediction.level, left=np.nan, right=np.nan)
+
+    def whitened(self, residual, phi):
+        r = residual[np.isfinite(residual)]
+        r = r - np.sum(r) / len(r)
+        return np.array([r[i + 1] - phi * r[i] for i in range(len(r) - 1)])
+
+    def cost(self, residual, phi):
+        if np.isfinite(residual).sum() - 1 < self.least:
+            return np.inf
+        w = self.whitened(residual, phi)
+        return float(np.mean((w - np.mean(w)) ** 2))
+
+    def phi(self, residual):
+        r = residual[np.isfinite(residual)]
+        r = r - np.mean(r)
+        return min(max(float(np.sum(r[1:] * r[:-1]) / np.sum(r * r)), 0.0), 0.99)
+
+
+def likelihood_ratios(cost, whitened):
+    """Twice the logarithm of the likelihood against the best, for as many independent samples as blocks show."""
+    w = whitened - np.mean(whitened)
+    size = max(4, round(2 * len(w) ** (1 / 3)))
+    count = len(w) // size
+    sums = [np.sum(w[i * size : (i + 1) * size]) for i in range(count)]
+    inflation = sum(s * s for s in sums) / len(w) / np.mean(w * w)
+    return len(w) / max(inflation, 1.0) * np.log(cost / np.min(cost[:-1]))
+
+
+@pytest.fixture(scope="module")
+def record():
+    """A level on 13 000 samples, 1.37 s late, with fading that remembers."""
+    from scipy.signal import lfilter
+
+    level = two_ray_flight(650)
+    t = np.arange(0, 650, 0.05)
+    noise = lfilter([1], [1, -0.8], np.random.default_rng(3).normal(0, 1.2, len(t)))
+    sampled = lag.sample(t, level(t - 1.37) + noise, level, window_s=12.0, resolution_s=0.05)
+    return SimpleNamespace(t=sampled.t, m=sampled.measured_db, prediction=sampled.prediction)
+
+
+@pytest.fixture(scope="module")
+def fit(record):
+    return fit_lag(record.t, record.m, record.prediction, LAGS, 1.0, True)
+
+
+def test_the_curve_is_the_spread_of_the_residual_at_every_lag(record, fit):
+    hand = ByHand(record.t, record.m, record.prediction)
+    curve = [np.sqrt(hand.cost(hand.residual(shift), 0.0)) for shift in LAGS]
+    np.testing.assert_allclose(fit.curve_rmse_db, curve, rtol=1e-9)
+    assert fit.rmse_unshifted_db == pytest.approx(curve[120], rel=1e-9)
+    assert fit.reference == hand.middle
+    assert fit.n == len(record.t)
+    assert fit.window_s == 12.0
+
+
+def test_the_evidence_is_that_of_whitened_residuals_over_lags_and_drifts(record, fit):
+    hand = ByHand(record.t, record.m, record.prediction)
+    plain = [hand.cost(hand.residual(shift), 0.0) for shift in LAGS]
+    phi = hand.phi(hand.residual(LAGS[int(np.argmin(plain))]))
+    assert 0.3 < phi < 0.6
+    span = record.t[-1] - record.t[0]
+    step = 2 * 0.1 / span  # the lag at the ends changes by one lag step
+    count = int(DRIFT_LIMIT / step + 1e-9)
+    if step > DRIFT_LIMIT:
+        step, count = DRIFT_LIMIT, 1
+    rates = [k * step for k in range(-count, count + 1)]
+    table = np.array([[hand.cost(hand.residual(shift, rate), phi) for shift in LAGS] for rate in rates])
+    still = table[len(rates) // 2]
+    best = int(np.argmin(still))  # no drift where none shows
+    assert len(hand.t) * np.log(still.min() / table.min()) < 10.83
+    constant = hand.cost(hand.m, phi)
+    cost = np.append(table.min(axis=0), constant)
+    ratio = likelihood_ratios(cost, hand.whitened(hand.residual(LAGS[best]), phi))
+    np.testing.assert_allclose(fit.evidence, ratio[:-1], rtol=1e-8, atol=1e-8)
+    assert fit.verdict == "ok"
+
+
+def test_the_lag_and_the_drift_are_where_the_whitened_residual_has_nothing_left_of_their_slopes(record, fit):
+    """SciPy's spline through level and slope, its solver of equations, and the memory at the scan's optimum."""
+    t, m, known = record.t, record.m, record.prediction.times()
+    spline = CubicHermiteSpline(known, record.prediction.level, np.gradient(record.prediction.level, known))
+    slope = spline.derivative()
+    middle, half = (t[0] + t[-1]) / 2, 0.5 * (t[-1] - t[0])
+    along = np.stack([np.ones(len(t)), (t - middle) / half])
+
+    def residual(x):
+        return m - spline(t - x @ along)
+
+    hand = ByHand(t, m, record.prediction)
+    phi = hand.phi(hand.residual(LAGS[int(np.argmin(fit.curve_rmse_db))]))
+    coarse = LAGS[np.argsort([hand.cost(hand.residual(shift), phi) for shift in LAGS])[:5]]
+    fine = [shift + 0.01 * k for shift in coarse for k in range(-6, 7)]
+    start = np.array([fine[int(np.argmin([hand.cost(hand.residual(shift), phi) for shift in fine]))], 0.0])
+    phi = hand.phi(residual(start))
+
+    def whitened(x):
+        r, jacobian = residual(x), slope(t - x @ along) * along
+        columns = np.vstack([r, jacobian])
+        columns = columns[:, 1:] - phi * columns[:, :-1]
+        return columns - columns.mean(axis=1, keepdims=True)
+
+    options = {"xatol": 1e-7, "fatol": 1e-6, "maxiter": 2000}
+    least = minimize(lambda x: np.sum(whitened(x)[0] ** 2), start, method="Nelder-Mead", options=options).x
+    best = root(lambda x: whitened(x)[1:] @ whitened(x)[0], least, tol=1e-12).x
+    assert np.abs(least - best).max() < 2e-5  # which is the bottom of the valley
+    assert fit.radio_minus_telemetry_s == pytest.approx(best[0], abs=2e-6)
+    assert fit.drift_s_per_s * half == pytest.approx(best[1], abs=2e-6)
+    left = residual(best)
+    left = left - np.mean(left[1:] - phi * left[:-1]) / (1 - phi)
+    assert fit.rmse_db == pytest.approx(float(np.sqrt(np.mean(left**2))), rel=1e-6)
+    width = lag._sandwich(whitened(best)[0], whitened(best)[1:])
+    low, high = fit.drift_interval_s_per_s
+    assert (high - low) / 2 == pytest.approx(width[1] / half, rel=1e-4)
+    assert (high + low) / 2 == pytest.approx(fit.drift_s_per_s, abs=1e-15)
+    reach = np.hypot(width[0], 0.05 * 0.05)  # the prediction is sampled every 0.05 s
+    possible = LAGS[fit.evidence <= 3.84]
+    low, high = fit.ci95_s
+    assert low == pytest.approx(min(fit.radio_minus_telemetry_s - reach, possible.min()), abs=1e-6)
+    assert high == pytest.approx(max(fit.radio_minus_telemetry_s + reach, possible.max()), abs=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_no_step_leads_out_of_a_narrow_valley(seed):
+    """Steep fades and residuals that remember: whole Gauss-Newton steps go from one side to the other, and up."""
+    from scipy.signal import lfilter
+
+    level = two_ray_flight(650)
+    t, late = np.arange(0, 650, 0.05), 1.37 + 0.013 * seed
+    noise = lfilter([1], [1, -0.8], np.random.default_rng(seed).normal(0, 1.8, len(t)))
+    sampled = lag.sample(t, level(t - late) + noise, level, window_s=6.0, resolution_s=0.05)
+    fit = fit_lag(sampled.t, sampled.measured_db, sampled.prediction, lag.symmetric(6.0, 0.1), 1.0, True)
+    assert fit.radio_minus_telemetry_s == pytest.approx(late, abs=2.5e-3)
+    assert fit.ci95_s[0] <= late <= fit.ci95_s[1]
+    assert abs(fit.drift_s_per_s) < 1e-5
+
+
+def test_free_terms_take_what_they_explain_at_every_lag():
+    level, predictor, _ = patterned_flight(1)
+    t = np.arange(0, 300, 0.25)
+    measured = level(t - 0.8) + np.random.default_rng(4).normal(0, 2, len(t))
+    sampled = lag.sample(t, measured, predictor, window_s=3.0, resolution_s=0.05)
+    lags = lag.symmetric(3.0, 0.1)
+    fit = fit_lag(sampled.t, sampled.measured_db, sampled.prediction, lags, 1.0, False)
+    known, columns = sampled.prediction.times(), np.column_stack([sampled.prediction.level, sampled.prediction.terms])
+    curve = []
+    for shift in lags:
+        at = sampled.t - shift
+        seen = np.column_stack([np.interp(at, known, column) for column in columns.T])
+        design = np.column_stack([np.ones(len(at)), seen[:, 1:]])[1:]
+        y = sampled.measured_db - seen[:, 0]
+        solved = np.linalg.lstsq(design, y[1:], rcond=None)[0]
+        left = y - np.column_stack([np.ones(len(at)), seen[:, 1:]]) @ solved
+        left = left - left.mean()
+        curve.append(np.std(left[1:]))
+    np.testing.assert_allclose(fit.curve_rmse_db, curve, rtol=1e-6)
+    assert fit.radio_minus_telemetry_s == pytest.approx(0.8, abs=0.1)
+    assert np.isnan(fit.drift_interval_s_per_s).all()
+    assert fit.drift_s_per_s == 0.0
+
+
+def test_interpolation_is_that_of_numpy_and_of_hermite_splines():
+    rng = np.random.default_rng(5)
+    level = rng.normal(0, 5, 60)
+    prediction = lag._Prediction(-2.0, 0.25, level[:, None])
+    known = prediction.times()
+    assert known[[0, -1]].tolist() == [-2.0, -2.0 + 59 * 0.25]
+    t = rng.uniform(-2.0, known[-1] - 0.26, 500)
+    np.testing.assert_allclose(prediction.at(t), np.interp(t, known, level), rtol=0, atol=1e-12)
+    spline = CubicHermiteSpline(known, level, np.gradient(level, 0.25))
+    np.testing.assert_allclose(prediction.smooth_at(t), [spline(t), spline.derivative()(t)], rtol=0, atol=1e-9)
+    outside = np.array([-2.0 - 1e-9, known[-1] + 1e-9, 99.0])
+    assert np.isnan(prediction.at(outside)).all()
+    assert np.isnan(prediction.smooth_at(outside)).all()
+    assert prediction.smooth_at(known[7:8])[0] == level[7:8]
+    assert prediction.at(known[:1]) == level[:1]
+    other = rng.normal(size=60)
+    np.testing.assert_allclose(prediction.at(t, other), np.interp(t, known, other), rtol=0, atol=1e-12)
+    terms = rng.normal(size=(60, 3))
+    terms[30] = np.nan
+    beside = prediction.beside(terms)
+    assert np.isnan(beside.level[30])
+    assert np.isfinite(np.delete(beside.level, 30)).all()
+    t = t[np.abs(t - known[30]) > 0.25]
+    np.testing.assert_allclose(
+        beside.terms_at(t), np.column_stack([np.ones(len(t)), *(np.interp(t, known, c) for c in terms.T)]), atol=1e-12
+    )
+    assert np.isnan(beside.terms_at(known[29:30] + 0.01)[:, 1:]).all()
+
+
+def test_instants_that_every_shift_reaches_have_no_gap_within_it():
+    level = np.zeros(101)
+    level[50] = np.nan  # at 10 s
+    prediction = lag._Prediction(0.0, 0.2, level[:, None])
+    t = np.array([0.9, 1.0, 5.0, 8.79, 9.0, 10.0, 11.0, 11.21, 19.0, 19.1])
+    reached = [1.0 <= x <= 19.0 and abs(x - 10.0) > 1.0 + 1e-9 for x in t.tolist()]
+    reached[3] = reached[7] = True
+    assert prediction.common(t, 1.0).tolist() == reached
+
+
+def test_a_record_shorter_than_what_a_lag_needs_costs_infinitely_much():
+    rows = np.random.default_rng(6).normal(size=(4, 40))
+    assert np.isinf(lag._costs(rows, 0.2, 40)).all()
+    assert np.isfinite(lag._costs(rows, 0.2, 39)).all()
+    assert lag._costs(rows, 0.2, 39).tolist() == [lag._cost(row, 0.2, 39) for row in rows]
+
+
+def test_samples_are_sorted_and_those_without_time_or_level_left_out():
+    level = two_ray_flight(60)
+    t = np.arange(0, 60, 0.5)
+    measured = level(t)
+    order = np.random.default_rng(7).permutation(len(t))
+    gaps = measured.copy()
+    gaps[[3, 8]] = np.nan
+    sampled = lag.sample(t[order] + 1e4, gaps[order], lambda x: level(x - 1e4), window_s=2.0, resolution_s=0.1)
+    first = t[order][0]  # the zero of the seconds is the first instant that was logged
+    kept = np.delete(t, [3, 8])
+    assert np.all(np.diff(sampled.t) > 0)
+    np.testing.assert_allclose(sampled.t, kept - first, atol=1e-6)
+    np.testing.assert_allclose(sampled.measured_db, np.delete(measured, [3, 8]))
+    known = sampled.prediction.times()
+    assert known[0] == pytest.approx(sampled.t[0] - 4.0 - DRIFT_LIMIT * 59.5, abs=1e-6)
+    assert known[-1] >= sampled.t[-1] + 4.0
+    np.testing.assert_allclose(sampled.prediction.level, level(known + first), atol=1e-5)
+    given = lag.sample(t, measured, level, window_s=2.0, resolution_s=0.1, origin_ns=-5_000_000_000)
+    np.testing.assert_allclose(given.t, t + 5.0, atol=1e-9)
+    assert lag.sample(t[:29], measured[:29], level, window_s=2.0, resolution_s=0.1) == "too few samples (29)"
+    assert not isinstance(lag.sample(t[:30], measured[:30], level, window_s=2.0, resolution_s=0.1), str)
+
+
+def test_a_short_flight_keeps_what_has_a_prediction_without_a_lag():
+    """Where few samples can be shifted by the whole window all count that have a prediction as they are."""
+    t = np.arange(0, 100, 0.5)
+    measured = np.sin(t)
+
+    def predictor(x):
+        return np.where((x > 20) & (x < 60), np.sin(x), np.nan)
+
+    wide = lag.sample(t, measured, predictor, window_s=12.0, resolution_s=0.1)  # 40 s less 24: 16 % of all
+    inside = (t > 20.15) & (t < 59.85)
+    assert len(wide.t) == inside.sum()
+    narrow = lag.sample(t, measured, predictor, window_s=1.0, resolution_s=0.1)
+    assert len(narrow.t) < inside.sum()
+    assert narrow.t[0] >= 21.1
+    assert narrow.t[-1] <= 58.9
+    nothing = lag.sample(t, measured, lambda x: np.full(len(x), np.nan), window_s=1.0, resolution_s=0.1)
+    assert "do not overlap" in nothing
+
+
+def test_drifts_are_tried_by_steps_of_a_lag_at_the_ends():
+    rates = lag._rates(1800.0, 0.1)
+    step = 0.2 / 1800.0
+    assert rates[1] - rates[0] == pytest.approx(step)
+    assert rates.max() == pytest.approx(step * int(DRIFT_LIMIT / step))
+    assert rates[len(rates) // 2] == 0.0
+    assert lag._rates(100.0, 0.1).tolist() == [-DRIFT_LIMIT, 0.0, DRIFT_LIMIT]
+
+
+def test_costs_that_are_equal_go_to_the_lag_nearest_zero():
+    lags = np.array([-2.0, -1.0, 0.0, 1.0, 2.0])
+    assert lag.best_of(np.array([1.0, 2.0, 3.0, 1.0, 1.0]), lags) == 3
+    assert lag.best_of(np.array([1.0, np.nan, 3.0, 1.0 + 1e-9, 1.0]), lags) == 0
+    assert lag.best_of(np.array([1.0, 2.0, 3.0, 1.0 + 1e-13, 2.0]), lags) == 3
+
+
+def test_a_finer_grid_is_searched_around_the_five_best_of_the_scan():
+    lags = lag.symmetric(2.0, 0.1)
+    cost = np.abs(lags - 0.5) + 1.0
+    asked = []
+
+    def costs_at(tried):
+        asked.append(tried)
+        return np.abs(tried - 0.537) + 1.0
+
+    cost[3] = np.nan
+    assert lag._between(cost, lags, costs_at) == pytest.approx(0.54, abs=1e-9)
+    around = np.unique(np.round(asked[0], 6))
+    np.testing.assert_allclose(around, np.round(np.arange(24, 77) * 0.01, 6), atol=1e-6)
+
+
+RATIO = np.where(np.abs(LAGS - 2.0) < 0.25, 0.0, 50.0)
+JUDGED = [
+    # lag, width, ratio, limit, verdict, word of the reason, interval
+    (2.0, 0.5, RATIO, 1.0, "ok", "", (1.5, 2.5)),
+    (2.0, 0.1, RATIO, 1.0, "ok", "", (1.8, 2.2)),
+    (2.0, 1.1, RATIO, 1.0, "ambiguous", "too wide", (0.9, 3.1)),
+    (2.0, 1.1, RATIO, 1.2, "ok", "", (0.9, 3.1)),
+    (10.4, 0.1, np.where(np.abs(LAGS - 10.4) < 0.25, 0.0, 50.0), 1.0, "failed", "near the edge", (10.2, 10.6)),
+    (10.3, 0.1, np.where(np.abs(LAGS - 10.3) < 0.25, 0.0, 50.0), 1.0, "ok", "", (10.1, 10.5)),
+    (-10.4, 0.1, np.where(np.abs(LAGS + 10.4) < 0.25, 0.0, 50.0), 1.0, "failed", "near the edge", (-10.6, -10.2)),
+    (2.0, 0.1, np.where(np.abs(LAGS + 5.0) < 0.05, 10.8, RATIO), 1.0, "ambiguous", "such as -5.0 s", (1.8, 2.2)),
+    (2.0, 0.1, np.where(np.abs(LAGS + 5.0) < 0.05, 10.9, RATIO), 1.0, "ok", "", (1.8, 2.2)),
+    (2.0, 0.1, np.where(np.abs(LAGS - 3.0) < 0.05, 5.0, RATIO), 1.0, "ok", "", (1.8, 2.2)),
+    (2.0, 0.1, np.where(np.abs(LAGS - 3.1) < 0.05, 5.0, RATIO), 1.0, "ambiguous", "such as +3.1 s", (1.8, 2.2)),
+    (0.0, 0.1, np.full(len(LAGS), 1.0), 1.0, "ambiguous", "hardly depends on the lag", (-12.0, 12.0)),
+    (11.9, 20.0, np.full(len(LAGS), 10.0), 1.0, "ambiguous", "hardly depends on the lag", None),
+]
+
+
+@pytest.mark.parametrize(("at", "width", "ratio", "limit", "verdict", "word", "interval"), JUDGED)
+def test_a_verdict_follows_from_the_width_of_the_valley_and_from_its_rivals(
+    at, width, ratio, limit, verdict, word, interval
+):
+    if interval is None:  # nothing within 3.84 but the best itself
+        ratio = ratio.copy()
+        ratio[-2] = 0.0
+        interval = (-8.1, 12.0)
+    said = lag._judge(at, width, ratio, LAGS, limit)
+    assert said[0] == verdict
+    assert word in said[1]
+    assert (said[1] == "") == (verdict == "ok")
+    assert said[2] == pytest.approx(interval, abs=1e-9)
+
+
+def made_fit(place, evidence, *, half=0.3, n=100, rmse=3.0, drift=0.0, verdict="ok"):
+    return lag.LagFit(
+        radio_minus_telemetry_s=place,
+        ci95_s=(place - half, place + half),
+        drift_s_per_s=drift,
+        drift_interval_s_per_s=(drift - 1e-6, drift + 1e-6),
+        verdict=verdict,
+        reason="",
+        reference=70.0,
+        n=n,
+        rmse_db=rmse,
+        rmse_unshifted_db=2.0 * rmse,
+        window_s=12.0,
+        curve_lag_s=LAGS,
+        curve_rmse_db=np.full(len(LAGS), rmse),
+        evidence=evidence,
+    )
+
+
+def test_evidence_of_channels_adds_up_to_seven_tenths_and_errors_by_samples():
+    one = made_fit(1.0, 100.0 * (LAGS - 1.0) ** 2, half=0.2, n=300, rmse=3.0, drift=2e-6)
+    two = made_fit(1.2, 400.0 * (LAGS - 1.2) ** 2, half=0.1, n=100, rmse=5.0, drift=3e-6)
+    both = combine_lags([one, two])
+    total = 0.7 * (one.evidence + two.evidence)
+    np.testing.assert_allclose(both.evidence, total - total.min(), atol=1e-9)
+    assert both.n == 400
+    assert both.rmse_db == pytest.approx(np.sqrt((300 * 9 + 100 * 25) / 400))
+    assert both.rmse_unshifted_db == pytest.approx(2 * both.rmse_db)
+    np.testing.assert_allclose(both.curve_rmse_db, both.rmse_db)
+    # the sharpest is within a step of the best of the sum (1.16: 1.2 on the grid), and finer than it
+    assert both.radio_minus_telemetry_s == 1.2
+    assert both.drift_s_per_s == 3e-6
+    assert both.drift_interval_s_per_s == two.drift_interval_s_per_s
+    assert (both.reference, both.window_s, both.verdict) == (70.0, 12.0, "ok")
+    possible = LAGS[both.evidence <= 3.84]
+    assert both.ci95_s == pytest.approx((min(1.1, possible.min()), max(1.3, possible.max())))
+
+
+def test_a_sharp_fit_far_from_the_best_of_all_gives_way_to_it():
+    sharp = made_fit(4.0, 10.0 * (LAGS - 4.0) ** 2, half=0.05)
+    strong = made_fit(1.0, 1000.0 * (LAGS - 1.0) ** 2, half=0.2)
+    both = combine_lags([sharp, strong])
+    assert both.radio_minus_telemetry_s == pytest.approx(1.0, abs=0.051)
+    assert both.ci95_s[1] - both.ci95_s[0] >= 0.1 - 1e-9  # a step of the grid: no sharper than that
+    # fits that agree within half a step are believed, wherever the grid has its least value
+    shifted = 1000.0 * (LAGS - 2.0) ** 2
+    agreeing = combine_lags([made_fit(1.02, shifted, half=0.05), made_fit(1.05, shifted, half=0.2)])
+    assert agreeing.radio_minus_telemetry_s == 1.02
+    apart = combine_lags([made_fit(1.02, shifted, half=0.05), made_fit(1.08, shifted, half=0.2)])
+    assert apart.radio_minus_telemetry_s == pytest.approx(2.0)
+    doubtful = combine_lags([made_fit(1.0, shifted, half=0.005, verdict="ambiguous"), made_fit(1.0, shifted)])
+    assert doubtful.ci95_s[1] - doubtful.ci95_s[0] >= 0.1 - 1e-9
+
+
+def test_evidence_without_end_does_not_drown_the_other_channel():
+    one = made_fit(1.0, np.where(np.abs(LAGS - 1.0) < 0.05, 0.0, np.inf), half=0.2)
+    two = made_fit(1.0, 50.0 * (LAGS - 1.0) ** 2, half=0.3)
+    both = combine_lags([one, two])
+    assert np.isfinite(both.evidence).all()
+    assert both.evidence.max() == pytest.approx(0.7 * (1e6 + two.evidence.max()))
+    assert both.radio_minus_telemetry_s == 1.0
+
+
+def test_times_are_corrected_by_subtracting_lag_and_drift():
+    fit = made_fit(1.5, LAGS * 0, drift=1e-4)
+    t = np.array([1000.0, 1100.0, 1300.0])
+    late = 1.5 + 1e-4 * (np.array([0.0, 100.0, 300.0]) - 70.0)
+    np.testing.assert_allclose(fit.apply(t), t - late, atol=1e-12)
+    stamps = np.datetime64("2025-03-02T12:00:00", "ns") + (t * 1e9).astype("timedelta64[ns]")
+    moved = (stamps - fit.apply(stamps)) / np.timedelta64(1, "s")
+    np.testing.assert_allclose(moved, late, atol=1e-9)
+
+
+def test_a_drift_needs_ten_minutes_unless_it_is_asked_for():
+    level = two_ray_flight(700)
+    for span, fitted in ((590.0, False), (601.0, True)):
+        t = np.arange(0, span, 0.5)
+        measured = level(t) + np.random.default_rng(8).normal(0, 2, len(t))
+        assert np.isfinite(estimate_lag(t, measured, level).drift_interval_s_per_s).all() == fitted
+        assert np.isfinite(estimate_lag(t, measured, level, drift=True).drift_interval_s_per_s).all()
+        assert np.isnan(estimate_lag(t, measured, level, drift=False).drift_interval_s_per_s).all()
+    coarse = estimate_lag(t, measured, level, resolution_s=0.5)
+    assert coarse.curve_lag_s[1] - coarse.curve_lag_s[0] == pytest.approx(0.5)
+    assert estimate_lag(t, measured, level, resolution_s=0.02).curve_lag_s[1] - coarse.curve_lag_s[0] > 0
+    assert dataclasses.replace(coarse, n=5).as_dict()["n"] == 5

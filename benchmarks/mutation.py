@@ -51,7 +51,9 @@ TARGETS: dict[str, tuple[str, ...]] = {
         _PHYSICS + "test_foliage.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_hard_cases.py",
         _PHYSICS + "test_crowns.py",
     ),
-    "aerpaw_cmp/compare/offset.py": ("aerpaw_cmp/compare/offset.py", "tests/compare/test_offset.py"),
+    "aerpaw_cmp/compare/offset.py": (
+        "aerpaw_cmp/compare/offset.py", "tests/compare/test_offset.py", "tests/compare/test_offset_by_hand.py"
+    ),
     "aerpaw_cmp/compare/rank.py": ("aerpaw_cmp/compare/rank.py", "tests/compare/test_rank.py"),
     "aerpaw_cmp/flight/clock.py": ("tests/flight/test_clock.py", "tests/flight/test_clock_by_hand.py"),
     "aerpaw_cmp/flight/lag.py": (

@@ -49,18 +49,20 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "aerpaw_cmp/propagation/foliage.py": (
         _PHYSICS + "test_foliage.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_hard_cases.py",
-        _PHYSICS + "test_crowns.py",
+        _PHYSICS + "test_crowns.py", _PHYSICS + "test_foliage_by_hand.py",
     ),
     "aerpaw_cmp/compare/offset.py": (
         "aerpaw_cmp/compare/offset.py", "tests/compare/test_offset.py", "tests/compare/test_offset_by_hand.py"
     ),
-    "aerpaw_cmp/compare/rank.py": ("aerpaw_cmp/compare/rank.py", "tests/compare/test_rank.py"),
+    "aerpaw_cmp/compare/rank.py": (
+        "aerpaw_cmp/compare/rank.py", "tests/compare/test_rank.py", "tests/compare/test_rank_by_hand.py"
+    ),
     "aerpaw_cmp/flight/clock.py": ("tests/flight/test_clock.py", "tests/flight/test_clock_by_hand.py"),
     "aerpaw_cmp/flight/lag.py": (
         "tests/flight/test_lag_by_hand.py", "tests/flight/test_lag.py", "tests/flight/test_clock.py",
         "tests/flight/test_clock_by_hand.py",
     ),
-    "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py",),
+    "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py", "tests/maps/test_kriging_by_hand.py"),
     "parsers/aerpaw_parsers/_lines.py": (
         "tests/parsers/test_law.py", "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py",
         "tests/parsers/test_rows.py", "tests/parsers/test_lines.py", "parsers/aerpaw_parsers/_lines.py",

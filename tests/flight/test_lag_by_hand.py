@@ -70,7 +70,7 @@ def record():
     return SimpleNamespace(t=sampled.t, m=sampled.measured_db, prediction=sampled.prediction)
 
 
-@pytest.fixture(scope="module")
+@pytest.fixture
 def fit(record):
     return fit_lag(record.t, record.m, record.prediction, LAGS, 1.0, True)
 

@@ -428,3 +428,111 @@ def test_a_drift_needs_ten_minutes_unless_it_is_asked_for():
     assert coarse.curve_lag_s[1] - coarse.curve_lag_s[0] == pytest.approx(0.5)
     assert estimate_lag(t, measured, level, resolution_s=0.02).curve_lag_s[1] - coarse.curve_lag_s[0] > 0
     assert dataclasses.replace(coarse, n=5).as_dict()["n"] == 5
+
+
+@pytest.mark.parametrize("drifting", [False, True])
+def test_a_free_term_moves_with_the_lag_and_its_coefficient_is_that_of_least_squares(drifting):
+    """One term: lag, drift and coefficient at once, by SciPy's solver on the whitened residual."""
+    level = two_ray_flight(300)
+    t = np.arange(0, 300, 0.1)
+
+    def term(x):
+        return np.cos(2 * np.pi * np.asarray(x) / 41.0)
+
+    from scipy.signal import lfilter
+
+    noise = lfilter([1], [1, -0.6], np.random.default_rng(12).normal(0, 0.8, len(t)))
+    heard = level(t - 0.83) + 4.0 * term(t - 0.83) - 20.0 + noise
+    sampled = lag.sample(t, heard, lambda x: np.column_stack([level(x), term(x)]), window_s=3.0, resolution_s=0.05)
+    t, m, prediction = sampled.t, sampled.measured_db, sampled.prediction
+    middle, half = (t[0] + t[-1]) / 2, 0.5 * (t[-1] - t[0])
+    start = np.array([0.83, 0.0])[: 1 + drifting]
+    (late, rate), (width, rate_width), rmse = lag._refine(t, m, prediction, middle, start)
+    known = prediction.times()
+    spline = CubicHermiteSpline(known, prediction.level, np.gradient(prediction.level, known))
+    along = np.stack([np.ones(len(t)), (t - middle) / half])[: 1 + drifting]
+
+    def parts(x):
+        at = t - x @ along
+        design = np.column_stack([np.ones(len(t)), np.interp(at, known, prediction.terms[:, 0])])
+        return (
+            m - spline(at),
+            design,
+            spline.derivative()(at),
+            np.interp(at, known, np.gradient(prediction.terms[:, 0], known)),
+        )
+
+    y, design, *_ = parts(np.array([0.83, 0.0])[: 1 + drifting])
+    left = y - design @ np.linalg.lstsq(design, y, rcond=None)[0]
+    phi = float(left[1:] @ left[:-1] / (left @ left)) if abs(left.mean()) < 1e-9 else np.nan
+
+    def whitened(x):
+        y, design, slope, moved = parts(x)
+        base = design[1:] - phi * design[:-1]
+        coefficient = np.linalg.lstsq(base, y[1:] - phi * y[:-1], rcond=None)[0]
+        columns = np.vstack([y, (slope + moved * coefficient[1]) * along])
+        columns = columns[:, 1:] - phi * columns[:, :-1]
+        return columns - (base @ np.linalg.lstsq(base, columns.T, rcond=None)[0]).T, y - design @ coefficient
+
+    best = root(lambda x: whitened(x)[0][1:] @ whitened(x)[0][0], start, tol=1e-12).x
+    assert late == pytest.approx(best[0], abs=2e-6)
+    assert late == pytest.approx(0.83, abs=0.01)
+    expected = lag._sandwich(whitened(best)[0][0], whitened(best)[0][1:])
+    assert width == pytest.approx(expected[0], rel=1e-3)
+    assert rmse == pytest.approx(float(np.sqrt(np.mean(whitened(best)[1] ** 2))), rel=1e-6)
+    if drifting:
+        assert rate * half == pytest.approx(best[1], abs=2e-6)
+        assert rate_width == pytest.approx(expected[1] / half, rel=1e-3)
+    else:
+        assert (rate, np.isnan(rate_width)) == (0.0, True)
+
+
+def test_a_valley_that_is_not_there_leaves_the_place_of_the_scan():
+    """A flat level has no bottom: Gauss-Newton would walk away."""
+    t = np.arange(0, 100, 0.5)
+    prediction = lag._Prediction(-20.0, 0.1, (1e-6 * np.sin(np.arange(1400) / 40.0))[:, None])
+    heard = np.random.default_rng(13).normal(0, 3, len(t))
+    (late, rate), _, rmse = lag._refine(t, heard, prediction, 50.0, np.array([1.23, 1e-5]))
+    assert (late, rate) == (1.23, pytest.approx(1e-5))
+    assert rmse == pytest.approx(np.std(heard), rel=0.02)
+
+
+def test_terms_of_direction_are_harmonics_of_where_each_end_sees_the_other():
+    azimuth, elevation, relative = np.radians([[10.0, 200.0], [5.0, 40.0], [300.0, 77.0]])
+    terms = lag.direction_terms([10.0, 200.0], [5.0, 40.0], [300.0, 77.0])
+    expected = [
+        elevation, elevation**2, np.cos(azimuth), np.sin(azimuth), np.cos(2 * azimuth), np.sin(2 * azimuth),
+        np.cos(relative), np.sin(relative), np.cos(2 * relative), np.sin(2 * relative),
+        np.cos(relative) * elevation, np.sin(relative) * elevation,
+    ]  # fmt: skip
+    np.testing.assert_allclose(terms, np.transpose(expected), atol=1e-15)
+    # a UAV 30 m north, 30 m east and up of the tower, its nose to the north: the tower is behind it, to the left
+    place, position = np.array([[100.0, 50.0, 10.0]]), np.array([[130.0, 80.0, 10.0 + np.hypot(30.0, 30.0)]])
+    np.testing.assert_allclose(
+        lag.terms_from(place, position, np.array([0.0])), lag.direction_terms([45.0], [45.0], [225.0]), atol=1e-12
+    )
+    np.testing.assert_allclose(
+        lag.terms_from(place, position, np.array([90.0])), lag.direction_terms([45.0], [45.0], [135.0]), atol=1e-12
+    )
+
+
+def test_the_prediction_is_asked_at_its_own_instants_to_the_nanosecond():
+    t = np.arange(0, 1000, 0.5)
+    sampled = lag.sample(t, np.sin(t), lambda x: x, window_s=2.0, resolution_s=0.1)
+    np.testing.assert_allclose(sampled.prediction.level, sampled.prediction.times(), rtol=0, atol=2e-9)
+    stamps = np.datetime64("2025-03-02T12:00:00", "ns") + (t * 1e9).astype("timedelta64[ns]")
+    asked = []
+
+    def predictor(x):
+        asked.append(x)
+        return np.zeros(len(x))
+
+    sampled = lag.sample(stamps, np.sin(t), predictor, window_s=2.0, resolution_s=0.1)
+    since = (asked[0] - stamps[0]) / np.timedelta64(1, "ns")
+    np.testing.assert_allclose(since, sampled.prediction.times() * 1e9, rtol=0, atol=1.0)
+
+
+def test_what_is_shown_of_a_fit_leaves_its_curves_out(fit):
+    assert "curve" not in repr(fit)
+    assert "evidence" not in repr(fit)
+    assert f"verdict={fit.verdict!r}" in repr(fit)

@@ -34,7 +34,7 @@ class ByHand:
     def whitened(self, residual, phi):
         r = residual[np.isfinite(residual)]
         r = r - np.sum(r) / len(r)
-        return np.array([r[i + 1] - phi * r[i] for i in range(len(r) - 1)])
+        return r[1:] - phi * r[:-1]
 
     def cost(self, residual, phi):
         if np.isfinite(residual).sum() - 1 < self.least:

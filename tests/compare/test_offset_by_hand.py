@@ -9,6 +9,7 @@ import pytest
 from scipy.optimize import minimize
 from scipy.stats import norm
 
+from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.compare.offset import (
     ReferencePower,
     censored_offset,
@@ -252,3 +253,18 @@ def test_a_setting_is_found_by_all_its_words_and_the_nearest_gain_within_half_a_
     assert expected_offset_db(
         receiver_reference_dbm=-11.0, transmitter_reference_dbm=2.0, simulated_transmit_dbm=7.0
     ) == pytest.approx(-11.0 - 2.0 + 7.0)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "Node,Category,Channel,PA,Gain,Freq_3.4GHz", "Node,Category,Channel,PA_Enabled,Gain",
+        "Node,Category,Channel,PA_Enabled,Gain,Freq_3.4GHz,Note", "Node,Category,Channel,PA_Enabled,Gain,Freq_3.4",
+        "Node,Category,Channel,PA_Enabled,Gain,3.4GHz",
+    ],
+)  # fmt: skip
+def test_a_header_that_is_wrong_in_one_place_is_refused(tmp_path, header):
+    path = tmp_path / "refs.csv"
+    path.write_text(header + "\nlw1,rx,ch0,0,30.0,-10\n")
+    with pytest.raises(InputError, match="no table of reference powers"):
+        read_reference_powers(path)

@@ -253,3 +253,26 @@ def test_the_condition_number_is_put_on_every_singular_value():
     assert ranks.condition_number_rank(sigma).tolist() == [2, 1, 0]
     assert ranks.condition_number_rank([1.0, 0.5], limit_db=6.0) == 1
     assert ranks.condition_number_rank([1.0, 0.5], limit_db=6.1) == 2
+
+
+def test_an_interval_of_k_on_a_fine_grid_is_one_step_wider():
+    k = 1.25 ** np.arange(12)
+    low, high = ranks._central(np.array([k[4], k[8]] * 50), k)
+    assert (low, high) == (k[3], k[9])
+    between = ranks._central(np.full(9, k[5] * 1.1), k)
+    assert between == (k[4], k[7])
+
+
+def test_profiles_without_a_value_have_no_rank():
+    assert rank_from_singular_values(np.zeros((3, 2, 0)), 10.0).tolist() == [[0, 0]] * 3
+    assert rank_from_singular_values(np.zeros((4, 0)), 10.0).tolist() == [0] * 4
+
+
+def test_places_of_two_passes_are_the_same_within_two_metres():
+    along = np.arange(200) * 10.0
+    first = np.column_stack([along, np.zeros((200, 2))])
+    rank = walk(200, 9)
+    for away, n in ((1.99, 200), (2.5, 0)):
+        found = ranks.repeat_rank(first, rank, [*first, 0.0, away, 0.0], rank, replicates=20)
+        assert found.n == n
+        assert (found.agreement == 1.0) == bool(n)

@@ -10,7 +10,7 @@ import pytest
 
 from aerpaw_cmp.compare.result import APPLIED, ESTIMATED, NOT_APPLIED
 from aerpaw_cmp.compare.statistics import paired_difference
-from aerpaw_cmp.flight import clock
+from aerpaw_cmp.flight import clock, lag
 from aerpaw_cmp.flight.clock import ClockChannel, HeldOutBlocks, clock_trap, judge_clock
 from aerpaw_cmp.flight.lag import DRIFT_LIMIT, combine_lags, fit_lag, no_lag, sample, symmetric
 from tests.flight.test_lag import two_ray_flight
@@ -462,3 +462,26 @@ def test_the_offset_of_the_zone_on_that_day_names_the_mistake():
         clock_trap(hour, span).explanation
         == "the clocks differ by -1 h: a time zone was taken into account in one log only"
     )
+
+
+def test_a_zone_without_an_offset_is_no_reason_for_hours():
+    noon = 1_721_060_000.0
+    span = (noon, noon + 600.0)
+    for zone in ("UTC", "Africa/Abidjan"):
+        for late in (-HOUR, HOUR):
+            trap = clock_trap((noon + late, noon + late + 600.0), span, zone)
+            assert trap.explanation == "one hour: daylight saving taken into account in one log only"
+
+
+def test_the_middle_sample_belongs_to_the_first_half():
+    level = two_ray_flight(260)
+    t = np.arange(0, 401) * 0.5  # the middle is a sample: 100 s
+    heard = level(t - 0.4) + np.random.default_rng(15).normal(0, 1, len(t))
+    s = lag.sample(t, heard, level, window_s=3.0, resolution_s=0.05)
+    assert (s.t[0] + s.t[-1]) / 2 in s.t
+    lags = symmetric(3.0, 0.1)
+    e = SimpleNamespace(drift_s_per_s=0.0, reference_s=0.0)
+    expected = [fit_lag(s.t[part], heard[part], s.prediction, lags, 1.0, False) for part in (t <= 100.0, t > 100.0)]
+    halves = clock._halves([s], e, lags, 1.0)
+    assert [h.radio_minus_telemetry_s for h in halves] == [x.radio_minus_telemetry_s for x in expected]
+    assert [h.n for h in halves] == [201, 200]

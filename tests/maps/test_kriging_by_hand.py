@@ -227,3 +227,25 @@ def test_estimates_do_not_depend_on_how_many_are_made_at_once(monkeypatch):
     monkeypatch.setattr(kriging, "CHUNK", 7)
     for a, b in zip(whole, OrdinaryKriging(exponential, 6).fit(points, values).predict(targets), strict=True):
         np.testing.assert_allclose(a, b, rtol=1e-12)
+
+
+def test_one_step_of_refinement_gives_back_digits_that_the_inverse_lost():
+    """A smooth correlation without nugget on a dense line: against 40 digits."""
+    import mpmath
+
+    points = np.column_stack([np.arange(7) * 9.0, np.zeros(7)])
+    gamma = 1.0 - np.exp(-((np.subtract.outer(points[:, 0], points[:, 0]) / 40.0) ** 2))
+    to_target = 1.0 - np.exp(-(((points[:, 0] - 24.3) / 40.0) ** 2))
+    weight, lagrange, fine = kriging._solve_bordered(gamma[None], to_target[None])
+    assert fine.all()
+    with mpmath.workdps(40):
+        system = mpmath.ones(8, 8)
+        for i, j in itertools.product(range(7), repeat=2):
+            system[i, j] = mpmath.mpf(float(gamma[i, j]))
+        system[7, 7] = 0
+        exact = mpmath.lu_solve(system, mpmath.matrix([*map(float, to_target), 1.0]))
+        error = max(abs(float(exact[i] - mpmath.mpf(float(weight[0, i])))) for i in range(7))
+        inverse = np.linalg.inv(np.array(system.tolist(), dtype=float)) @ np.append(to_target, 1.0)
+        plain = max(abs(float(exact[i] - mpmath.mpf(float(inverse[i])))) for i in range(7))
+    assert error < 0.5 * plain
+    assert float(exact[7]) == pytest.approx(lagrange[0], abs=1e-9)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation import foliage
 from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db
 from aerpaw_cmp.site.site import Trees
@@ -158,3 +159,26 @@ def test_a_level_line_lies_within_a_slab_up_to_its_faces(low):
     first, last = foliage._slab(np.array([0.0, 10.0, 0.0, 3.0]), np.array([10.0, -10.0, 1.0, 1.0]), 2.0, 5.0)
     np.testing.assert_allclose(first, [0.2, 0.5, 1.0 + 1.0, 0.0])
     np.testing.assert_allclose(last, [0.5, 0.8, 1.0, 1.0])
+
+
+def test_models_are_their_formulas_to_the_last_digits():
+    metres = np.array([0.0, 3.0, 14.0, 14.5, 200.0])
+    for ghz, leaf in ((3.4, True), (0.23, False), (95.0, True)):
+        scale = ghz**0.284 * (1.0 if leaf else foliage.LEAFLESS_FACTOR)
+        expected = [scale * (0.45 * d if d <= 14 else 1.33 * d**0.588) for d in metres]
+        np.testing.assert_allclose(foliage.Weissberger(ghz * 1e9, leaf).loss_db(metres), expected, rtol=1e-12)
+    found = foliage.P833(0.2, 0.5).loss_db(metres)  # less than a decibel either
+    np.testing.assert_allclose(found, 0.5 * (1 - np.exp(-0.2 * metres / 0.5)), rtol=1e-12)
+    assert foliage.P833(0.0, 10.0).loss_db(metres).tolist() == [0.0] * 5
+    for gamma, most in ((-0.1, 10.0), (0.5, 0.0), (np.nan, 1.0), (0.5, np.inf), (np.inf, 1.0)):
+        with pytest.raises(UsageError, match="gamma >= 0 and A_m > 0"):
+            foliage.P833(gamma, most)
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 8])
+def test_batches_of_one_segment_come_to_the_last(count, monkeypatch):
+    monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 1)
+    start = np.column_stack([np.full(count, -9.0), np.linspace(-3, 3, count), np.full(count, 8.0)])
+    end = [*start, 18.0, 0.0, 0.0]
+    found = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
+    np.testing.assert_allclose(found, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)

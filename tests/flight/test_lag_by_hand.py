@@ -60,11 +60,11 @@ def likelihood_ratios(cost, whitened):
 
 @pytest.fixture(scope="module")
 def record():
-    """A level on 13 000 samples, 1.37 s late, with fading that remembers."""
+    """A level on 13 000 samples of 1300 s, 1.37 s late, with fading that remembers."""
     from scipy.signal import lfilter
 
-    level = two_ray_flight(650)
-    t = np.arange(0, 650, 0.05)
+    level = two_ray_flight(1300)
+    t = np.arange(0, 1300, 0.1)
     noise = lfilter([1], [1, -0.8], np.random.default_rng(3).normal(0, 1.2, len(t)))
     sampled = lag.sample(t, level(t - 1.37) + noise, level, window_s=12.0, resolution_s=0.05)
     return SimpleNamespace(t=sampled.t, m=sampled.measured_db, prediction=sampled.prediction)
@@ -92,9 +92,8 @@ def test_the_evidence_is_that_of_whitened_residuals_over_lags_and_drifts(record,
     assert 0.3 < phi < 0.6
     span = record.t[-1] - record.t[0]
     step = 2 * 0.1 / span  # the lag at the ends changes by one lag step
+    assert step < DRIFT_LIMIT
     count = int(DRIFT_LIMIT / step + 1e-9)
-    if step > DRIFT_LIMIT:
-        step, count = DRIFT_LIMIT, 1
     rates = [k * step for k in range(-count, count + 1)]
     table = np.array([[hand.cost(hand.residual(shift, rate), phi) for shift in LAGS] for rate in rates])
     still = table[len(rates) // 2]
@@ -536,3 +535,32 @@ def test_what_is_shown_of_a_fit_leaves_its_curves_out(fit):
     assert "curve" not in repr(fit)
     assert "evidence" not in repr(fit)
     assert f"verdict={fit.verdict!r}" in repr(fit)
+
+
+def test_evidence_does_not_depend_on_the_unit_of_the_level():
+    rng = np.random.default_rng(16)
+    cost, runs = np.array([1.0, 2.0, 3.0]), np.repeat(rng.normal(size=400), 20)
+    for unit in (1e-3, 1e3):
+        np.testing.assert_allclose(
+            lag._likelihood_ratios(cost * unit**2, runs * unit), lag._likelihood_ratios(cost, runs), rtol=1e-9
+        )
+    assert lag._likelihood_ratios(np.array([0.0, 0.0, 1.0]), runs).tolist() == [0.0, 0.0, np.inf]
+    assert lag._likelihood_ratios(np.array([1.0, np.inf, 1.0]), runs).tolist() == [0.0, np.inf, 0.0]
+    np.testing.assert_allclose(lag._likelihood_ratios(cost, np.zeros(50)), 50 * np.log(cost), rtol=1e-12)
+
+
+@pytest.mark.parametrize(("drift", "kept"), [(1.1, True), (1.5, False), (-1.5, False)])
+def test_a_drift_well_beyond_the_search_is_not_followed(drift, kept):
+    level = two_ray_flight(700)
+    t = np.arange(0, 700, 0.2)
+    late = 0.5 + drift * DRIFT_LIMIT * (t - t[-1] / 2)
+    heard = level(t - late) + np.random.default_rng(17).normal(0, 0.5, len(t))
+    s = lag.sample(t, heard, level, window_s=3.0, resolution_s=0.05)
+    (found, rate), _, _ = lag._refine(
+        s.t, s.measured_db, s.prediction, (s.t[0] + s.t[-1]) / 2, np.array([0.5, drift * DRIFT_LIMIT * 0.98])
+    )
+    if kept:
+        assert rate == pytest.approx(drift * DRIFT_LIMIT, rel=0.01)
+        assert found == pytest.approx(0.5, abs=0.01)
+    else:
+        assert (found, rate) == (0.5, pytest.approx(drift * DRIFT_LIMIT * 0.98, rel=1e-12))

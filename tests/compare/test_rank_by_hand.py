@@ -273,6 +273,6 @@ def test_places_of_two_passes_are_the_same_within_two_metres():
     first = np.column_stack([along, np.zeros((200, 2))])
     rank = walk(200, 9)
     for away, n in ((1.99, 200), (2.5, 0)):
-        found = ranks.repeat_rank(first, rank, [*first, 0.0, away, 0.0], rank, replicates=20)
+        found = ranks.repeat_rank(first, rank, first + np.array([0.0, away, 0.0]), rank, replicates=20)
         assert found.n == n
         assert (found.agreement == 1.0) == bool(n)

@@ -180,6 +180,6 @@ def test_models_are_their_formulas_to_the_last_digits():
 def test_batches_of_one_segment_come_to_the_last(count, monkeypatch):
     monkeypatch.setattr(foliage, "_PAIRS_AT_ONCE", 1)
     start = np.column_stack([np.full(count, -9.0), np.linspace(-3, 3, count), np.full(count, 8.0)])
-    end = [*start, 18.0, 0.0, 0.0]
+    end = start + np.array([18.0, 0.0, 0.0])
     found = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
     np.testing.assert_allclose(found, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)

@@ -386,14 +386,14 @@ def _whitened(residual: FloatArray, phi: float) -> FloatArray:
 def _cost(residual: FloatArray, phi: float, least: int) -> float:
     """Mean square of the whitened residual about its mean; infinite where too few samples have a prediction."""
     w = _whitened(residual, phi)
-    return float(w.var()) if len(w) >= least else float("inf")
+    return float(w.var()) if len(w) + 1 >= least else float("inf")
 
 
 def _costs(residuals: FloatArray, phi: float, least: int) -> FloatArray:
     """:func:`_cost` of each row (lags, n), to the last digit; rows without a gap at once."""
     whole = np.isfinite(residuals).all(axis=1)
     costs = np.empty(len(residuals))
-    if whole.any() and residuals.shape[1] > least:
+    if whole.any() and residuals.shape[1] >= least:
         r = residuals if whole.all() else residuals[whole]
         r = r - r.mean(axis=1, keepdims=True)
         costs[whole] = (r[:, 1:] - phi * r[:, :-1]).var(axis=1)

@@ -133,6 +133,8 @@ def test_halves_are_fitted_apart_with_the_drift_taken_off(flight):
     first, second = clock._halves([tiny], e, flight.lags, 1.0)  # twenty samples each: too few
     assert first.verdict == second.verdict == "failed"
     assert (first.reason, first.n, first.ci95_s) == ("too few samples", 0, (-3.0, 3.0))
+    enough = replace(tiny, t=s.t[:60], measured_db=s.measured_db[:60])  # thirty each
+    assert [half.n for half in clock._halves([enough], e, flight.lags, 1.0)] == [30, 30]
 
 
 def test_free_patterns_are_terms_at_the_instants_of_the_prediction(flight):
@@ -213,7 +215,8 @@ def test_blocks_kept_out_are_scored_with_what_the_others_say(flight):
     odd, even = (list(flight.sampled.values()) for _ in range(2))
     even = [replace(s, t=s.t[: len(s.t) // 2 * 2], measured_db=s.measured_db[: len(s.t) // 2 * 2]) for s in even]
     odd = [replace(s, t=s.t[:-1], measured_db=s.measured_db[:-1]) for s in even]
-    for sampled in (odd, even):  # every second sample of them is taken
+    shorter = [even[0], replace(even[1], t=even[1].t[:2500], measured_db=even[1].measured_db[:2500])]
+    for sampled in (odd, even, shorter):  # every second sample of them is taken
         found = clock._held_out(sampled, e, flight.lags)
         improved, paired = by_hand_held_out(sampled, e, flight.lags, 10)  # 700 s: ten at most
         assert found.blocks == 10

@@ -37,7 +37,7 @@ class ByHand:
         return r[1:] - phi * r[:-1]
 
     def cost(self, residual, phi):
-        if np.isfinite(residual).sum() - 1 < self.least:
+        if np.isfinite(residual).sum() < self.least:
             return np.inf
         w = self.whitened(residual, phi)
         return float(np.mean((w - np.mean(w)) ** 2))
@@ -230,9 +230,11 @@ def test_instants_that_every_shift_reaches_have_no_gap_within_it():
 
 def test_a_record_shorter_than_what_a_lag_needs_costs_infinitely_much():
     rows = np.random.default_rng(6).normal(size=(4, 40))
-    assert np.isinf(lag._costs(rows, 0.2, 40)).all()
-    assert np.isfinite(lag._costs(rows, 0.2, 39)).all()
-    assert lag._costs(rows, 0.2, 39).tolist() == [lag._cost(row, 0.2, 39) for row in rows]
+    assert np.isinf(lag._costs(rows, 0.2, 41)).all()
+    assert np.isfinite(lag._costs(rows, 0.2, 40)).all()
+    assert lag._costs(rows, 0.2, 40).tolist() == [lag._cost(row, 0.2, 40) for row in rows]
+    rows[1, 7] = np.nan
+    assert np.isinf(lag._costs(rows, 0.2, 40)).tolist() == [False, True, False, False]
 
 
 def test_samples_are_sorted_and_those_without_time_or_level_left_out():
@@ -564,3 +566,13 @@ def test_a_drift_well_beyond_the_search_is_not_followed(drift, kept):
         assert found == pytest.approx(0.5, abs=0.01)
     else:
         assert (found, rate) == (0.5, pytest.approx(drift * DRIFT_LIMIT * 0.98, rel=1e-12))
+
+
+def test_thirty_samples_are_enough_for_a_fit_and_say_nothing_of_an_overlap():
+    level = two_ray_flight(60)
+    for n, words in ((29, "too few samples (29)"), (30, "")):
+        t = np.arange(n) * 2.0
+        fit = estimate_lag(t, level(t - 0.3), level, window_s=2.0)
+        assert words in fit.reason
+        assert (fit.n, "overlap" in fit.reason) == (n * (n >= 30), False)
+    assert fit.radio_minus_telemetry_s == pytest.approx(0.3, abs=0.05)

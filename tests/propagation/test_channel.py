@@ -340,6 +340,9 @@ def test_power_sum_is_the_mean_over_random_phases(scenes):
 def test_rss_of_no_power_is_nan():
     assert np.isnan(rss_dbm(np.array([0.0]), 40.0))
     assert rss_dbm(np.array([1e-8]), 40.0) == pytest.approx(-40.0)
+    at_floor = float(rss_dbm(np.array([1e-8]), 40.0)[0])  # a level at the floor is heard, one below it is not
+    assert rss_dbm(np.array([1e-8]), 40.0, at_floor) == at_floor
+    assert np.isnan(rss_dbm(np.array([1e-8]), 40.0, np.nextafter(at_floor, 0.0)))
 
 
 @pytest.mark.parametrize("scale", [1e-150, 1.0, 1e150])

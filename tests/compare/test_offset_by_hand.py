@@ -146,7 +146,7 @@ def test_pooled_offsets_are_those_of_all_pairs_of_the_group(per, axes):
             [("f1", "A", "x", 7), ("f1", "A", "y", 3), ("f1", "B", "x", 11), ("f2", "A", "x", 5), ("f2", "B", "y", 2)]
         )
     }
-    pairs["f2", "B", "x"] = ([NAN], [0.0])
+    pairs = {("f0", "C", "z"): ([NAN], [0.0]), **pairs, ("f2", "B", "x"): ([NAN], [0.0])}
     fits = pooled_offsets(pairs, per)
     assert list(fits) == list(pairs)
     for key, (measured, simulated) in pairs.items():
@@ -268,3 +268,13 @@ def test_a_header_that_is_wrong_in_one_place_is_refused(tmp_path, header):
     path.write_text(header + "\nlw1,rx,ch0,0,30.0,-10\n")
     with pytest.raises(InputError, match="no table of reference powers"):
         read_reference_powers(path)
+
+
+@pytest.mark.parametrize("step", [0.001, 0.02, 2.0])
+def test_the_trimmed_fit_is_the_best_of_its_grid_whatever_its_step(step):
+    rng = np.random.default_rng(8)
+    measured, simulated = rng.normal(0, 1, 30), rng.normal(0.7, 1, 30)
+    grid = offset_grid(step, (-3.0, 5.0))
+    brute = [np.mean(np.sort((measured + o - simulated) ** 2)[:21]) for o in grid]
+    fit = trimmed_offset(measured, simulated, keep=0.7, step_db=step, span_db=(-3.0, 5.0))
+    assert fit.offset_db == grid[int(np.argmin(brute))]

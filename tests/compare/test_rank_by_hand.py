@@ -276,3 +276,12 @@ def test_places_of_two_passes_are_the_same_within_two_metres():
         found = ranks.repeat_rank(first, rank, first + np.array([0.0, away, 0.0]), rank, replicates=20)
         assert found.n == n
         assert (found.agreement == 1.0) == bool(n)
+
+
+def test_a_curve_without_a_pair_says_nothing():
+    curve = k_curve([np.nan, 2.0], np.array([[1.0, 0.5], [0.0, 0.0]]), k=[10.0, 100.0])
+    assert np.isnan(
+        [*curve.agreement, *curve.total_variation, curve.best_k_agreement, curve.best_k_total_variation]
+    ).all()
+    assert curve.best_k_interval == curve.best_k_total_variation_interval == NO_INTERVAL
+    assert not curve.at_edge

@@ -576,3 +576,46 @@ def test_thirty_samples_are_enough_for_a_fit_and_say_nothing_of_an_overlap():
         assert words in fit.reason
         assert (fit.n, "overlap" in fit.reason) == (n * (n >= 30), False)
     assert fit.radio_minus_telemetry_s == pytest.approx(0.3, abs=0.05)
+
+
+def test_terms_that_are_all_but_alike_take_no_direction_of_noise():
+    """What tells them apart by a ten-millionth is rounding: it must not be fitted."""
+    rng = np.random.default_rng(18)
+    wave, noise = np.cos(np.arange(400) / 9.0), rng.normal(size=400)
+    terms = np.stack([np.ones(400), wave, wave + 1e-7 * noise], axis=1)[None]
+    y = (5.0 * wave + 3.0 * noise)[None]
+    for phi in (0.0, 0.5):
+        for left in (lag._without_terms(y, terms, phi)[0], y[0] - lag._explained(y[0], terms[0], phi)):
+            assert np.std(left) == pytest.approx(np.std(3.0 * noise), rel=0.02)
+            assert np.corrcoef(left, noise)[0, 1] > 0.99
+
+
+def test_memory_is_taken_as_099_at_most_and_as_none_where_neighbours_differ():
+    walk = np.cumsum(np.random.default_rng(19).normal(size=20_000))
+    assert lag._phi(walk) == 0.99
+    assert lag._phi(np.tile([1.0, -1.0], 500)) == 0.0
+    assert lag._phi(np.full(50, 3.0)) == 0.0
+    gap = np.where(np.arange(20_000) % 7 == 0, np.nan, walk)
+    assert lag._phi(gap) == 0.99
+
+
+def test_a_lag_that_leaves_less_than_half_of_the_samples_is_no_candidate():
+    t = np.arange(0, 100, 0.5)
+    prediction = lag._Prediction(0.0, 0.1, (10 * np.sin(np.arange(601) / 13.0))[:, None])  # 0 to 60 s
+    heard = np.interp(t - 1.0, prediction.times(), prediction.level) + np.random.default_rng(20).normal(0, 0.1, 200)
+    fit = fit_lag(t, heard, prediction, LAGS, 1.0, False)
+    share = [np.mean((t - shift >= 0) & (t - shift < 60.0)) for shift in LAGS]
+    assert 0.45 < min(share) < 0.5 < max(share)
+    assert (np.isinf(fit.curve_rmse_db) == (np.array(share) < 0.5)).all()
+    assert np.isinf(fit.evidence[np.array(share) < 0.5]).all()
+    assert fit.radio_minus_telemetry_s == pytest.approx(1.0, abs=0.01)
+
+
+def test_the_limits_are_those_that_the_documents_state():
+    """docs/statistics.md: rivals beyond 1 s, at 0.1 % significance; drifts up to 10 ms per minute, from ten minutes on."""
+    from scipy.stats import chi2
+
+    assert lag.LAG_LIMIT_S == 1.0
+    assert pytest.approx(10e-3 / 60.0) == lag.DRIFT_LIMIT
+    assert pytest.approx(chi2.ppf(0.999, 1), abs=0.01) == lag._RIVAL
+    assert lag.DRIFT_FROM_S == 600.0

@@ -249,3 +249,15 @@ def test_one_step_of_refinement_gives_back_digits_that_the_inverse_lost():
         plain = max(abs(float(exact[i] - mpmath.mpf(float(inverse[i])))) for i in range(7))
     assert error < 0.5 * plain
     assert float(exact[7]) == pytest.approx(lagrange[0], abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1e15])
+def test_weights_do_not_depend_on_the_unit_of_the_variance(scale):
+    rng = np.random.default_rng(9)
+    points = rng.uniform(0, 100, (6, 2))
+    gamma = 1.0 - exponential(np.hypot(*(points[:, None] - points[None]).transpose(2, 0, 1)))
+    np.fill_diagonal(gamma, 0.0)
+    to_target = 1.0 - exponential(np.hypot(*(points - 50.0).T))
+    usual = kriging._solve_reduced(gamma[None], to_target[None])
+    np.testing.assert_allclose(kriging._solve_reduced(scale * gamma[None], scale * to_target[None]), usual, rtol=1e-9)
+    np.testing.assert_allclose(usual, kriging._solve_bordered(gamma[None], to_target[None])[0], rtol=1e-9, atol=1e-12)

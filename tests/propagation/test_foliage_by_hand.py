@@ -54,6 +54,7 @@ LINES = [
     ([3.9, -30, 5.01], [3.9, 30, 5.01]), ([-30, 0, 4.99], [30, 0, 4.99]), ([-30, 0, 17.01], [30, 0, 17.01]),
     ([-4.2, 0, 5], [-4.2 + 24, 0, 77]), ([5, 0, 5], [5 - 4.25, 0, 17]), ([-3, 0, 5], [0, 0, 17 + 1e-3]),
     ([0.1, 0, 10], [0.1, 0, 10.5]), ([0.1, 0, 16.6], [0.15, 0, 17.3]),  # plumb or steep, and shorter than a metre
+    ([2, 0, 11], [2, 5, 11]), ([2, -5, 11], [2, 0, 11]),  # touching the cone's side where the line begins or ends
     ([0, -4, 5], [0, 4, 5]), ([0, -4, 17], [0, 4, 17]), ([-2, -2, 16.9], [2, 2, 16.9]),
     ([-1, 0, 16], [1, 0, 18]), ([-1, 0, 18], [1, 0, 16]), ([0, 0, 20], [0.1, 0, 16.5]), ([0, 0, 60], [40, 0, 20]),
 ]  # fmt: skip
@@ -183,3 +184,14 @@ def test_batches_of_one_segment_come_to_the_last(count, monkeypatch):
     end = start + np.array([18.0, 0.0, 0.0])
     found = CrownIndex(forest(TREE), "cylinder").chords_m(start, end)
     np.testing.assert_allclose(found, 2 * np.sqrt(16.0 - start[:, 1] ** 2), rtol=1e-12)
+
+
+def test_p833_is_refused_outside_of_its_scope_and_taken_at_its_ends():
+    for hz in (30e6, 100e9):
+        assert np.isfinite(foliage.P833.at(hz).loss_db(np.array([10.0]))).all()
+        with pytest.raises(UsageError, match="30 MHz to 100 GHz"):
+            foliage.P833.at(float(np.nextafter(hz, 0.0 if hz < 1e9 else np.inf)))
+    for hz in (0.23e9, 95e9):
+        assert foliage.Weissberger(hz).frequency_hz == hz
+        with pytest.raises(UsageError, match=r"0\.23 to 95 GHz"):
+            foliage.Weissberger(float(np.nextafter(hz, 0.0 if hz < 1e9 else np.inf)))

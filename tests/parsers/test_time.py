@@ -136,3 +136,17 @@ def test_times_that_come_back_are_read_like_times_alone(steps: list[int], fracti
     wall, valid = _time.parse_digits(np.frombuffer(b"".join(rows), dtype=np.uint8).reshape(len(rows), -1), fraction)
     assert valid.all()
     assert wall.tolist() == [s * 10**9 + (250_000_000 if fraction else 0) for s in seconds]
+
+
+def test_offsets_in_times_of_any_layout_are_taken_row_by_row() -> None:
+    """Lengths of fractions and offsets all differ: nothing is common to the column, and no zone is needed."""
+    texts = [
+        b"2025-03-02T10:00:00Z", b"2025-03-02 10:00:00.5+02:00", b"2025-03-02T10:00:00.123456-0500",
+        b"2025-03-02T10:00:00.25+05:30", b"2025-03-02 10:00:00-00:30", b"2025-03-02T10:00:00.000000001+00:00",
+    ]  # fmt: skip
+    instants, valid = _time.texts_to_utc(np.array(texts), ReadOptions(), needed_by="here")
+    assert valid.all()
+    expected = ["10:00:00", "08:00:00.5", "15:00:00.123456", "04:30:00.25", "10:30:00", "10:00:00.000000001"]
+    assert instants.time.tolist() == [np.datetime64(f"2025-03-02T{text}", "ns").astype(int) for text in expected]
+    with pytest.raises(UsageError, match="zone"):
+        _time.texts_to_utc(np.array([*texts, b"2025-03-02T10:00:00.75"]), ReadOptions(), needed_by="here")

@@ -653,11 +653,13 @@ def _refine(
         size = float(np.abs(step).max())
         step = step * min(1.0, 0.3 / max(size, 1e-12))  # the valley is no wider than fractions of a second
         for _ in range(_HALVED):  # steep fades: a whole step may lead to the other side, and higher up
-            here = evaluate(shift + step, phi)
-            if size < 1e-5 or np.mean(here[1] ** 2) <= np.mean(rw**2):
+            there = evaluate(shift + step, phi)
+            if size < 1e-5 or np.mean(there[1] ** 2) <= np.mean(rw**2):
                 break
             step = 0.5 * step
-        shift = shift + step
+        else:
+            break  # nowhere lower
+        shift, here = shift + step, there
         if size < 1e-5:
             break
     beyond = len(shift) > 1 and abs(shift[1] / scale[1]) > 1.2 * DRIFT_LIMIT

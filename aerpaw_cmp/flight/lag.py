@@ -558,7 +558,9 @@ def fit_lag(
     table = np.stack([scan(phi, rate) for rate in rates])
     row, column = divmod(best_of(table, np.broadcast_to(lags, table.shape)), len(lags))
     still = len(rates) // 2
-    if len(ts) * np.log(table[still].min() / table[row, column]) <= _RIVAL:  # no drift where none shows
+    with np.errstate(divide="ignore", invalid="ignore"):  # a residual of nothing at all
+        gain = len(ts) * np.log(table[still].min() / table[row, column])
+    if not gain > _RIVAL:  # no drift where none shows
         row, column = still, best_of(table[still], lags)
     near = _between(table[row], lags, lambda tried: costs(tried, float(rates[row]), phi))
     start = np.array([near, rates[row]])[: 2 if drifting else 1]

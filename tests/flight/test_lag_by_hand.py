@@ -620,3 +620,15 @@ def test_the_limits_are_those_that_the_documents_state():
     assert pytest.approx(10e-3 / 60.0) == lag.DRIFT_LIMIT
     assert pytest.approx(chi2.ppf(0.999, 1), abs=0.01) == lag._RIVAL
     assert lag.DRIFT_FROM_S == 600.0
+
+
+def test_a_record_without_noise_is_no_trouble():
+    """A simulation on another one: the residual is zero to the last digit at the true lag, with and without drifts tried."""
+    t = np.arange(0, 1300, 0.5)
+    prediction = lag._Prediction(-20.0, 0.5, (10 * np.sin(np.arange(2700) / 13.0) + np.arange(2700) % 7)[:, None])
+    heard = prediction.at(t - 1.0)
+    for drifting in (False, True):
+        fit = fit_lag(t, heard, prediction, LAGS[::5], 1.0, drifting)
+        assert (fit.verdict, fit.drift_s_per_s) == ("ok", pytest.approx(0.0, abs=1e-12))
+        assert fit.radio_minus_telemetry_s == pytest.approx(1.0, abs=1e-9)
+        assert fit.rmse_db < 1e-9

@@ -9,8 +9,8 @@ benchmark that fails or whose peer is not installed is told and does not stop th
 to ``benchmarks/history.jsonl``, from which ``benchmarks/performance.py`` makes docs/performance.md.
 
 ``--check`` runs every file of this folder at its smallest size and says which does not come to its end: numbers of such
-sizes mean nothing and are not kept. What needs the field data is left out where AERPAW_CMP_FIELD_DATA is not set. Twenty
-minutes.
+sizes mean nothing and are not kept. What needs the field data is left out where AERPAW_CMP_FIELD_DATA is not set. It
+takes some twenty minutes.
 """
 
 from __future__ import annotations

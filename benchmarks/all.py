@@ -166,9 +166,8 @@ def _run(command: list[str]) -> tuple[str, str | None]:
         return "", f"not done in {LIMIT_S:g} s"
     if done.returncode == 0:
         return done.stdout, None
-    return done.stdout, (done.stderr.strip().splitlines() or done.stdout.strip().splitlines() or ["no message"])[-1][
-        :300
-    ]
+    said = done.stderr.strip() or done.stdout.strip() or "no message"
+    return done.stdout, said.splitlines()[-1][:300]
 
 
 def run_one(name: str, command: list[str]) -> dict[str, Any]:

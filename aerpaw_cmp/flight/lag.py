@@ -171,15 +171,14 @@ class _Prediction:
         before, after = np.maximum(rows - 1, 0), np.minimum(rows + 1, len(self.terms) - 1)
         return np.asarray((self.terms[after] - self.terms[before]) / ((after - before) * self.step)[:, None])
 
-    def at(self, t: FloatArray, values: FloatArray | None = None) -> FloatArray:
+    def at(self, t: FloatArray) -> FloatArray:
         """Linear interpolation at t; NaN outside and next to NaN."""
-        source = self.level if values is None else values
         place = (t - self.first) / self.step
         left = np.floor(place).astype(np.int64)
-        inside = (left >= 0) & (left < len(source) - 1)
+        inside = (left >= 0) & (left < len(self.level) - 1)
         left = np.where(inside, left, 0)
         weight = place - left
-        level = source[left] * (1.0 - weight) + source[left + 1] * weight
+        level = self.level[left] * (1.0 - weight) + self.level[left + 1] * weight
         return np.where(inside, level, np.nan)
 
     def smooth_at(self, t: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -204,8 +204,6 @@ def test_interpolation_is_that_of_numpy_and_of_hermite_splines():
     assert np.isnan(prediction.smooth_at(outside)).all()
     assert prediction.smooth_at(known[7:8])[0] == level[7:8]
     assert prediction.at(known[:1]) == level[:1]
-    other = rng.normal(size=60)
-    np.testing.assert_allclose(prediction.at(t, other), np.interp(t, known, other), rtol=0, atol=1e-12)
     terms = rng.normal(size=(60, 3))
     terms[30] = np.nan
     beside = prediction.beside(terms)

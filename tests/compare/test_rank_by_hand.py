@@ -89,7 +89,6 @@ def test_intervals_come_from_one_bootstrap_each_with_its_own_memory(pair):
             assert found[number] == interval(values[number], drawn, known, bounds=bounds)
     assert found[0] != interval(values[0], drawn, known, bounds=(0.0, 1.0))
     assert ranks._pair_intervals(a[:1], b[:1], values, 10, 0) == [NO_INTERVAL] * 4
-    assert ranks._pair_intervals(a[:2], b[:2], values, 10, 0) != [None] * 4
 
 
 def test_bars_of_a_histogram_have_wilsons_intervals(pair):

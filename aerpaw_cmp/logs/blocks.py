@@ -10,10 +10,12 @@ What only the whole log can tell is left to ``settle``.
 from __future__ import annotations
 
 import hashlib
+import operator
 import re
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -47,8 +49,8 @@ _SUMMED = re.compile(
 )
 """Warnings whose numbers are counts: over blocks they add up."""
 _STEPS_BACK = "time steps back at "
-_COUNTED = ("repeated_samples",)
-"""Attributes that are counts."""
+_TOGETHER: dict[str, Callable[[Any, Any], Any]] = {"repeated_samples": operator.add, "ports": max}
+"""How attributes of two parts that are counts, or bounds, become one."""
 _LOOK_BACK = 1000
 """Lines among which a place to cut is looked for."""
 
@@ -96,7 +98,8 @@ def by_lines(
     head : callable, optional
         ``head(data, options) -> int``: how many bytes of the file's beginning every block needs in front; whole lines.
     keep : sequence of re.Pattern, optional
-        MULTILINE patterns of lines on which later ones hang: the last of each is put in front of a block.
+        MULTILINE patterns of lines on which later ones hang: the last of each is put in front of a block; of a pattern
+        with the group ``kind`` the last of each kind that this group tells.
     settle : callable, optional
         What only the whole log can tell, from the joined result.
 
@@ -131,6 +134,16 @@ def whole_lines(chunks: Iterator[bytes]) -> Iterator[bytes]:
     """Blocks of whole lines, for a reader that keeps by itself what later lines hang on."""
     for _, data in _blocks(_unmarked(chunks), None, None, ()):
         yield data
+
+
+def beginning(chunks: Iterator[bytes], size: int) -> tuple[bytes, Iterator[bytes]]:
+    """At least so many bytes of a log's beginning where it has them, without a mark, and the chunks of all of it."""
+    taken: list[bytes] = []
+    for piece in chunks:
+        taken.append(piece)
+        if sum(map(len, taken)) > size:
+            break
+    return b"".join(taken).removeprefix(b"\xef\xbb\xbf"), chain(taken, chunks)
 
 
 def first_line(data: bytes, options: ReadOptions) -> int:  # noqa: ARG001 - the contract of heads
@@ -176,7 +189,8 @@ def _blocks(
     """Blocks of whole lines behind the lines from before that they need: these, and both as one piece."""
     parts: list[bytes] = []
     size, enough = 0, BLOCK_BYTES
-    top, kept, front = b"", [b""] * len(keep), b""
+    top, front = b"", b""
+    kept: list[dict[bytes, bytes]] = [{} for _ in keep]
     begun = False
     for chunk in chunks:
         parts.append(chunk)
@@ -197,9 +211,10 @@ def _blocks(
         yield front, data
         if not begun and head is not None:
             top = data[: head(data + rest)]
-        kept = [_last_line(p, data, len(front), cut) or line for p, line in zip(keep, kept, strict=True)]
+        for pattern, lines in zip(keep, kept, strict=True):
+            lines |= _last_lines(pattern, data, len(front), cut)
         last = data[data.rfind(b"\n", 0, cut - 1) + 1 : cut] if apart is not None else b""
-        front = _front(top, kept, last)
+        front = b"".join([top, *dict.fromkeys(line for lines in kept for line in lines.values()), last])
         begun, parts, size, enough = True, [front, rest], len(rest), BLOCK_BYTES
     data = b"".join(parts)
     if len(data) > len(front) or not begun:
@@ -220,8 +235,17 @@ def _joined_to_cut(parts: Sequence[bytes], apart: re.Pattern[bytes] | None) -> t
     return b"".join([*parts[:-1], memoryview(last)[: begin + cut]]), last[begin + cut :]
 
 
-def _front(top: bytes, kept: Sequence[bytes], last: bytes) -> bytes:
-    return b"".join([top, *dict.fromkeys(kept), last])
+def _last_lines(pattern: re.Pattern[bytes], data: bytes, start: int, end: int) -> dict[bytes, bytes]:
+    """The last line of each kind between two places that the pattern finds, by kind."""
+    if "kind" in pattern.groupindex:
+        return {found["kind"]: _line_at(data, found.start()) for found in pattern.finditer(data, start, end)}
+    line = _last_line(pattern, data, start, end)
+    return {b"": line} if line else {}
+
+
+def _line_at(data: bytes, place: int) -> bytes:
+    first = data.rfind(b"\n", 0, place) + 1
+    return data[first : data.find(b"\n", first) + 1]
 
 
 def _last_line(pattern: re.Pattern[bytes], data: bytes, start: int, end: int) -> bytes:
@@ -232,8 +256,7 @@ def _last_line(pattern: re.Pattern[bytes], data: bytes, start: int, end: int) ->
         begin = max(begin, start)
         places = [found.start() for found in pattern.finditer(data, begin, end)]
         if places:
-            first = data.rfind(b"\n", 0, places[-1]) + 1
-            return data[first : data.find(b"\n", first) + 1]
+            return _line_at(data, places[-1])
         if begin == start:
             return b""
         window *= 8
@@ -305,7 +328,8 @@ class Gathered:
         streams = []
         for key in self.order:
             frame = self.records.pop(key).frame()
-            streams.append(Stream(key[0], key[1], frame, self.attributes[key]))  # type: ignore[arg-type]
+            about = {name: value for name, value in self.attributes[key].items() if value != _DIFFERS}
+            streams.append(Stream(key[0], key[1], frame, about))  # type: ignore[arg-type]
         back = steps_back(streams[0].frame["time"].to_numpy()) if streams else 0
         return ReadResult(
             reader=self.reader,
@@ -342,13 +366,17 @@ def _joined(known: dict[str, Attribute] | None, more: Any) -> dict[str, Attribut
         return dict(more)
     made = dict(known)
     for name, value in more.items():
-        if name in _COUNTED:
-            made[name] = made.get(name, 0) + value
+        if name in _TOGETHER and name in made:
+            made[name] = _TOGETHER[name](made[name], value)
         elif name == "clock" and made.get(name) != value:
             raise Whole  # what the times count from was read in two ways
         elif made.setdefault(name, value) != value:
-            del made[name]
+            made[name] = _DIFFERS
     return made
+
+
+_DIFFERS = "differs"
+"""In place of an attribute that two parts of a stream have otherwise: a third part does not bring it back."""
 
 
 class _Column:

@@ -15,6 +15,8 @@ from . import _decided, _lines, _rows
 RATS = ("", "lte", "nr")
 """Radio accesses; the first where a log does not say."""
 BESIDE = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
+_SEVERAL = "several"
+"""In place of the carrier of a cell that a block heard on several, until all blocks are there."""
 RANGE_DBM = (-170.0, -1.0)
 """RSRP beyond these is a sentinel (2147483647, 0) or a mistake."""
 
@@ -155,21 +157,46 @@ def _once(time: AnyArray, served: FloatArray) -> IntArray:
 
 
 def settled(result: ReadResult) -> ReadResult:
-    """A result whose blocks may have cut an instant in two: each cell once at each time."""
-    streams = []
-    for stream in result.streams:
-        if stream.kind == "rss" and "serving" in stream.frame:
-            twice = np.ones(len(stream.frame), dtype=bool)
-            twice[_once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
-            stream = replace(stream, frame=_decided.without(stream.frame, twice))
-        streams.append(stream)
-    return replace(result, streams=tuple(streams))
+    """A result whose blocks may have cut an instant in two: each cell once at each time, the cells in their order.
+
+    A cell that was heard on several carriers has no ``arfcn``.
+    """
+    places = [_place(stream) for stream in result.streams]
+    streams = [_settled(stream) if _is_cell(stream) else stream for stream in result.streams]
+    ordered = sorted(zip(places, streams, strict=True), key=lambda pair: pair[0])
+    return _decided.finished(result, [stream for _, stream in ordered])
+
+
+def _is_cell(stream: Stream) -> bool:
+    return stream.kind == "rss" and "serving" in stream.frame
+
+
+_KINDS = ("telemetry", "rank", "rss", "kpi")
+
+
+def _place(stream: Stream) -> tuple[int, bool, int, int, str]:
+    """Place of a stream among the others: the track, ranks, cells by radio access and PCI, what else there is."""
+    kind = _KINDS.index(stream.kind)
+    if not _is_cell(stream):
+        return kind, True, 0, 0, stream.name
+    return kind, False, RATS.index(str(stream.attributes.get("rat", ""))), int(stream.attributes.get("pci", -1)), ""
+
+
+def _settled(stream: Stream) -> Stream:
+    twice = np.ones(len(stream.frame), dtype=bool)
+    twice[_once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
+    frame = _decided.without(stream.frame, twice)
+    empty = [name for name in BESIDE if name in frame and not frame[name].notna().any()]
+    about = {key: value for key, value in stream.attributes.items() if (key, value) != ("arfcn", _SEVERAL)}
+    return replace(stream, frame=frame.drop(columns=empty) if empty else frame, attributes=about)
 
 
 def _stream(
     rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, rat: str, pci: float, source: str
 ) -> Stream:
     """Readings of one cell, in the order of the log."""
+    numbers = np.unique(found.arfcn[pick])
+    numbers = numbers[np.isfinite(numbers)]
     keep = _once(rows.time[found.row[pick]], served)
     if len(keep) < len(pick):
         pick, served = pick[keep], served[keep]
@@ -183,13 +210,12 @@ def _stream(
         mine = column[pick]
         if np.isfinite(mine).any():
             values[name] = mine
-    numbers = np.unique(found.arfcn[pick])
-    numbers = numbers[np.isfinite(numbers)]
+    carrier = None if not len(numbers) else int(numbers[0]) if len(numbers) == 1 else _SEVERAL
     name = "_".join(part for part in (rat, f"pci{int(pci)}" if pci >= 0 else "rsrp") if part)
     made = rows.stream(
         "rss", name, values, pick=row, flag=flag, channel=rows.options.channel or name,
         unit=rows.options.unit or "dBm", quantity="RSRP", rat=rat or None, pci=int(pci) if pci >= 0 else None,
-        arfcn=int(numbers[0]) if len(numbers) == 1 else None, source=source,
+        arfcn=carrier, source=source,
     )  # fmt: skip
     assert made is not None
     return made

@@ -121,6 +121,17 @@ def finished(result: ReadResult, streams: Iterable[Stream], *warnings: str) -> R
     return blocks.with_warnings(replace(result, streams=kept), without="^time steps back at ", more=tuple(more))
 
 
+def ordered(place: Callable[[Stream], Any]) -> Callable[[ReadResult], ReadResult]:
+    """Settles a log whose blocks may have met its streams in another order than that of the whole.
+
+    Parameters
+    ----------
+    place : callable
+        Where a stream stands among the others.
+    """
+    return lambda result: finished(result, sorted(result.streams, key=place))
+
+
 def without(frame: pd.DataFrame, where: BoolArray) -> pd.DataFrame:
     """A frame without some rows; the old one is emptied column by column: one more of a large log is too much."""
     if not where.any():

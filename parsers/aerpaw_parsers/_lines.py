@@ -7,7 +7,7 @@ without LF is a line too; a file that ends with LF has no further, empty line.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -144,6 +144,8 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
     groups : list of tuple of bytes, length n
         One tuple per line.
     """
+    if b"\r\r" in lines.data:  # the pattern has room for one carriage return, a line's own is left out
+        return _each(lines, pattern, range(len(lines)))
     positions: list[int] = []
     groups: list[tuple[bytes, ...]] = []
     for found in pattern.finditer(lines.data):
@@ -161,7 +163,12 @@ def match_rest(lines: Lines, pattern: re.Pattern[bytes], done: IntArray) -> tupl
         rows, groups = match(lines, pattern)
         mine = np.flatnonzero(left[rows])
         return rows[mine], [groups[i] for i in mine.tolist()]
-    found = [(i, pattern.match(lines.raw(i))) for i in rest.tolist()]
+    return _each(lines, pattern, rest.tolist())
+
+
+def _each(lines: Lines, pattern: re.Pattern[bytes], numbers: Iterable[int]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
+    """Of some lines those that the pattern describes, one by one, and its groups."""
+    found = [(i, pattern.match(lines.raw(i))) for i in numbers]
     kept = [(i, one.groups(b"")) for i, one in found if one is not None]
     return np.array([i for i, _ in kept], dtype=np.int64), [groups for _, groups in kept]
 

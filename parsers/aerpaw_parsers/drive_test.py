@@ -277,7 +277,7 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
             about = {key: value for key, value in stream.attributes.items() if key != "arfcn"}
             about |= {"arfcn": int(*numbers)} if len(numbers) == 1 else {}
             columns = [name for name in stream.frame if name not in _cells.BESIDE]
-            columns += [name for name in _cells.BESIDE if name in stream.frame and stream.frame[name].notna().any()]
+            columns += [name for name in _cells.BESIDE if name in stream.frame]
             frame = stream.frame if list(stream.frame) == columns else stream.frame[columns]  # no copy in vain
             stream = replace(stream, attributes=about, frame=frame)
         streams.append(stream)

@@ -68,6 +68,11 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
+    return _cells.settled(_read(data, options))
+
+
+def _read(data: bytes, options: ReadOptions) -> ReadResult:
+    """What each row says by itself."""
     lines = _lines.split(data)
     found, rejected = _tables(lines)
     row = np.array([one[0] for one in found], dtype=np.int64)
@@ -107,5 +112,5 @@ READER = Reader(
     sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read, keep=_KEPT, settle=_cells.settled),
+    in_blocks=blocks.by_lines(_read, keep=_KEPT, settle=_cells.settled),
 )

@@ -30,9 +30,10 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-from . import _frames, _lines, _table, _time
+from . import _decided, _frames, _lines, _table, _time
 
 _C = rb"[^,\n]{0,80}"
+_DIGITS = 7
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
 _T = rb"^(" + _time.TIME + _time.ZONE + rb"),"
 
@@ -185,11 +186,22 @@ def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, list[FloatArray]
             or (_table.cells_at(lines, found.start(place), len(token)) != np.frombuffer(token, dtype=np.uint8)).any()
         ):
             return nothing
-    value = _table.numbers(lines, found.rows, 11, (2, 3, 4, 5, 7, 8, 9, 10), also=b'" :/QNWCFGlte_csinr5g')
+    places = (2, 3, 4, 5, 7, 8, 9, 10)
+    text = _table.bytes_of(lines, found.rows)
+    tokens, count = b"".join(token for _, token in _LAUNCHED), len(found.rows)
+    if any(text.count(sign) != count * tokens.count(sign) for sign in (b"e", b"E", b"+")) or b".," in text:
+        return nothing  # numbers that the pattern has not: 5e8, +5, 5.
+    spaces = int(np.count_nonzero(lines.buffer[found.begin + 10] == 32))
+    if text.count(b" ") != count * tokens.count(b" ") + spaces:
+        return nothing
+    value = _table.numbers(lines, found.rows, 11, places, also=b'" :/QNWCFGlte_csinr5g')
     if value is None:
         return nothing
     wall, valid = _time.parse_digits(_table.cells_at(lines, found.begin, 23), 3)
     keep = valid & np.isfinite(sum(value))
+    for place in places:
+        keep &= found.width(place) <= _DIGITS
+    keep &= lines.buffer[found.ends[:, -1] - 1] != 46
     if keep.all():
         return found.rows, wall, value
     return found.rows[keep], wall[keep], [column[keep] for column in value]
@@ -256,6 +268,9 @@ def _level(
     )
 
 
+_STREAMS = ("nr5g_csi", "lte_csi", "lte_rsrp", "nr_rsrp")
+
+
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank and level streams, whichever rows the file has.
 
@@ -308,5 +323,5 @@ READER = Reader(
     sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read),
+    in_blocks=blocks.by_lines(read, settle=_decided.ordered(lambda stream: _STREAMS.index(stream.name))),
 )

@@ -280,5 +280,7 @@ READER = Reader(
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read, apart=re.compile(_HEAD + rb"[0-7]{7,12} +[-0-9.]{1,16}\r?$")),
+    in_blocks=blocks.by_lines(
+        read, apart=re.compile(rb"\[" + _time.CERTAIN + rb"\] +[0-7]{7,12} +-?\d{1,9}(?:\.\d{1,9})?\r?$")
+    ),
 )

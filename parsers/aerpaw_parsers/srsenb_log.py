@@ -27,15 +27,17 @@ _ROW = re.compile(
     + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% [^\n]{0,160}$",
     re.MULTILINE,
 )  # fmt: skip
-_CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (\d{1,2}) channels in RF device", re.MULTILINE)
+_CHANNELS = re.compile(rb"^\[[^\]\n]{19,40}\] *Opening (?P<kind>\d{1,2}) channels in RF device", re.MULTILINE)
 _MIXED = "srsENB prints the truncated mean of the ranks reported in a second: 1 may be a mix of 1 and 2"
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
-    """Rank ``srsenb``; no rank is above the number of transmit channels that the console says it opened."""
+    """Rank ``srsenb``; no rank is above the most transmit channels that the console says above it that it opened."""
     ri = rows.number("ri")
     rows.warnings += [_MIXED] if (ri > 0).any() else []
-    ports = max((int(number) for number in _CHANNELS.findall(rows.data)), default=0) or None
+    last = int(rows.row[-1]) if len(rows) else 0
+    above = b"\n".join(rows.data.split(b"\n", last)[:last])
+    ports = max((int(number) for number in _CHANNELS.findall(above)), default=0) or None
     values = rows.rank(ri, none=ri == 0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs")}
     about = {"ri_base": "one", "source": "CSI report, truncated mean", "ports": ports}
     yield rows.stream("rank", rows.options.channel or "srsenb", values, about=about)

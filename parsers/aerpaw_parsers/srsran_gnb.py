@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -42,6 +43,7 @@ _LOG = re.compile(
 )
 _TITLE = re.compile(_STAMP + rb" *\|? *pci +rnti +(?:\| +)?cqi +ri +mcs", re.MULTILINE)
 _SCHEDULER = re.compile(_STAMP + rb" +\[METRICS *\][^\n]{0,300}\bdl_ri=", re.MULTILINE)
+_HEAD_BYTES = 1 << 20
 _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a-fA-F]{1,6} ")
 
 
@@ -52,7 +54,21 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
-    pattern = _LOG if _SCHEDULER.search(data[: 1 << 20]) and not _TITLE.search(data[: 1 << 20]) else _ROW
+    return _read(_pattern(data), data, options)
+
+
+def _pattern(begin: bytes) -> re.Pattern[bytes]:
+    """Rows of the table, or of the log where the beginning has no table."""
+    begin = begin[:_HEAD_BYTES]
+    return _LOG if _SCHEDULER.search(begin) and not _TITLE.search(begin) else _ROW
+
+
+def _in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
+    begin, chunks = blocks.beginning(chunks, _HEAD_BYTES)
+    return blocks.by_lines(partial(_read, _pattern(begin)), keep=(_TITLE, _SCHEDULER))(chunks, options)
+
+
+def _read(pattern: re.Pattern[bytes], data: bytes, options: ReadOptions) -> ReadResult:
     torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
     rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
     rnti = np.array([int(text, 16) if text else -1 for text in rows.text("rnti")], dtype=np.float64)
@@ -123,7 +139,7 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000]   1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2",
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read, keep=(_TITLE, _SCHEDULER)),
+    in_blocks=_in_blocks,
 )
 JSON_READER = Reader(
     name="srsran_json",

@@ -20,7 +20,6 @@ import re
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from functools import partial
-from itertools import chain
 
 import numpy as np
 
@@ -203,13 +202,10 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
 
 
 def _in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    begin: list[bytes] = []
-    for piece in chunks:
-        begin.append(piece)
-        if sum(map(len, begin)) > _HEAD_BYTES:
-            break
-    form = _form(b"".join(begin).removeprefix(b"\xef\xbb\xbf"))
-    return blocks.by_lines(partial(_read, form), apart=form, settle=_settled)(chain(begin, chunks), options)
+    begin, chunks = blocks.beginning(chunks, _HEAD_BYTES)
+    form = _form(begin)
+    apart = re.compile(form.pattern.replace(_time.TIME, _time.CERTAIN), re.MULTILINE)  # a row that is read for certain
+    return blocks.by_lines(partial(_read, form), apart=apart, settle=_settled)(chunks, options)
 
 
 def _read(form: re.Pattern[bytes], data: bytes, options: ReadOptions) -> ReadResult:

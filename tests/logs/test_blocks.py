@@ -51,10 +51,8 @@ def same(one: ReadResult, other: ReadResult) -> None:
         other.rejected,
     )
     assert sorted(one.warnings) == sorted(other.warnings)
-    by = {(stream.kind, stream.name): stream for stream in one.streams}
-    assert len(by) == len(one.streams) == len(other.streams)
-    for b in other.streams:
-        a = by[b.kind, b.name]
+    assert [(a.kind, a.name) for a in one.streams] == [(b.kind, b.name) for b in other.streams]
+    for a, b in zip(one.streams, other.streams, strict=True):
         assert_same_frame(a.frame, b.frame, check_like=True)
         assert dict(a.attributes) == dict(b.attributes)
 
@@ -120,6 +118,81 @@ def test_a_cut_at_any_line_changes_nothing(reader: str, name: str, data: bytes) 
     for pieces in (*([data[:place], data[place:]] for place in ends), lines):
         with nullcontext() if (reader, name) not in SOMETIMES_WHOLE else suppress(blocks.Whole):
             same(in_two(reader, pieces, OPTIONS), whole)
+
+
+PAIRS = [
+    (reader, f"{one}+{two}", head + tail)
+    for reader, found in samples.SAMPLES.items()
+    for one, (head, *_) in found.items()
+    for two, (tail, *_) in found.items()
+    if by_name(reader).in_blocks is not None and head.endswith(b"\n")
+]
+
+
+@pytest.mark.parametrize(("reader", "name", "data"), PAIRS, ids=[f"{reader}-{name}" for reader, name, _ in PAIRS])
+def test_logs_joined_by_hand_say_in_blocks_what_they_say_in_one_piece(reader: str, name: str, data: bytes) -> None:
+    """A block that has other kinds of lines than the one before it decides nothing for itself."""
+    try:
+        whole = by_name(reader).read(data, OPTIONS)
+    except InputError:
+        return
+    lines = data.splitlines(keepends=True)
+    for pieces in (lines, [b"".join(lines[i : i + 3]) for i in range(0, len(lines), 3)]):
+        with suppress(blocks.Whole):
+            same(in_two(reader, pieces, OPTIONS), whole)
+
+
+def test_a_cell_on_several_carriers_has_no_carrier_in_blocks_either() -> None:
+    line = (
+        b'{"abs_time": %d, "connected_pci": 2, "cells": [{"technology": "4G_LTE", "rsrp": -90, "pci": 2, '
+        b'"earfcn": %d}]}\n'
+    )
+    for carriers, expected in (([1, 1, 2, 2, 3, 3], None), ([1, 2, 1, 1, 1, 1], None), ([5] * 6, 5)):
+        pieces = [line % (1740927600000 + 1000 * i, carrier) for i, carrier in enumerate(carriers)]
+        for size in (1, 2, 3):
+            grouped = [b"".join(pieces[i : i + size]) for i in range(0, 6, size)]
+            cell = in_two("pawprints", grouped, OPTIONS).streams[0]
+            assert cell.attributes.get("arfcn") == expected
+        assert by_name("pawprints").read(b"".join(pieces), OPTIONS).streams[0].attributes.get("arfcn") == expected
+
+
+def test_the_most_channels_that_a_base_station_opened_bound_its_ranks() -> None:
+    opened = b"[2025-03-02 10:00:00.000001] Opening %d channels in RF device=uhd\n"
+    title, row = (line + b"\n" for line in samples.SRSENB.splitlines()[1:3])
+    log = [opened % 2, row, row, opened % 1, row, row, title, opened % 4]
+    whole = by_name("srsenb_log").read(b"".join(log), OPTIONS)
+    assert whole.streams[0].attributes["ports"] == 2  # what was opened behind the last row bounds none
+    for size in (1, 2, 3):
+        pieces = [b"".join(log[i : i + size]) for i in range(0, len(log), size)]
+        same(in_two("srsenb_log", pieces, OPTIONS), whole)
+
+
+@pytest.mark.parametrize("reader", ["sounder_log", "vehicle_out"])
+def test_a_gap_around_a_row_of_no_date_is_seen_at_a_cut_too(reader: str) -> None:
+    """The line before a cut is seen by the next block; one that gives no record must not stand there."""
+    if reader == "sounder_log":
+        rows = [b"[2025-03-02 10:00:%02d.000000] %07o       -20.12345\n" % (i, 4 * i) for i in range(40)]
+    else:
+        rows = [b"%d,-78.69,35.72,79.9,44.2,80,2022-01-13 14:07:%02d.285580,3,14\n" % (i, i) for i in range(40)]
+    for place in range(1, 39):
+        damaged = rows[place].replace(b"2025-03-02", b"2025-02-30").replace(b"2022-01-13", b"2022-13-13")
+        lines = [*rows[:place], damaged, *rows[place + 1 :]]
+        whole = by_name(reader).read(b"".join(lines), OPTIONS)
+        assert any("jump" in text for text in whole.warnings)
+        same(in_two(reader, lines, OPTIONS), whole)
+
+
+def test_what_a_row_says_does_not_hang_on_the_others() -> None:
+    csi = b'2025-03-02 10:00:%02d.250,"+QNWCFG: ""lte_csi""",20,1,9,%b,"+QNWCFG: ""nr5g_csi""",24,2,12,5\n'
+    pose = b"%d,-78.7000001,35.7300002,0.5,48.1,99,2025-03-02 10:00:%02d.250000,5,12%b\r\n"
+    for odd in (b"5e8", b"+5", b"5.", b"12345678", b" 5"):
+        rows = [csi % (i, odd if i == 3 else b"3") for i in range(6)]
+        alone = by_name("quectel_csv").read(rows[3], OPTIONS)
+        together = by_name("quectel_csv").read(b"".join(rows), OPTIONS)
+        assert (alone.accepted, together.accepted) == (0, 5), odd
+    for odd in (3, 5):
+        rows = [pose % (i, i, b"\r" if i < odd else b"") for i in range(6)]
+        assert by_name("vehicle_out").read(b"".join(rows), OPTIONS).accepted == 6
 
 
 def test_a_cut_at_any_byte_changes_nothing() -> None:

@@ -208,8 +208,9 @@ def _stream(
     values: dict[str, FloatArray] = {"rss_db": level, "serving": served}
     for name, column in zip(BESIDE, found.beside, strict=True):
         mine = column[pick]
-        if np.isfinite(mine).any():
-            values[name] = mine
+        known = np.isfinite(mine)  # a ratio or loss written as 'inf' is none
+        if known.any():
+            values[name] = np.where(known, mine, np.nan)
     carrier = None if not len(numbers) else int(numbers[0]) if len(numbers) == 1 else _SEVERAL
     name = "_".join(part for part in (rat, f"pci{int(pci)}" if pci >= 0 else "rsrp") if part)
     made = rows.stream(

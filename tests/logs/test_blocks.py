@@ -156,6 +156,15 @@ def test_a_cell_on_several_carriers_has_no_carrier_in_blocks_either() -> None:
         assert by_name("pawprints").read(b"".join(pieces), OPTIONS).streams[0].attributes.get("arfcn") == expected
 
 
+def test_a_loss_written_as_infinite_is_none() -> None:
+    title, row = samples.SRSUE.splitlines(keepends=True)[1:3]
+    log = [title, row, row.replace(b"   61 -4.2k", b"  inf -4.2k").replace(b":00.000003", b":01.000003")]
+    whole = by_name("srsue_log").read(b"".join(log), OPTIONS)
+    assert whole.streams[0].frame["pathloss_db"].tolist()[0] == 61.0
+    assert np.isnan(whole.streams[0].frame["pathloss_db"].to_numpy()[1])
+    same(in_two("srsue_log", log, OPTIONS), whole)
+
+
 def test_the_most_channels_that_a_base_station_opened_bound_its_ranks() -> None:
     opened = b"[2025-03-02 10:00:00.000001] Opening %d channels in RF device=uhd\n"
     title, row = (line + b"\n" for line in samples.SRSENB.splitlines()[1:3])

@@ -7,6 +7,7 @@ import importlib.util
 import json
 import sys
 import warnings
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,9 +15,10 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import limits
-from aerpaw_cmp.logs.readers import catalogue
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs import blocks, limits
+from aerpaw_cmp.logs.readers import by_name, catalogue
+from aerpaw_cmp.logs.records import ReadResult, RejectedLine
+from tests.parsers import samples
 
 PATH = Path(__file__).parents[2] / "benchmarks" / "fuzz_inputs.py"
 
@@ -140,3 +142,47 @@ def test_a_reader_that_breaks_its_promises_is_seen(fuzz: ModuleType) -> None:
     with pytest.raises(fuzz.ViolationError, match="latitude_deg beyond its range"):
         fuzz.check_law(beyond, VEHICLE_10, False)
     assert fuzz.check_law(limits.check(beyond), VEHICLE_10, False) is None
+
+
+def _changed(result: ReadResult, **columns: object) -> ReadResult:
+    stream = result.streams[0]
+    return replace(result, streams=(replace(stream, frame=stream.frame.assign(**columns)), *result.streams[1:]))
+
+
+def test_what_blocks_say_otherwise_is_seen(fuzz: ModuleType) -> None:
+    """Each thing that a result says, changed alone."""
+    reader = by_name("quectel_console")
+    data = samples.QUECTEL_CONSOLE
+    one, two = reader.read(data, samples.OPTIONS), reader.read(data, samples.OPTIONS)
+    assert fuzz.difference(one, two) is None
+    stream = one.streams[0]
+    about = replace(stream, attributes={**stream.attributes, "arfcn": 7})
+    level = stream.frame["rss_db"].to_numpy() if "rss_db" in stream.frame else stream.frame["rank"].to_numpy()
+    others = {
+        "a line less": replace(one, lines=one.lines - 1, blank=one.blank - 1),
+        "a warning": replace(one, warnings=("time steps back at 1 places",)),
+        "the text of a rejected line": replace(one, rejected=(*one.rejected[:-1], RejectedLine(1, "x", "y"))),
+        "a stream less": replace(one, streams=one.streams[1:]),
+        "the order of streams": replace(one, streams=one.streams[::-1]),
+        "an attribute": replace(one, streams=(about, *one.streams[1:])),
+        "a column": _changed(one, odd=1.0),
+        "a flag": _changed(one, flag="x"),
+        "a time": _changed(one, time=stream.frame["time"] + np.timedelta64(1, "ns")),
+        "a value": _changed(one, **{"rss_db" if "rss_db" in stream.frame else "rank": level + 1.0}),
+    }
+    assert len(one.streams) > 1
+    assert len(one.rejected) > 0
+    for what, other in others.items():
+        assert fuzz.difference(one, other) is not None, what
+
+
+def test_a_reader_that_says_otherwise_in_blocks_is_seen(
+    fuzz: ModuleType, known: dict, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target = known["reader:pawprints"]
+    index = fuzz.BLOCKS_EVERY // 2
+    indices = range(index, 40 * fuzz.BLOCKS_EVERY, fuzz.BLOCKS_EVERY)
+    assert {fuzz.one_input(target, 7, i, bounded=False)[0] for i in indices} <= {"read", "refused"}
+    monkeypatch.setattr(blocks, "_joined", lambda _known, more: {**dict(more), "arfcn": 7})
+    seen = [fuzz.one_input(target, 7, i, bounded=False)[1] for i in indices]
+    assert any("in blocks" in text for text in seen)

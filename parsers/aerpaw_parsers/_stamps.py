@@ -16,7 +16,7 @@ import numpy as np
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import ReadOptions
 
-from . import _alike
+from . import _alike, _time
 
 _CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
 _ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
@@ -26,6 +26,7 @@ _WORD_MONTH = re.compile(r"(\d{1,2})[- ]?([A-Z][a-z]{2})[a-z]{0,6}[- ]?(\d{4}|\d
 _DIGITS = re.compile(r"(20\d\d)(\d\d)(\d\d)[T_ -]?(\d\d)(\d\d)(\d\d(?:\.\d{1,9})?)()" + _ZONE)
 _OF_DAY = re.compile(r"T?(\d{1,2}):(\d\d):(\d\d(?:[.,]\d{1,9})?) ?([AaPp][Mm])?" + _ZONE)
 _NUMBER = re.compile(r"[-+]?\d{1,20}(?:[.,]\d{0,12})?(?:[eE][-+]?\d{1,3})?")
+_COMMON = re.compile((_time.TIME + rb"(?:Z|[+-]\d\d:\d\d)?").decode())
 _MONTHS = ("jan", "feb", "mar", "apr", "may", "jun", "jul", "aug", "sep", "oct", "nov", "dec")
 _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
@@ -202,6 +203,8 @@ def read(
 
 def _in_common(part: _alike.Alike, texts: Sequence[str], day_first: bool) -> AnyArray:
     """Times of one form in the common one, ``-`` where they are none."""
+    if part.at_once and _COMMON.fullmatch(part.first):
+        return np.ascontiguousarray(part.cells).view(f"S{len(part.first)}").ravel()
     if part.at_once and not part.first[:8].isdigit():  # of _DIGITS it matters which they are
         return _dates(part, day_first)
     return np.array([_dated(texts[i], day_first) or b"-" for i in part.at.tolist()], dtype=np.bytes_)

@@ -30,7 +30,7 @@ from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-from . import _decided, _frames, _lines, _table, _time
+from . import _by_eights, _decided, _frames, _lines, _table, _time
 
 _C = rb"[^,\n]{0,80}"
 _DIGITS = 7
@@ -187,21 +187,14 @@ def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, list[FloatArray]
         ):
             return nothing
     places = (2, 3, 4, 5, 7, 8, 9, 10)
-    text = _table.bytes_of(lines, found.rows)
-    tokens, count = b"".join(token for _, token in _LAUNCHED), len(found.rows)
-    if any(text.count(sign) != count * tokens.count(sign) for sign in (b"e", b"E", b"+")) or b".," in text:
-        return nothing  # numbers that the pattern has not: 5e8, +5, 5.
-    spaces = int(np.count_nonzero(lines.buffer[found.begin + 10] == 32))
-    if text.count(b" ") != count * tokens.count(b" ") + spaces:
-        return nothing
-    value = _table.numbers(lines, found.rows, 11, places, also=b'" :/QNWCFGlte_csinr5g')
-    if value is None:
-        return nothing
-    wall, valid = _time.parse_digits(_table.cells_at(lines, found.begin, 23), 3)
-    keep = valid & np.isfinite(sum(value))
-    for place in places:
-        keep &= found.width(place) <= _DIGITS
-    keep &= lines.buffer[found.ends[:, -1] - 1] != 46
+    made = _by_eights.decimals(lines, found, places)
+    wall, keep = _time.parse_digits(_table.cells_at(lines, found.begin, 23), 3)
+    for place, number, odd in zip(places, made.value, made.odd, strict=True):
+        begin, end = found.start(place), found.ends[:, place]
+        first, last = lines.buffer[np.minimum(begin, len(lines.data) - 1)], lines.buffer[end - 1]
+        # plain decimals that the pattern has not: 12345678, +5, 5.
+        keep &= ~odd & ~np.isnan(number) & (end - begin <= _DIGITS) & (first != 43) & (last != 46)
+    value = made.value
     if keep.all():
         return found.rows, wall, value
     return found.rows[keep], wall[keep], [column[keep] for column in value]

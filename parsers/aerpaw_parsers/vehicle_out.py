@@ -61,6 +61,7 @@ _HEAD_BYTES = 16_384
 """What :func:`_lines.mostly` looks at."""
 _TENS = 10.0 ** np.arange(1, 13)
 _GROUPS = 20
+_NO_SIGN = bytes(set(range(256)) - set(b' "()'))
 _INVALID_POSITION = -900.0  # the logger writes -999 for each coordinate while there is no fix
 
 
@@ -143,9 +144,10 @@ def _at_once(lines: _lines.Lines) -> _Rows:
             continue
         found = found.take(mine)
         spaces = int(np.count_nonzero(lines.buffer[found.start(time) + 10] == 32))
-        if _table.bytes_of(lines, found.rows).count(b" ") != spaces:  # a space elsewhere than in the times
+        signs = _table.bytes_of(lines, found.rows).translate(None, _NO_SIGN)
+        if signs.count(b" ") != spaces:  # a space elsewhere than in the times
             return nothing
-        if count == 14 and not _tuples_in_place(lines, found):
+        if count == 14 and not _tuples_in_place(lines, found, signs):
             return nothing
         wanted = [i for i in range(count) if i != time]
         marks = b'"()' if count == 14 else b""
@@ -178,16 +180,15 @@ def _digits_only(lines: _lines.Lines, found: _table.Fields, column: int, whole: 
     return np.asarray((found.width(column) == digits) & ~exponent)
 
 
-def _tuples_in_place(lines: _lines.Lines, found: _table.Fields) -> bool:
-    """Whether each row has its quotes and brackets where the two tuples are, and nowhere else."""
+def _tuples_in_place(lines: _lines.Lines, found: _table.Fields, signs: bytes) -> bool:
+    """Whether each row has its quotes and brackets where the two tuples are; ``signs`` are those of all rows."""
     at = lines.buffer
     right = np.ones(len(found.rows), dtype=bool)
     for first, last in ((4, 6), (7, 9)):
         opening, closing = found.start(first), found.ends[:, last]
         right &= (found.ends[:, first] - opening > 2) & (closing - found.start(last) > 2)
         right &= (at[opening] == 34) & (at[opening + 1] == 40) & (at[closing - 1] == 34) & (at[closing - 2] == 41)
-    text = _table.bytes_of(lines, found.rows)
-    return bool(right.all()) and [text.count(sign) for sign in b'"()'] == [n * len(right) for n in (4, 2, 2)]
+    return bool(right.all()) and [signs.count(sign) for sign in b'"()'] == [n * len(right) for n in (4, 2, 2)]
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -18,7 +18,7 @@ from . import _lines, _rows, _text, _time
 _CELL = rb', ?"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|)"?'
 _ROW = re.compile(
     rb'^"?\d{1,12}(?:\.0)?"?, ?"?(?P<time>' + _time.TIME + _time.ZONE + rb')"?'
-    + b"".join(_CELL % name for name in (b"longitude_deg", b"latitude_deg", b"altitude_m", b"ri")) + rb"\r?$",
+    + b"".join(_CELL % name for name in (b"longitude_deg", b"latitude_deg", b"altitude_m", b"ri")) + rb"[ \t]*\r?$",
     re.MULTILINE,
 )  # fmt: skip
 

@@ -25,6 +25,9 @@ VARIANTS = {
     "windows lines": lambda data: data.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"),
     "byte order mark": lambda data: b"\xef\xbb\xbf" + data,
     "utf-16": lambda data: data.decode().encode("utf-16"),
+    "spaces at the end of lines": lambda data: re.sub(rb"\r?\n", b" \n", data),
+    "tabs at the end of lines": lambda data: re.sub(rb"\r?\n", b"\t\n", data),
+    "a blank line behind each": lambda data: data.replace(b"\n", b"\n\n"),
     "blank lines at the end": lambda data: data + b"\n\n" if data.endswith(b"\n") else data,
 }
 

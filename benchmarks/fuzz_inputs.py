@@ -255,6 +255,8 @@ def check_law(result: ReadResult, data: bytes, binary: bool) -> None:
         raise ViolationError("rejected lines are not in order, or come twice")
     if not all(line.reason and len(line.text) <= 500 for line in result.rejected):
         raise ViolationError("a rejected line without a reason, or with too long a text")
+    if len({(stream.kind, stream.name) for stream in result.streams}) < len(result.streams):
+        raise ViolationError("two streams of one name")
     records: set[int] = set()
     for stream in result.streams:
         records |= _check_frame(stream.name, stream.kind, stream.frame, max(result.lines, 1))

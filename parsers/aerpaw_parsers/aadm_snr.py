@@ -24,7 +24,11 @@ def _row(data: bytes) -> re.Pattern[bytes]:
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     header = _HEADER.match(rows.data[:400])
     towers = [] if header is None else header[1].decode("ascii").upper().split(",SNR_")[1:]
-    return (_rows.snr(rows, tower, rows.number(f"t{i}")) for i, tower in enumerate(towers))
+    for i, tower in enumerate(towers):
+        if tower in towers[:i]:
+            rows.warnings.append(f"a second column of {tower} is left out")
+        else:
+            yield _rows.snr(rows, tower, rows.number(f"t{i}"))
 
 
 READER = _text.reader(

@@ -34,6 +34,7 @@ from . import _by_eights, _decided, _frames, _lines, _table, _time
 
 _C = rb"[^,\n]{0,80}"
 _DIGITS = 7
+"""Of a whole number, at most."""
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
 _T = rb"^(" + _time.TIME + _time.ZONE + rb"),"
 
@@ -262,6 +263,7 @@ def _level(
 
 
 _STREAMS = ("nr5g_csi", "lte_csi", "lte_rsrp", "nr_rsrp")
+"""In their order."""
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:

@@ -44,6 +44,7 @@ _LOG = re.compile(
 _TITLE = re.compile(_STAMP + rb" *\|? *pci +rnti +(?:\| +)?cqi +ri +mcs", re.MULTILINE)
 _SCHEDULER = re.compile(_STAMP + rb" +\[METRICS *\][^\n]{0,300}\bdl_ri=", re.MULTILINE)
 _HEAD_BYTES = 1 << 20
+"""What says whether the log has a table."""
 _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a-fA-F]{1,6} ")
 
 

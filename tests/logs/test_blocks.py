@@ -156,6 +156,16 @@ def test_a_cell_on_several_carriers_has_no_carrier_in_blocks_either() -> None:
         assert by_name("pawprints").read(b"".join(pieces), OPTIONS).streams[0].attributes.get("arfcn") == expected
 
 
+def test_a_tower_that_has_two_columns_is_one_stream() -> None:
+    rows = [b"2025-03-02 10:00:0%d.5,-80.5,-90.5,-70.5\n" % i for i in range(6)]
+    log = [b"time,snr_lw1,snr_lw2,snr_LW1\n", *rows]
+    whole = by_name("aadm_snr").read(b"".join(log), OPTIONS)
+    assert [stream.name for stream in whole.streams] == ["LW1", "LW2"]
+    assert whole.streams[0].frame["rss_db"].tolist() == [-80.5] * 6
+    assert whole.warnings == ("a second column of LW1 is left out",)
+    same(in_two("aadm_snr", log, OPTIONS), whole)
+
+
 def test_a_loss_written_as_infinite_is_none() -> None:
     title, row = samples.SRSUE.splitlines(keepends=True)[1:3]
     log = [title, row, row.replace(b"   61 -4.2k", b"  inf -4.2k").replace(b":00.000003", b":01.000003")]

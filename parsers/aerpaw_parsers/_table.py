@@ -177,6 +177,8 @@ def numbers(
 
 def _bare_point(data: bytes) -> bool:
     """Whether a point stands behind anything but a digit: pandas reads '.5', the pattern of numbers does not."""
+    if data.startswith(b"."):
+        return True
     buffer = np.frombuffer(data, dtype=np.uint8)
     for first in range(0, len(buffer) - 1, _lines.SLICE):
         piece = buffer[first : first + _lines.SLICE + 1]

@@ -200,6 +200,12 @@ def test_mapped_tables_by_columns_and_by_cells(table: bytes, data: st.DataObject
         assert_same_frame(a.frame, b.frame, check_exact=True)
 
 
+@pytest.mark.parametrize("rows", [b".5\t0.5\n", b"-80.5\t0.5\n.5\t1.5\n", b".5\t0.5\n-80.5\t1.5\n"])
+def test_a_bare_point_is_no_number_wherever_it_stands(rows: bytes) -> None:
+    frame = by_name("generic_csv").read(b"Level\tTime\n" + rows, OPTIONS).streams[0].frame
+    assert frame["flag"].tolist() == ["no_number" if row.startswith(b".") else "" for row in rows.splitlines()]
+
+
 def test_mapped_tables_are_read_by_columns(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(generic_csv, "_one_by_one", lambda *_: pytest.fail("cell by cell"))
     for table, records in zip(TABLES, (3, 4, 3), strict=True):

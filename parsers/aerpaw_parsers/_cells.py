@@ -186,9 +186,11 @@ def _settled(stream: Stream) -> Stream:
     twice = np.ones(len(stream.frame), dtype=bool)
     twice[_once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
     frame = _decided.without(stream.frame, twice)
-    empty = [name for name in BESIDE if name in frame and not frame[name].notna().any()]
+    columns = [name for name in frame if name not in BESIDE]
+    columns += [name for name in BESIDE if name in frame and frame[name].notna().any()]
+    frame = frame if list(frame) == columns else frame[columns]  # no copy in vain
     about = {key: value for key, value in stream.attributes.items() if (key, value) != ("arfcn", _SEVERAL)}
-    return replace(stream, frame=frame.drop(columns=empty) if empty else frame, attributes=about)
+    return replace(stream, frame=frame, attributes=about)
 
 
 def _stream(

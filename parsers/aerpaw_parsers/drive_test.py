@@ -10,7 +10,7 @@ quantities become streams of kind ``kpi``, RI a rank stream (from one). Position
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -211,7 +211,7 @@ def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadR
     track = _pose.from_sheet(rows, sheet, decided, name="phone", source="table of a phone")
     serving: dict[str, float] = decided.kept.setdefault("serving", {})
     levels = _cells.streams(rows, readings, source="drive test", before=serving)
-    _carry_on(readings, serving, decided)
+    _carry_on(readings, serving)
     columns = [*ranks, *others, *_beside(sheet, cells, decided)]
     names = [_stream_name(sheet, column) for column in columns]
     if len(sheet):
@@ -232,13 +232,9 @@ def _stream_name(sheet: _sheet.Sheet, column: int) -> str:
     return found[1].upper() if found else re.sub(r"\W+", "_", name)
 
 
-def _carry_on(readings: _cells.Table, serving: dict[str, float], decided: _decided.Decided) -> None:
-    """Note for the next block which cell serves, and the carriers of cells for the end."""
+def _carry_on(readings: _cells.Table, serving: dict[str, float]) -> None:
+    """Note for the next block which cell serves."""
     known = np.isfinite(readings.rsrp_dbm)
-    key = np.where(readings.pci >= 0, readings.pci, -1.0)
-    carried = np.flatnonzero(known & np.isfinite(readings.arfcn))
-    carriers: set[tuple[int, float, float]] = decided.kept.setdefault("carriers", set())
-    carriers.update(zip(*(one[carried].tolist() for one in (readings.rat, key, readings.arfcn)), strict=True))
     for code, rat in enumerate(_cells.RATS):
         told = np.flatnonzero(known & readings.serving & (readings.rat == code))
         if len(told):
@@ -271,23 +267,14 @@ def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
     for stream in _cells.settled(result).streams:
         if stream.kind == "telemetry":
             stream, warnings = _pose.settled(stream, decided)
-        elif "serving" in stream.frame:
-            cell = (_cells.RATS.index(str(stream.attributes.get("rat", ""))), stream.attributes.get("pci", -1))
-            numbers = {arfcn for *one, arfcn in decided.kept["carriers"] if tuple(one) == cell}
-            about = {key: value for key, value in stream.attributes.items() if key != "arfcn"}
-            about |= {"arfcn": int(*numbers)} if len(numbers) == 1 else {}
-            columns = [name for name in stream.frame if name not in _cells.BESIDE]
-            columns += [name for name in _cells.BESIDE if name in stream.frame]
-            frame = stream.frame if list(stream.frame) == columns else stream.frame[columns]  # no copy in vain
-            stream = replace(stream, attributes=about, frame=frame)
         streams.append(stream)
 
-    def place(stream: Stream) -> tuple[int, str, int, int]:
+    def place(stream: Stream) -> tuple[int, int]:
         if stream.kind == "telemetry":
-            return 0, "", 0, 0
+            return 0, 0
         if "serving" in stream.frame:
-            return 1, str(stream.attributes.get("rat", "")), int(stream.attributes.get("pci", -1)), 0
-        return 2, "", 0, order.index(stream.name)
+            return 1, 0  # in the order that they have
+        return 2, order.index(stream.name)
 
     return _decided.finished(result, sorted(streams, key=place), *warnings)
 

@@ -10,20 +10,45 @@ import tarfile
 import zipfile
 import zlib
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 from ..common.errors import InputError
 
-MOST_MEMBERS = 100_000
+MOST_MEMBERS = 20_000
+"""A flight of half an hour with a burst every 0.1 s has 18 000."""
 MOST_BYTES = 2**31
 """Of one member after decompression."""
 MOST_IN_ALL = 2**35
 """Of all members together."""
+MOST_RATIO = 100
+"""Of all members together to the archive, beyond ``_FREE_BYTES``: logs shrink to a fifth, the most even to a 50th."""
 _ZIP = (b"PK\x03\x04", b"PK\x05\x06")
 _TAR = b"ustar"
 _MARGIN = 2**20
+_FREE_BYTES = 2**28
 _RATIO = 1200
 """Deflate makes a file at most 1032 times smaller: what claims more lies."""
+
+
+@dataclass(frozen=True, slots=True)
+class Member:
+    """A file of an archive.
+
+    Parameters
+    ----------
+    name : str
+        Relative, whatever the archive says.
+    size : int
+        After decompression, as the archive says [bytes].
+    read : callable
+        Content, all of it or at most so many bytes.
+    """
+
+    name: str
+    size: int
+    read: Callable[[int | None], bytes]
 
 
 def is_archive(head: bytes) -> bool:
@@ -42,63 +67,88 @@ def inside(path: Path) -> tuple[Path, str] | None:
     return None
 
 
-def members(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
-    """Names of the files in an archive, in order, and what reads each.
+def members(data: bytes, path: str | Path) -> dict[str, Member]:
+    """Files of an archive by their names, in order.
 
     Raises
     ------
     InputError
-        If the archive is damaged, or holds or unpacks to more than a data set can; also from the callables.
+        If the archive is damaged, or holds or unpacks to more than a data set can; also from a member's ``read``.
     """
     try:
-        yield from _zip(data, path) if data.startswith(_ZIP) else _tar(data, path)
+        found = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
     except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, OSError, NotImplementedError) as error:
         raise InputError(f"a damaged archive ({error})", cause="a cut download", path=path) from error
+    _check(found, len(data), path)
+    return {member.name: member for member in sorted(found, key=lambda member: member.name)}
 
 
 def _hidden(name: str) -> bool:
-    return any(part.startswith(".") or part == "__MACOSX" for part in name.split("/"))
+    return any((part.startswith(".") and part != "..") or part == "__MACOSX" for part in name.split("/"))
 
 
-def _zip(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
+def _zip(data: bytes, path: str | Path) -> Iterator[Member]:
     book = zipfile.ZipFile(io.BytesIO(data))
-    members = [one for one in book.infolist() if not one.is_dir() and not _hidden(one.filename)]
-    _check(len(members), sum(one.file_size for one in members), path)
-    for one in sorted(members, key=lambda one: one.filename):
-        yield one.filename, lambda one=one: _unzipped(book, one, path)  # type: ignore[misc]
+    for entry in book.infolist():
+        if not entry.is_dir() and not _hidden(entry.filename):
+            size = entry.file_size
+            lies = size > MOST_BYTES or size > _RATIO * entry.compress_size + _MARGIN
+            read = partial(_too_large, size, path) if lies else partial(_unzipped, book, entry, path)
+            yield _member(entry.filename, 0 if lies else size, path, read)
 
 
-def _unzipped(book: zipfile.ZipFile, one: zipfile.ZipInfo, path: str | Path) -> bytes:
-    place = f"{path}/{one.filename}"
-    if one.file_size > MOST_BYTES or one.file_size > _RATIO * one.compress_size + _MARGIN:
-        raise InputError(
-            f"the member unpacks to {one.file_size} bytes", expected=f"at most {MOST_BYTES}", cause="no log", path=place
-        )
+def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, most: int | None) -> bytes:
+    place = f"{path}/{entry.filename}"
     try:
-        with book.open(one) as stream:
-            content = stream.read(one.file_size + 1)
+        with book.open(entry) as stream:
+            content = stream.read(entry.file_size + 1 if most is None else most)
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
         raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
-    if len(content) > one.file_size:
+    if len(content) > entry.file_size:
         raise InputError("the member is larger than the archive says", cause="no log", path=place)
     return content
 
 
-def _tar(data: bytes, path: str | Path) -> Iterator[tuple[str, Callable[[], bytes]]]:
+def _tar(data: bytes, path: str | Path) -> Iterator[Member]:
     book = tarfile.open(fileobj=io.BytesIO(data), mode="r:")  # noqa: SIM115 - members are read later
-    members = [one for one in book.getmembers() if one.isreg() and not _hidden(one.name)]
-    _check(len(members), sum(one.size for one in members), path)
-    for one in sorted(members, key=lambda one: one.name):
-        yield one.name, lambda one=one: _untarred(book, one)  # type: ignore[misc]
+    for entry in book.getmembers():
+        if entry.isreg() and not _hidden(entry.name):
+            yield _member(entry.name, entry.size, path, partial(_untarred, book, entry))
 
 
-def _untarred(book: tarfile.TarFile, one: tarfile.TarInfo) -> bytes:
-    stream = book.extractfile(one)
-    return stream.read() if stream is not None else b""
+def _untarred(book: tarfile.TarFile, entry: tarfile.TarInfo, most: int | None) -> bytes:
+    stream = book.extractfile(entry)
+    return stream.read(-1 if most is None else most) if stream is not None else b""
 
 
-def _check(count: int, total: int, path: str | Path) -> None:
-    if count > MOST_MEMBERS:
-        raise InputError(f"the archive holds {count} files", expected=f"at most {MOST_MEMBERS}", path=path)
-    if total > MOST_IN_ALL:
-        raise InputError(f"the archive unpacks to {total} bytes", expected=f"at most {MOST_IN_ALL}", path=path)
+def _member(name: str, size: int, path: str | Path, read: Callable[[int | None], bytes]) -> Member:
+    """A member under a relative name: what a flight.yaml names by it lies in the archive and nowhere else."""
+    if ".." in name.split("/"):
+        return Member(name, 0, partial(_leads_out, path))
+    return Member(name.lstrip("/"), size, read)
+
+
+def _too_large(size: int, path: str | Path, _most: int | None) -> bytes:
+    raise InputError(f"the member unpacks to {size} bytes", expected=f"at most {MOST_BYTES}", cause="no log", path=path)
+
+
+def _leads_out(path: str | Path, _most: int | None) -> bytes:
+    raise InputError("the member's name leads out of the archive", expected="a name below it", path=path)
+
+
+def most_bytes(size: int) -> int:
+    """Bytes that an archive or packed file of ``size`` bytes may unpack to."""
+    return min(MOST_IN_ALL, MOST_RATIO * size + _FREE_BYTES)
+
+
+def _check(found: list[Member], size: int, path: str | Path) -> None:
+    total = sum(member.size for member in found)
+    if len(found) > MOST_MEMBERS:
+        raise InputError(f"the archive holds {len(found)} files", expected=f"at most {MOST_MEMBERS}", path=path)
+    if total > most_bytes(size):
+        raise InputError(
+            f"the archive of {size} bytes unpacks to {total} bytes",
+            expected=f"at most {MOST_RATIO} times its size and {_FREE_BYTES >> 20} MiB, and {MOST_IN_ALL >> 30} GiB",
+            cause="no data set: an archive made to fill a disk or the memory",
+            path=path,
+        )

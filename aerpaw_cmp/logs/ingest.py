@@ -10,7 +10,7 @@ import hashlib
 import io
 import os
 import zlib
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -72,8 +72,12 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """What a packed file holds, other content as it is."""
     if packed.form(raw) is not None:
-        return packed.unpacked(raw, path, MAX_BYTES)
+        return packed.unpacked(raw, path, _most_unpacked(raw))
     return _gunzip(raw, path) if raw.startswith(_GZIP) else raw
+
+
+def _most_unpacked(raw: bytes) -> int:
+    return min(MAX_BYTES, archives.most_bytes(len(raw)))
 
 
 def _raw(place: Path, limit: int | None = None) -> bytes:
@@ -96,17 +100,18 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
 
 
 def _gunzip(raw: bytes, path: str | Path) -> bytes:
-    """Content of all members of a gzip file, never more than ``MAX_BYTES``."""
+    """Content of all members of a gzip file, never more than a log of that size can hold."""
+    most = _most_unpacked(raw)
     out = io.BytesIO()
     rest = raw
     while rest.startswith(_GZIP):
         machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
         try:
-            out.write(machine.decompress(rest, MAX_BYTES + 1 - out.tell()))
+            out.write(machine.decompress(rest, most + 1 - out.tell()))
         except zlib.error as error:
             raise InputError(f"a damaged gzip file ({error})", cause="a cut download", path=path) from error
-        if out.tell() > MAX_BYTES:
-            raise InputError(f"the gzip file unpacks to more than {MAX_BYTES} bytes", cause="no log", path=path)
+        if out.tell() > most:
+            raise InputError(f"the gzip file unpacks to more than {most} bytes", cause="no log", path=path)
         if not machine.eof:
             raise InputError("the gzip file ends too early", cause="a cut download", path=path)
         rest = machine.unused_data
@@ -214,8 +219,8 @@ def _sniffed(path: Path) -> bytes:
     from .readers import head_of
 
     if (part := None if _present(path) else archives.inside(path)) is not None:
-        content = dict(archives.members(read_bytes(part[0])[0], part[0]))
-        return head_of(as_utf8(content[part[1]]())) if part[1] in content else b""
+        content = archives.members(read_bytes(part[0])[0], part[0])
+        return head_of(as_utf8(content[part[1]].read(None))) if part[1] in content else b""
     head = _raw(path, HEAD_BYTES)
     if packed.form(head) is not None:
         head = packed.head_of(path, HEAD_BYTES)
@@ -315,38 +320,43 @@ def _archive(
     """All logs of an archive; what cannot be read is reported, not fatal."""
     files: list[IngestedFile] = []
     skipped: list[Skipped] = []
-    content = dict(archives.members(read_bytes(place)[0], place))
-    for name, read in content.items():
+    content = archives.members(read_bytes(place)[0], place)
+    for name, member in content.items():
         path = place / name
         try:
-            files.append(_member(path, read(), content, name, options, chosen))
+            files.append(_member(path, member, content, options, chosen))
         except InputError as error:
-            skipped.append(Skipped(str(path), _samples_of(name, set(content)) or error.found))
+            skipped.append(Skipped(str(path), _samples_of(name, content) or error.found))
     return files, skipped
 
 
 def _member(
     path: Path,
-    raw: bytes,
-    content: Mapping[str, Callable[[], bytes]],
-    name: str,
+    member: archives.Member,
+    content: Mapping[str, archives.Member],
     options: OptionsFor | None,
     chosen: Reader | None,
 ) -> IngestedFile:
-    """One file of an archive."""
+    """One file of an archive; what its first bytes show to be no log is not unpacked."""
+    head = member.read(HEAD_BYTES)
+    if chosen is None and member.size > HEAD_BYTES and packed.form(head) is None and not head.startswith(_GZIP):
+        head = as_utf8(head)
+        if not archives.is_archive(head) and not hides_its_content(head):
+            chosen = identify(head, path=str(path))
+    raw = member.read(None)
     digest = hashlib.sha256(raw).hexdigest()
     data = as_utf8(_unpacked(raw, path))
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
     def beside(other: str) -> bytes | None:
-        unpack = content.get(f"{name.rpartition('/')[0]}/{other}".lstrip("/"))
-        return None if unpack is None else unpack()
+        neighbour = content.get(f"{member.name.rpartition('/')[0]}/{other}".lstrip("/"))
+        return None if neighbour is None else neighbour.read(None)
 
     return _read(path, data, digest, chosen or identify(data, path=str(path)), options, beside)
 
 
-def _samples_of(name: str, names: set[str]) -> str | None:
+def _samples_of(name: str, names: Collection[str]) -> str | None:
     """What a file of samples is whose meta file lies beside it."""
     meta = name.removesuffix(".sigmf-data") + ".sigmf-meta"
     if name.endswith(".sigmf-data") and meta in names:
@@ -366,10 +376,10 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     place = Path(path)
     if (part := None if _present(place) else archives.inside(place)) is not None:
         archive, name = part
-        content = dict(archives.members(read_bytes(archive)[0], archive))
+        content = archives.members(read_bytes(archive)[0], archive)
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
-        return _member(place, content[name](), content, name, options, reader)
+        return _member(place, content[name], content, options, reader)
     head = as_utf8(_raw(place, HEAD_BYTES))
     if head.startswith(_HDF5):
         raise InputError(
@@ -548,9 +558,15 @@ ACCOUNT = ("file", "reader", "streams (rows)", "lines", "accepted", "rejected", 
 
 def account_rows(account: Mapping[str, Any]) -> tuple[str, list[list[str]]]:
     """A summary for people: the folder that all paths share, and a row of :data:`ACCOUNT` per file."""
-    paths = [Path(file["path"]) for file in account["files"]]
-    folder = os.path.commonpath([path.parent for path in paths]) if len(paths) > 1 else ""
+    folder = _common_folder([Path(file["path"]) for file in account["files"]])
     return folder, [_account_row(file, folder) for file in account["files"]]
+
+
+def _common_folder(paths: Sequence[Path]) -> str:
+    """The folder that all paths are named in; none where they begin at different places, or at several heights."""
+    if len(paths) < 2 or len({path.is_absolute() for path in paths}) > 1:
+        return ""
+    return os.path.commonpath([path.parent for path in paths])
 
 
 def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
@@ -561,7 +577,7 @@ def _account_row(file: Mapping[str, Any], folder: str) -> list[str]:
     rates = {"-" if s["rate_hz"] is None else f"{s['rate_hz']:.3g}" for s in streams}
     start, seconds = _start_and_length([s for s in streams if s["start"]])
     return [
-        one_line(os.path.relpath(file["path"], folder) if folder else str(file["path"])),
+        one_line(str(Path(file["path"]).relative_to(folder) if folder else file["path"])),
         file["reader"],
         "; ".join(f"{kind}: {', '.join(names)}" for kind, names in kinds.items()) or "-",
         *(str(file[key]) for key in ("lines", "accepted", "rejected", "blank")),

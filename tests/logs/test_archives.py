@@ -93,6 +93,46 @@ def test_bombs_are_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> N
         ingest(place)
 
 
+def test_an_archive_that_unpacks_to_far_more_than_its_size_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    content = {f"m{i}.txt": b"\0" * 400_000 for i in range(10)} | {"x_vehicleOut.txt": VEHICLE_10}
+    place = tmp_path / "many.zip"
+    place.write_bytes(zipped(content))
+    assert [Path(f.path).name for f in ingest(place, options=OPTIONS)] == ["x_vehicleOut.txt"]
+    monkeypatch.setattr(archives, "_FREE_BYTES", 1000)
+    with pytest.raises(InputError, match=r"unpacks to 40\d+ bytes"):
+        ingest(place, options=OPTIONS)
+
+
+def test_what_the_first_bytes_show_to_be_no_log_is_not_unpacked(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    place = tmp_path / "a.zip"
+    place.write_bytes(zipped({"junk.bin": b"\0" * 900_000, "x_vehicleOut.txt": VEHICLE_10}))
+    unpacked: list[tuple[str, int | None]] = []
+    plain = archives._unzipped
+
+    def noted(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: Path, most: int | None) -> bytes:
+        unpacked.append((entry.filename, most))
+        return plain(book, entry, path, most)
+
+    monkeypatch.setattr(archives, "_unzipped", noted)
+    assert len(ingest(place, options=OPTIONS)) == 1
+    assert ("x_vehicleOut.txt", None) in unpacked
+    assert ("junk.bin", None) not in unpacked
+
+
+def test_names_of_members_stay_in_the_archive(tmp_path: Path) -> None:
+    place = tmp_path / "a.zip"
+    place.write_bytes(zipped({"/etc/x_vehicleOut.txt": VEHICLE_10, "../../y_vehicleOut.txt": VEHICLE_10}))
+    found = ingest(place, options=OPTIONS)
+    assert [f.path for f in found] == [str(place / "etc/x_vehicleOut.txt")]
+    assert "leads out of the archive" in found.skipped[0].reason
+    (again,) = ingest(place / "etc/x_vehicleOut.txt", options=OPTIONS)
+    assert again.result.accepted == found[0].result.accepted
+
+
 def test_an_archive_in_an_archive_is_told(tmp_path: Path) -> None:
     (tmp_path / "a.zip").write_bytes(zipped({"inner.zip": zipped(CONTENT), "x_vehicleOut.txt": VEHICLE_10}))
     assert "unpack it" in ingest(tmp_path / "a.zip", options=OPTIONS).skipped[0].reason

@@ -93,6 +93,25 @@ def test_the_account_for_people_names_lines_and_files(tmp_path: Path) -> None:
     assert account_rows(summary(Ingested())) == ("", [])
 
 
+@pytest.mark.parametrize(
+    ("paths", "folder", "names"),
+    [
+        (["logs/a.txt", "/abs/b.txt"], "", ["logs/a.txt", "/abs/b.txt"]),
+        (["logs/a.txt", "../b.txt"], "", ["logs/a.txt", "../b.txt"]),
+        (["logs/x/a.txt", "logs/b.txt"], "logs", ["x/a.txt", "b.txt"]),
+        (["/f/a.txt", "/g/b.txt"], "/", ["f/a.txt", "g/b.txt"]),
+        (["a.txt", "b.txt"], "", ["a.txt", "b.txt"]),
+        (["logs/a.txt"], "", ["logs/a.txt"]),
+    ],
+)
+def test_the_account_names_files_below_the_folder_they_share(paths: list[str], folder: str, names: list[str]) -> None:
+    account = {"files": [{"path": path, "reader": "-", "lines": 0, "accepted": 0, "rejected": 0, "blank": 0,
+                          "streams": []} for path in paths]}  # fmt: skip
+    shared, rows = account_rows(account)
+    assert shared == folder
+    assert [row[0] for row in rows] == names
+
+
 def test_relative_times_are_called_relative(tmp_path: Path) -> None:
     account = {"files": [{"path": "x", "reader": "r", "lines": 1, "accepted": 1, "rejected": 9, "blank": 0,
                           "warnings": [], "first_rejected": [{"number": 1, "reason": "torn", "text": "t"}],

@@ -13,6 +13,7 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.compare.result import BASELINE_TITLE
 from aerpaw_cmp.logs.ingest import Ingested
 from aerpaw_cmp.logs.readers import ReadOptions
 
@@ -72,7 +73,7 @@ def test_report_completes_with_baselines_and_audit(report: Report, name: str) ->
                 channel["rmse_ci95_db"] == [None, None]
                 or channel["rmse_ci95_db"][0] < channel["rmse_db"] < channel["rmse_ci95_db"][1]
             )
-            assert set(channel["baselines"]) == {"free_space", "two_ray"}
+            assert set(channel["baselines"]) == set(BASELINE_TITLE)
             assert not channel["at_search_edge"]
     for tower in metrics["rank"].values():
         assert set(tower["simulated"]) == {"10", "100", "1000"}

@@ -149,6 +149,8 @@ def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
 
 
 def _print_report_summary(outcome: Any) -> None:
+    from ..compare.result import BASELINE_TITLE
+
     rows = []
     for tower, channels in outcome.metrics["rss"].items():
         for channel, m in channels.items():
@@ -160,8 +162,7 @@ def _print_report_summary(outcome: Any) -> None:
                     number(m["offset_db"], "{:.1f}"),
                     number(m["rmse_db"], "{:.2f}"),
                     f"{number(ci[0], '{:.2f}')} .. {number(ci[1], '{:.2f}')}",
-                    number(m["baselines"]["free_space"]["rmse_db"], "{:.2f}"),
-                    number(m["baselines"]["two_ray"]["rmse_db"], "{:.2f}"),
+                    *(number(m["baselines"][name]["rmse_db"], "{:.2f}") for name in BASELINE_TITLE),
                     number(m["correlation"], "{:.2f}"),
                     str(m["n"]),
                     str(m["n_out_of_coverage"]),
@@ -169,7 +170,7 @@ def _print_report_summary(outcome: Any) -> None:
             )
     if rows:
         table(
-            ["tower", "channel", "offset dB", "RMSE dB", "95 %", "free space", "two-ray", "corr.", "n", "out of cov."],
+            ["tower", "channel", "offset dB", "RMSE dB", "95 %", *BASELINE_TITLE.values(), "corr.", "n", "out of cov."],
             rows,
             "RSS, measured against replayed",
         )
@@ -223,14 +224,16 @@ def calibrate(
     if as_json:
         print_json(outcome.metrics)
         return
+    from ..compare.calibration import BASELINES
+
     m = outcome.metrics
     rows = []
     for name, scores in [*m["scores"].items(), *((f"control: {k}", v) for k, v in m["controls"].items())]:
         means = [sum(s[key] for s in scores) / len(scores) if scores else None
-                 for key in ("rmse_db", "rmse_4s_db", "free_space_rmse_db")]  # fmt: skip
+                 for key in ("rmse_db", "rmse_4s_db", *BASELINES)]  # fmt: skip
         rows.append([name.replace("_", " "), *(number(v, "{:.2f}") for v in means), str(len(scores))])
     if rows:
-        heads = ["left out", "RMSE dB", "4 s means dB", "free space dB", "series"]
+        heads = ["left out", "RMSE dB", "4 s means dB", *(f"{title} dB" for title in BASELINES.values()), "series"]
         table(heads, rows, "Scores on what was left out, means")
     rows = [
         [split.replace("_", " "), one["flight"], one["tower"], number(one["kappa"], "{:.3f}"),

@@ -14,7 +14,9 @@ from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
 from .direction_gain import GainFit, GainModel, LinkSamples, Term, fit_gain
 from .gain_choice import Choice, choose_and_fit
+from .ladder import log_distance_level_db
 from .mount import GainOf, MountFit, fit_mounts
+from .result import BASELINE_TITLE
 from .rss import local_mean_db
 
 SECTORS = 6
@@ -25,6 +27,9 @@ STRETCHES = 8
 GUARD_S = 20.0
 CRUISE_M = 5.0
 LEAST_SAMPLES = 50
+
+BASELINES = {f"{name}_rmse_db": BASELINE_TITLE[name] for name in ("free_space", "log_distance", "constant")}
+"""Fields of :class:`Score` that a learned model is held against, with their titles."""
 
 SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_left_out", "route_left_out")
 
@@ -144,7 +149,8 @@ class Score:
     ``rmse_4s_db``: both sides averaged in power over 4 s. ``within_2sd``: share of samples (some hundred of them)
     whose error is within two standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured
     minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
-    place of the flight's own.
+    place of the flight's own. ``constant_rmse_db``, ``log_distance_rmse_db``: of a constant, and of a line over log
+    distance whose slope at each of eight places comes from the other places of the flight.
     """
 
     flight: str
@@ -153,6 +159,8 @@ class Score:
     rmse_db: float
     rmse_4s_db: float
     free_space_rmse_db: float
+    constant_rmse_db: float
+    log_distance_rmse_db: float
     n: int
     offset_db: float = math.nan
     within_2sd: float = math.nan
@@ -168,6 +176,7 @@ def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = No
         return None
     time, free, left = s.time_s[good], observed.free_space_db[good], error[good]
     measured, level = s.residual_db[good] + free, gain_db[good] + free
+    line = log_distance_level_db(measured, 10.0 ** (-free / 20.0), s.position_m[good])
     means = local_mean_db(time, measured, 4.0) - local_mean_db(time, level, 4.0)
     known = np.zeros(len(left), np.bool_) if sd_db is None else np.isfinite(sd_db[good])
     inside = math.nan
@@ -180,6 +189,8 @@ def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = No
         rmse_db=float(left.std()),
         rmse_4s_db=float(means.std()),
         free_space_rmse_db=float(s.residual_db[good].std()),
+        constant_rmse_db=float(measured.std()),
+        log_distance_rmse_db=float((measured - line).std()),
         n=int(good.sum()),
         offset_db=float(left.mean()),
         within_2sd=inside,

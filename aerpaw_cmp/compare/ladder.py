@@ -26,11 +26,16 @@ LEAST_COVERED = 0.8
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Rung:
-    """One model: its name, its level (n,) [dBm] at the samples of each series, and what it cost [s]."""
+    """One model: its name, its level (n,) [dBm] at the samples of each series, and what it cost [s].
+
+    ``regressor_db`` (n,) per series marks a line that replays nothing: its slope is fitted beside the offset, without
+    the places that it is scored on. A regressor of zeros leaves the constant alone.
+    """
 
     model: str
     level_db: tuple[FloatArray, ...]
     seconds: float
+    regressor_db: tuple[FloatArray, ...] | None = None
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,13 +72,15 @@ class LadderRow:
 class Ladder:
     """All rungs, scored: ``error_db[rung][series]`` (n,), NaN outside the shared samples.
 
-    ``rmse_db`` is over all series; ``best`` and ``recommended`` are indices of rungs, None where nothing was compared.
+    ``rmse_db`` is over all series. ``best`` (of all rungs), ``best_replay`` and ``recommended`` (without the lines that
+    replay nothing) are indices of rungs, None where nothing was compared.
     """
 
     rungs: tuple[Rung, ...]
     error_db: tuple[tuple[FloatArray, ...], ...]
     rmse_db: tuple[float, ...]
     best: int | None
+    best_replay: int | None
     recommended: int | None
 
 
@@ -155,22 +162,25 @@ def climb(
     ]  # fmt: skip
     errors = tuple(
         tuple(
-            held_out_error_db(m, level, keep, blocks, block) if ok else np.full(len(m), np.nan)
-            for m, level, keep, block in zip(measured_db, rung.level_db, shared, places, strict=True)
+            held_out_error_db(m, level, keep, blocks, block, x) if ok else np.full(len(m), np.nan)
+            for m, level, keep, block, x in zip(
+                measured_db, rung.level_db, shared, places, rung.regressor_db or [None] * len(shared), strict=True
+            )
         )
         for rung, ok in zip(rungs, enough, strict=True)
     )
     joined = [np.concatenate(e)[_in_time(time_s)] if e else np.zeros(0) for e in errors]
     rmse = tuple(_rmse(e) for e in joined)
     if not any(np.isfinite(rmse)):
-        return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, recommended=None)
-    best = int(np.nanargmin(rmse))
-    recommended = best
-    for index, error in enumerate(joined[:best]):
-        if np.isfinite(rmse[index]) and _as_good(error, joined[best], replicates):
-            recommended = index
-            break
-    return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=best, recommended=recommended)
+        return Ladder(rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=None, best_replay=None, recommended=None)
+    replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
+    chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
+    if chosen is not None:
+        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen], replicates))
+    return Ladder(
+        rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=int(np.nanargmin(rmse)), best_replay=chosen,
+        recommended=recommended,
+    )  # fmt: skip
 
 
 def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]], *, replicates: int = REPLICATES) -> list[LadderRow]:
@@ -219,7 +229,7 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicate
 
 def held_out_error_db(
     measured_db: FloatArray, level_db: FloatArray, keep: BoolArray, blocks: int = BLOCKS,
-    place: IntArray | None = None,
+    place: IntArray | None = None, regressor_db: FloatArray | None = None,
 ) -> FloatArray:  # fmt: skip
     """Measured minus predicted (n,), each stretch with the offset of all the others [dB]; NaN where not ``keep``.
 
@@ -233,6 +243,8 @@ def held_out_error_db(
         Stretches of equal length.
     place : (kept samples,) int, optional
         The block of each sample that counts, in place of stretches of time.
+    regressor_db : (n,), optional
+        Has a slope that is fitted together with the offset, on the same samples.
 
     Returns
     -------
@@ -247,13 +259,71 @@ def held_out_error_db(
     rows = np.flatnonzero(keep)
     difference = measured_db[rows] - level_db[rows]
     stretch = stretches_of(len(rows), blocks) if place is None else place
-    count = np.bincount(stretch, minlength=blocks)
-    total = np.bincount(stretch, weights=difference, minlength=blocks)
-    with np.errstate(invalid="ignore", divide="ignore"):
-        offset = (total.sum() - total) / (count.sum() - count)
+    x = np.zeros(len(rows)) if regressor_db is None else regressor_db[rows]
+    offset, slope = held_out_lines(difference, x, stretch, blocks)
     error = np.full(len(measured_db), np.nan)
-    error[rows] = difference - offset[stretch]
+    error[rows] = difference - offset[stretch] - slope[stretch] * x
     return error
+
+
+def held_out_lines(values: FloatArray, x: FloatArray, block: IntArray, blocks: int) -> tuple[FloatArray, FloatArray]:
+    """Least-squares lines through all blocks but one: offset and slope (blocks,) for each block left out.
+
+    Parameters
+    ----------
+    values, x : (n,)
+        Ordinate and abscissa. Where ``x`` does not vary, the slope is 0.
+    block : (n,) int
+        Of each sample, 0 to ``blocks - 1``.
+    blocks : int
+
+    Returns
+    -------
+    (offset, slope) : each (blocks,)
+        NaN offset where no sample is left.
+    """
+    centre = float(x.mean()) if len(x) else 0.0
+    away = x - centre
+    sums = np.array(
+        [np.bincount(block, weights=w, minlength=blocks)
+         for w in (np.ones(len(x)), away, values, away * away, away * values)]
+    )  # fmt: skip
+    count, sx, sy, sxx, sxy = sums.sum(axis=1, keepdims=True) - sums
+    with np.errstate(invalid="ignore", divide="ignore"):
+        spread = sxx - sx * sx / count
+        slope = np.where(spread > 1e-9 * np.maximum(sxx, 1e-12), (sxy - sx * sy / count) / spread, 0.0)
+        return (sy - slope * sx) / count - slope * centre, slope
+
+
+def log_distance_level_db(
+    measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray, blocks: int = BLOCKS
+) -> FloatArray:
+    """Log-distance level (n,) about its mean [dB], each place by the slope of the other places.
+
+    The offset is left to the comparison, as for every other model. NaN where no distance is known.
+
+    Parameters
+    ----------
+    measured_db, distance_m : (n,)
+        Level [dB] and distance of the ends [m]; NaN is left out of the fit.
+    position_m : (n, 3)
+        See :func:`places_of`.
+    blocks : int
+        Places.
+    """
+    with np.errstate(divide="ignore", invalid="ignore"):
+        x = 10.0 * np.log10(distance_m)
+    good = np.isfinite(measured_db) & np.isfinite(x)
+    level = np.full(len(x), np.nan)
+    if not good.any():
+        return level
+    away = x - x[good].mean()
+    place = places_of(position_m[good], blocks)
+    slope = held_out_lines(measured_db[good], away[good], place, blocks)[1]
+    overall = held_out_lines(measured_db[good], away[good], np.zeros(int(good.sum()), np.int64), 2)[1][1]
+    level[np.isfinite(away)] = overall * away[np.isfinite(away)]
+    level[good] = slope[place] * away[good]
+    return level
 
 
 def compared(error_db: FloatArray, best_db: FloatArray, replicates: int = REPLICATES) -> PairedDifference:

@@ -21,6 +21,14 @@ from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .serving import ServingComparison
 from .statistics import Interval, PairedDifference
 
+BASELINE_TITLE = {
+    "free_space": "free space",
+    "two_ray": "two-ray ground",
+    "log_distance": "log-distance line",
+    "constant": "constant level",
+}
+"""Models that a replay is held against, with their names in words; the last two know no physics."""
+
 APPLIED, NOT_APPLIED, ESTIMATED, GIVEN = (
     "estimated and applied", "asked for, not applied", "estimated, not applied", "given in flight.yaml"
 )  # fmt: skip

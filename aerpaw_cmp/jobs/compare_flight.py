@@ -22,6 +22,7 @@ from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
 from ..compare.forecast import ForecastScore, score_forecast
+from ..compare.ladder import log_distance_level_db
 from ..compare.result import (
     APPLIED,
     Censored,
@@ -128,6 +129,8 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         name: at_samples(series, replayed, level, settings)
         for name, level in baseline_levels(data.site, series.tower, replayed).items()
     }
+    position = _positions(replayed)
+    simple |= fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
     score = rss.compare_rss(
         series.time,
         levels.measured_db,
@@ -141,7 +144,6 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
     )
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
-    position = _positions(replayed)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
     stated_sd = gain_sd_db(data.site, series.tower, replayed)
@@ -203,6 +205,16 @@ def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, Flo
     ends = (source, target, link.carrier_hz, link.transmit_power_dbm)
     two_ray = two_ray_dbm(*ends, ground_material=site.ground_material, ground_m=place.ground_m)
     return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
+
+
+def fitted_levels(
+    free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
+) -> dict[str, FloatArray]:
+    """Baselines that know no physics, about the mean level of free space (n,) [dBm]: a constant, and log-distance."""
+    known = np.isfinite(measured_db) & np.isfinite(free_space_dbm)
+    mean = float(free_space_dbm[known].mean()) if known.any() else np.nan
+    line = log_distance_level_db(measured_db, distance_m, position_m)
+    return {"constant": np.where(np.isfinite(line), mean, np.nan), "log_distance": mean + line}
 
 
 def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> dict[str, ModelLevel]:

@@ -19,6 +19,7 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray
 from ..common.yamlfile import parse_yaml
 from ..compare.ladder import Ladder, Rung, climb
+from ..compare.result import BASELINE_TITLE
 from ..flight.data import FlightData, RssSeries
 from ..flight.losses import path_loss
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
@@ -40,7 +41,9 @@ MOST_SAMPLES = 4000
 """Per series; of longer ones every second, third, ... sample is taken."""
 
 AS_SET = "as set in flight.yaml"
-FREE_SPACE = "free space"
+FREE_SPACE = BASELINE_TITLE["free_space"]
+LINES = BASELINE_TITLE["constant"], BASELINE_TITLE["log_distance"]
+"""Lines that replay nothing: what a model must beat to be worth its name."""
 
 LEARNED_HERE = " (its antennas were learned on this flight, too: not scored)"
 """Behind the name of a rung that would be scored where it was fitted."""
@@ -150,8 +153,8 @@ class _Climber:
 
     def climb(self) -> FlightLadder:
         """All stages."""
-        rungs: list[Rung] = []
-        models: list[Model | None] = []
+        rungs = self._lines()
+        models: list[Model | None] = [None] * len(rungs)
         best = Model()
         for stage in (self._antennas, self._ground, self._buildings, self._trees):
             for model in stage(best):
@@ -159,8 +162,8 @@ class _Climber:
                     models.append(model)
                     rungs.append(self._rung(model))
             scored = self._scored(rungs)
-            if scored.best is not None:
-                best = models[scored.best] or best
+            if scored.best_replay is not None:
+                best = models[scored.best_replay] or best
         models.append(None)
         rungs.append(self._as_set())
         names = tuple((s.tower, s.channel) for s in self._data.rss)
@@ -212,6 +215,15 @@ class _Climber:
         return [dataclasses.replace(best, trees=kind) for kind in kinds]
 
     # levels
+
+    def _lines(self) -> list[Rung]:
+        zeros = tuple(np.zeros(len(s.rows)) for s in self._series)
+        away = tuple(s.replayed.poses.position_m[s.picked] - self._sources(s) for s in self._series)
+        range_db = tuple(10.0 * np.log10(np.maximum(np.linalg.norm(a, axis=1), 0.1)) for a in away)
+        return [
+            Rung(model=name, level_db=zeros, seconds=0.0, regressor_db=x)
+            for name, x in zip(LINES, (zeros, range_db), strict=True)
+        ]
 
     def _as_set(self) -> Rung:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)

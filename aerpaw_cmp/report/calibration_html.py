@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..common.jsonable import json_safe
+from ..compare.calibration import BASELINES
 from . import canvas
 from .calibration_data import AntennaMap, CalibrationData
 from .canvas import FigureSpec, Picture
@@ -97,14 +98,16 @@ def draw_antenna(antenna: AntennaMap) -> Figure:
 
 def draw_scores(data: CalibrationData) -> Figure:
     """Mean RMSE of every split and control beside free space."""
-    rows = [("free space", _mean(data.scores["flight_left_out"], "free_space_rmse_db"))]
+    left_out = data.scores["flight_left_out"]
+    rows = [(title, _mean(left_out, key)) for key, title in BASELINES.items()]
     rows += [(SPLIT_TITLE.get(k, k), _mean(v)) for k, v in data.scores.items()]
     rows += [(f"control: {k}", _mean(v)) for k, v in data.controls.items()]
     rows = [(name, value) for name, value in rows if np.isfinite(value)]
     fig = canvas.figure((9.2, 0.4 * len(rows) + 1.0))
     ax = fig.subplots()
     names, values = [r[0] for r in rows][::-1], [r[1] for r in rows][::-1]
-    colours = [canvas.SIMULATED if "control" not in n and n != "free space" else canvas.OUT_OF_COVERAGE for n in names]
+    beside = [n in BASELINES.values() or "control" in n for n in names]
+    colours = [canvas.OUT_OF_COVERAGE if pale else canvas.SIMULATED for pale in beside]
     ax.barh(names, values, color=colours)
     for y, value in enumerate(values):
         ax.text(value, y, f" {value:.2f}", va="center", fontsize=8)
@@ -186,7 +189,8 @@ def _page(data: CalibrationData, pictures: Sequence[Picture]) -> str:
         data=data,
         sections=by_section(pictures),
         split_title=SPLIT_TITLE,
-        means={k: (_mean(v), _mean(v, "rmse_4s_db"), _mean(v, "free_space_rmse_db"), len(v))
+        baselines=BASELINES,
+        means={k: ([_mean(v, key) for key in ("rmse_db", "rmse_4s_db", *BASELINES)], len(v))
                for k, v in {**data.scores, **{f"control: {k}": v for k, v in data.controls.items()}}.items()},
         content_policy=policy(),
     )  # fmt: skip

@@ -21,12 +21,12 @@ from .canvas import (
     frame_around,
     plan_axes,
     plan_shape,
-    pretty,
     thinned,
     thinned_plan,
 )
 from .maps_figures import COLOURS, LINES, MARKERS, grouped
 from .names import k_key, safe_name
+from .words import pretty
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure

@@ -27,6 +27,7 @@ from .exports.samples import of_campaign
 from .exports.write import write_exports
 from .html import by_section, environment, policy, script
 from .names import k_key
+from .words import pretty
 
 FEW, MANY = 8, 200
 """Warnings that stand open, and that stand on the page at all."""
@@ -341,7 +342,7 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=rss_flights(data),
-        pretty=canvas.pretty,
+        pretty=pretty,
         files=files,
         season=data.season.over_all(),
         worst=worst_flights(data),

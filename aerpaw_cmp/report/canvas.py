@@ -35,15 +35,19 @@ if TYPE_CHECKING:
 # Okabe & Ito's palette (jfly.uni-koeln.de/color), chosen here for distinct lightness too
 MEASURED = "#56B4E9"
 SIMULATED = "#111111"
-BASELINE = {"free_space": ("#D55E00", (0, (5, 2))), "two_ray": ("#009E73", (0, (1, 1.5)))}
-OTHER_BASELINES = (("#CC79A7", (0, (6, 2, 1, 2))), ("#0072B2", (0, (8, 3))))
+BASELINE = {
+    "free_space": ("#D55E00", (0, (5, 2))),
+    "two_ray": ("#009E73", (0, (1, 1.5))),
+    "log_distance": ("#CC79A7", (0, (6, 2, 1, 2))),
+    "constant": ("#0072B2", (0, (8, 3))),
+}
+OTHER_BASELINES = (("#E69F00", (0, (6, 2, 1, 2))), ("#7F7F7F", (0, (8, 3))))
 OUT_OF_COVERAGE = "#BBBBBB"
 TOWER = "#C1121F"
 BUILDING = "#8A8A8A"
 FOREST = "#B9D8B0"
 WAYPOINT = "#555555"
 
-BASELINE_TITLE = {"free_space": "free space", "two_ray": "two-ray ground"}
 RANK_MARKER = {0: "x", 1: "o", 2: "s", 3: "^", 4: "D"}
 RANK_HATCH = {1: "", 2: "///", 3: "xx", 4: ".."}
 
@@ -489,11 +493,6 @@ def legend_below(ax: Axes, columns: int = 4) -> None:
     handles, labels = ax.get_legend_handles_labels()
     if handles:
         ax.legend(handles, labels, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=columns, borderaxespad=0.0)
-
-
-def pretty(name: str) -> str:
-    """A baseline's name in words."""
-    return BASELINE_TITLE.get(name, name.replace("_", " "))
 
 
 def baseline_style(name: str, number: int) -> tuple[str, Any]:

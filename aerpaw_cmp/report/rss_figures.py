@@ -28,7 +28,6 @@ from .canvas import (
     legend_below,
     lonely,
     only,
-    pretty,
     robust_limits,
     seconds_since,
     signed,
@@ -40,6 +39,7 @@ from .canvas import (
     used_towers,
 )
 from .data import GEOMETRY, ChannelPair, RankPanel, ReportData, RssPanel, Track, tower_way
+from .words import pretty
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

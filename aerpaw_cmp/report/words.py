@@ -6,16 +6,16 @@ import math
 from collections.abc import Sequence
 
 from ..compare.ladder import LadderRow
+from ..compare.result import BASELINE_TITLE
 from .data import Interval, RankPanel, ReportData, RssPanel
 
-_TITLES = {"free_space": "free space", "two_ray": "two-ray ground"}
 FEW_SAMPLES = 30
 """Below this a panel is called too short for a verdict."""
 
 
 def pretty(name: str) -> str:
     """A baseline's name in words."""
-    return _TITLES.get(name, name.replace("_", " "))
+    return BASELINE_TITLE.get(name, name.replace("_", " "))
 
 
 def count(n: int) -> str:

@@ -3,7 +3,16 @@
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.ladder import Rung, climb, held_out_error_db, ladder_rows, places_of, stretches_of
+from aerpaw_cmp.compare.ladder import (
+    Rung,
+    climb,
+    held_out_error_db,
+    held_out_lines,
+    ladder_rows,
+    log_distance_level_db,
+    places_of,
+    stretches_of,
+)
 
 
 def wave(n, seed, sd=1.0):
@@ -104,3 +113,49 @@ def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     assert ladder.error_db[0][0][level > 0] == pytest.approx(8.0)
     assert len(places_of(np.zeros((3, 2)))) == 3
     assert len(places_of(np.zeros((0, 2)))) == 0
+
+
+def test_lines_without_a_block_are_those_of_polyfit() -> None:
+    rng = np.random.default_rng(3)
+    x, block = rng.normal(size=90) + 25.0, np.repeat(np.arange(3), 30)
+    values = 4.0 - 2.0 * x + rng.normal(size=90)
+    offset, slope = held_out_lines(values, x, block, 3)
+    for b in range(3):
+        assert (slope[b], offset[b]) == pytest.approx(np.polyfit(x[block != b], values[block != b], 1), rel=1e-9)
+    assert held_out_lines(values, np.ones(90), block, 3)[1] == pytest.approx(0.0)  # one distance: no slope to learn
+
+
+def test_a_log_distance_line_finds_its_slope_and_is_never_the_recommended_replay() -> None:
+    """Levels that fall by 35 dB per decade: free space misses the slope, the line has it, and no replay stands for it."""
+    rng = np.random.default_rng(4)
+    position = np.column_stack([np.linspace(50.0, 900.0, 800), np.zeros(800), np.full(800, 40.0)])
+    range_db = 10.0 * np.log10(np.hypot(position[:, 0], 40.0))
+    measured = -20.0 - 3.5 * range_db + rng.normal(0.0, 1.0, 800)
+    zeros = np.zeros(800)
+    ladder = climb(
+        [measured],
+        [np.arange(800.0)],
+        [
+            Rung(model="constant", level_db=(zeros,), seconds=0.0, regressor_db=(zeros,)),
+            Rung(model="line", level_db=(zeros,), seconds=0.0, regressor_db=(range_db,)),
+            Rung(model="free space", level_db=(-2.0 * range_db,), seconds=0.0),
+        ],
+        position_m=[position],
+    )
+    constant, line, free = ladder.rmse_db
+    assert line == pytest.approx(1.0, abs=0.1)
+    assert constant > free > 3.0
+    assert (ladder.best, ladder.best_replay, ladder.recommended) == (1, 2, 2)
+    level = log_distance_level_db(measured, 10.0 ** (range_db / 10.0), position)
+    assert np.std(measured - level) == pytest.approx(1.0, abs=0.1)
+    assert np.polyfit(range_db, level, 1)[0] == pytest.approx(-3.5, abs=0.05)
+
+
+def test_the_slope_of_a_place_does_not_come_from_that_place() -> None:
+    """A jump at one place moves the line of the other places, and not its own."""
+    position = np.column_stack([np.arange(1.0, 801.0), np.zeros(800), np.zeros(800)])
+    measured = -2.0 * 10.0 * np.log10(position[:, 0])
+    bent = measured + np.where(position[:, 0] > 700.0, 1.0 * np.arange(800.0) - 700.0, 0.0)
+    level = log_distance_level_db(bent, position[:, 0], position)
+    last = position[:, 0] > 700.0
+    assert np.polyfit(10.0 * np.log10(position[last, 0]), level[last], 1)[0] == pytest.approx(-2.0, abs=1e-6)

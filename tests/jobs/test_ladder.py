@@ -26,15 +26,15 @@ LW1 = (35.72750947, -78.69595819)
 ORIGIN = "2025-06-01T14:00:00Z"
 
 
-def flight(folder: Path) -> Path:
-    """Eastwards past LW1 at 40 m; the levels are free space plus noise, the flight file asks for coherent ground."""
+def flight(folder: Path, exponent: float = 2.0) -> Path:
+    """Eastwards past LW1 at 40 m; the levels are log-distance plus noise, the flight file asks for coherent ground."""
     t = np.arange(0.0, 121.0)
     east = -500.0 + 8.0 * t
     rows = "\n".join(f"{a:g},{LW1[0] + 5e-4:.9f},{LW1[1] + b / 90_314.0:.9f},40" for a, b in zip(t, east, strict=True))
     (folder / "track.csv").write_text("s,phi,lam,h\n" + rows + "\n", encoding="utf-8")
     at = np.arange(0.0, 120.0, 0.2)
     range_m = np.sqrt((-500.0 + 8.0 * at) ** 2 + 55.0**2 + 30.0**2)
-    level = -30.0 - 20.0 * np.log10(range_m) + np.random.default_rng(1).normal(size=len(at))
+    level = -30.0 - 10.0 * exponent * np.log10(range_m) + np.random.default_rng(1).normal(size=len(at))
     rows = "\n".join(f"{a:.1f},{b:.4f}" for a, b in zip(at, level, strict=True))
     (folder / "rss.csv").write_text("t,level\n" + rows + "\n", encoding="utf-8")
     path = folder / "flight.yaml"
@@ -80,6 +80,23 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert again.rss[0].score.rmse_db == pytest.approx(1.0, abs=0.1)
     as_set = {r.model: r for r in again.ladder}["as set in flight.yaml"]
     assert as_set.rmse_heldout_db == pytest.approx(rows["free space"]["rmse_heldout_db"], abs=1e-6)
+
+
+def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    """Levels that fall by 40 dB per decade: the two-parameter line beats every replay, in report, ladder and words."""
+    metrics = report(flight(tmp_path, 4.0), capsys)
+    rss = metrics["rss"]["LW1"]["A"]
+    error = {name: fit["rmse_db"] for name, fit in rss["baselines"].items()}
+    assert set(error) == {"free_space", "two_ray", "log_distance", "constant"}
+    assert error["log_distance"] == pytest.approx(1.0, abs=0.1)
+    assert min(error["free_space"], error["constant"]) > 2.0
+    assert rss["compared_with"]["log_distance"]["difference_db"] > 1.0
+    rows = {row["model"]: row for row in metrics["ladder"]}
+    assert rows["log-distance line"]["rmse_heldout_db"] == pytest.approx(error["log_distance"], abs=0.2)
+    assert rows["log-distance line"]["difference_to_best_db"] == 0.0
+    assert "line" not in next(name for name, row in rows.items() if row["recommended"])
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "log-distance line" in page[page.index('id="result"') :][:400]
 
 
 def test_learned_antennas_are_scored_on_other_flights_alone(tmp_path: Path) -> None:

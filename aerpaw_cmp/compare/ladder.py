@@ -310,6 +310,11 @@ def log_distance_level_db(
         See :func:`places_of`.
     blocks : int
         Places.
+
+    Returns
+    -------
+    (n,)
+        [dB].
     """
     with np.errstate(divide="ignore", invalid="ignore"):
         x = 10.0 * np.log10(distance_m)

@@ -130,7 +130,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         for name, level in baseline_levels(data.site, series.tower, replayed).items()
     }
     position = _positions(replayed)
-    simple |= fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
+    simple |= _fitted_levels(simple["free_space"], levels.measured_db, geometry["distance_m"], position)
     score = rss.compare_rss(
         series.time,
         levels.measured_db,
@@ -207,7 +207,7 @@ def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, Flo
     return {"free_space": free_space_dbm(*ends)[:, 0], "two_ray": two_ray[:, 0]}
 
 
-def fitted_levels(
+def _fitted_levels(
     free_space_dbm: FloatArray, measured_db: FloatArray, distance_m: FloatArray, position_m: FloatArray
 ) -> dict[str, FloatArray]:
     """Baselines that know no physics, about the mean level of free space (n,) [dBm]: a constant, and log-distance."""

@@ -21,7 +21,6 @@ from ..site.site import Building, Site, Tower
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from .audit import RANK_K, Difference, compare
 from .channel import mean_pair_power, rss_dbm
-from .compiled import ENOUGH_WORK, search_kernels_for
 from .scene import Scene
 from .tracer import Replay, replay
 
@@ -356,8 +355,7 @@ def path_search(
     -------
     dict
         ``seconds_image``, ``seconds_sionna``, ``ratio``, ``paths_image``, ``paths_sionna``, ``missing_paths``,
-        ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions; ``compiled`` says whether
-        the image engine ran compiled code.
+        ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions.
     """
     from . import image, sionna
 
@@ -373,11 +371,10 @@ def path_search(
             max_depth=2,
             usable=scene.usable,
             excluded=scene.excluded,
-            work=ENOUGH_WORK,
         )
         return time.perf_counter() - started
 
-    search()  # compiles, where numba is there, or reads what was compiled: PathSolver's kernels are warm as well
+    search()
     times = [search() for _ in range(repeats)]
     # compiles the kernels
     replay(site, link, _take(some, np.arange(batch)), "sionna", samples=samples, batch=batch, cache_dir="")
@@ -399,7 +396,6 @@ def path_search(
         "batch": batch,
         "faces": len(scene.faces),
         "depth": 2,
-        "compiled": search_kernels_for(ENOUGH_WORK) is not None,
         "versions": sionna.engine_versions(),
     }
 

@@ -7,10 +7,9 @@ tree is conservative; what decides is computed on the items themselves, in float
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from ..common.units import FloatArray
-from .numba_options import OPTIONS
+from .numba_options import kernel
 from .surfaces import BoxTree
 
 DEEPEST = 64
@@ -30,7 +29,7 @@ def box_tree(lower: FloatArray, upper: FloatArray, leaf: int = 4) -> BoxTree:
     return BoxTree(*_build(lower, upper, leaf))
 
 
-@njit(**OPTIONS)
+@kernel
 def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     n = len(lower)
     most = max(1, 2 * n)
@@ -83,7 +82,7 @@ def _build(lower, upper, leaf):  # type: ignore[no-untyped-def]
     )
 
 
-@njit(**OPTIONS)
+@kernel
 def _opened(tree, node, todo, waiting, hits, total):  # type: ignore[no-untyped-def]
     """The children of a node join the nodes that wait, the items of a leaf those found; how many both are then."""
     _, _, child, start, count, items = tree
@@ -96,7 +95,7 @@ def _opened(tree, node, todo, waiting, hits, total):  # type: ignore[no-untyped-
     return waiting, total
 
 
-@njit(**OPTIONS)
+@kernel
 def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf meets the box ``low``, ``high`` (3,), into ``hits``; how many.
 
@@ -130,7 +129,7 @@ def overlapping(tree, low, high, hits):  # type: ignore[no-untyped-def]
     return total
 
 
-@njit(**OPTIONS)
+@kernel
 def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-def]
     """Items whose leaf has a part on the inner side of each of the first ``many`` planes, into ``hits``; how many.
 
@@ -168,7 +167,7 @@ def within_planes(tree, planes, many, reach, hits):  # type: ignore[no-untyped-d
     return total
 
 
-@njit(**OPTIONS)
+@kernel
 def way_over_box(lower, upper, node, reach):  # type: ignore[no-untyped-def]
     """Shortest way [m] from a point to a box of a tree and on to another box; less where only a bound is known.
 
@@ -195,7 +194,7 @@ def way_over_box(lower, upper, node, reach):  # type: ignore[no-untyped-def]
     return np.sqrt(to2) + np.sqrt(on2)
 
 
-@njit(**OPTIONS)
+@kernel
 def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-def]
     """Whether a box lies wholly outside one of the planes.
 
@@ -226,7 +225,7 @@ def box_outside(lower, upper, node, planes, many):  # type: ignore[no-untyped-de
     return False
 
 
-@njit(**OPTIONS)
+@kernel
 def box_missed(lower, upper, node, a, inverse):  # type: ignore[no-untyped-def]
     """Whether the segment from ``a`` with the component-wise ``inverse`` of its direction misses a box.
 

@@ -60,7 +60,6 @@ def channel_matrices(
     *,
     threads: int | None = None,
     work: int | None = None,
-    device: str = "auto",
 ) -> Fields:
     """Channel matrices of a path set.
 
@@ -82,8 +81,6 @@ def channel_matrices(
     work : int, optional
         Element pairs of all links of the replay that this call is a part of; decides whether compiled code is worth
         loading (:mod:`aerpaw_cmp.propagation.compiled`).
-    device : {"auto", "cpu", "cuda"}
-        "cuda" evaluates on a GPU, through the same functions; the others do not.
 
     Returns
     -------
@@ -104,15 +101,13 @@ def channel_matrices(
     _check_patterns([*arrays, link.uav_array])
     pairs = ports * len(link.uav_array)
     size = len(poses) * len(arrays) * pairs if work is None else work
-    if device == "cuda" and (reason := compiled.load("kernels").reason):
-        raise UsageError(f"rt.device: cuda, but {reason}", expected="auto or cpu on this machine")
-    kernels = compiled.load("kernels").kernels if device == "cuda" else compiled.kernels_for(size)
+    kernels = compiled.kernels_for(size)
     if kernels is not None:
         from .compiled_field import evaluate
 
         tables = FaceMaterials.of(faces, link.carrier_hz)
         electric = (tables.permittivity, tables.thickness_m)
-        h, path_power = evaluate(kernels, paths, faces, electric, sources_m, poses, link, loss_db, threads, device)
+        h, path_power = evaluate(kernels, paths, faces, electric, sources_m, poses, link, loss_db, threads)
     else:
         h, path_power = _in_numpy(paths, faces, sources_m, poses, link, loss_db)
     links = paths.pose * len(arrays) + paths.tower

@@ -57,11 +57,6 @@ def kernels_for(work: int) -> ModuleType | None:
     return _chosen("kernels", work)
 
 
-def search_kernels_for(work: int) -> ModuleType | None:
-    """Those of the path search."""
-    return _chosen("search_kernels", work)
-
-
 def beams() -> State:
     """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.growth`), or why it cannot run."""
     if switch() == "never":

@@ -10,7 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
 from ..common.units import AnyArray, ComplexArray, FloatArray, IntArray, wavelength_m
 from ..site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from .arrays import Array, Link, Pattern, Poses
@@ -88,7 +87,6 @@ def evaluate(
     link: Link,
     loss_db: FloatArray | None,
     threads: int | None = None,
-    device: str = "cpu",
 ) -> tuple[ComplexArray, FloatArray]:
     """H (poses, towers, n_rx, n_tx) and the power (paths,) of each path alone.
 
@@ -100,8 +98,6 @@ def evaluate(
     electric : (faces + 1,), (faces + 1,)
         Permittivity and thickness [m] of each face.
     threads : int, optional
-    device : {"cpu", "cuda"}
-        "cuda" where patterns are formulas; links with other patterns are evaluated on the CPU.
 
     Returns
     -------
@@ -109,11 +105,6 @@ def evaluate(
         Coherent sum over paths; zero without a path.
     power : (paths,)
         Mean over element pairs of ``|h|^2`` of each path alone.
-
-    Raises
-    ------
-    UsageError
-        "cuda" without a device.
     """
     arrays = list(link.tower_arrays.values())
     ports, uavs = len(arrays[0]), len(link.uav_array)
@@ -162,24 +153,11 @@ def evaluate(
         given = np.zeros((1, 8, 1)) if ends is None else _given(kernels, known, *ends, *part)
         kernels.fields(*_ordered(kernels, known, *part, given, only_directions=False))
 
-    if not (device == "cuda" and _on_cuda(known, h, power)):
-        in_threads(run, _parts(some.pose), threads)
+    in_threads(run, _parts(some.pose), threads)
     if order is not None:
         power[order] = power.copy()
     shape = (ports, uavs) if link.uav_transmits else (uavs, ports)
     return h.view(np.complex128).reshape(len(poses), len(arrays), *shape), power
-
-
-def _on_cuda(known: dict[str, Any], h: FloatArray, power: FloatArray) -> bool:
-    """Evaluate on a CUDA device; whether it could."""
-    from . import cuda_field
-
-    if reason := cuda_field.available():
-        raise UsageError(f"rt.device: cuda, but {reason}", expected="auto or cpu on this machine")
-    if not cuda_field.can_evaluate(known):
-        return False
-    cuda_field.evaluate(known, h, power)
-    return True
 
 
 def _ordered(

@@ -16,7 +16,7 @@ import shapely
 from shapely.geometry import Polygon
 from shapely.geometry.polygon import orient
 
-from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
+from ..common.units import BoolArray, FloatArray, IntArray
 from ..site.site import Building, Site
 from .paths import Faces
 
@@ -278,57 +278,3 @@ def inside_solids(site: Site, points_m: FloatArray) -> BoolArray:
         if len(low):
             result[low] |= shapely.contains_xy(building.footprint, points_m[low, 0], points_m[low, 1])
     return result
-
-
-def smaller_than_fresnel_zone(
-    faces: Faces,
-    sources_m: FloatArray,
-    targets_m: FloatArray,
-    frequency_hz: float,
-    area_m2: FloatArray | None = None,
-) -> BoolArray:
-    """Faces smaller than the first Fresnel zone of every link: they scatter, they are no mirrors.
-
-    The zone on a face at distances d1 and d2 has the area ``pi lambda d1 d2 / (d1 + d2)`` at least; a face is
-    named only when it is smaller for the nearest source and the nearest target it can have. ``area_m2`` (faces,) is
-    that of faces that do not fill their bounds; left out, it is that of their polygons.
-
-    Parameters
-    ----------
-    faces : Faces
-    sources_m, targets_m : (s, 3), (n, 3)
-        Ends of the links [m].
-    frequency_hz : float
-    area_m2 : (faces,), optional
-        Areas of the faces [m^2].
-
-    Returns
-    -------
-    (faces,) bool
-    """
-    span = faces.upper - faces.lower
-    area = span[:, 0] * span[:, 1]
-    for index, polygon in enumerate(faces.polygon):
-        if polygon is not None:
-            area[index] = polygon.area
-    area = area if area_m2 is None else area_m2
-    near_source = _distance(faces, sources_m)
-    near_target = _distance(faces, targets_m)
-    total = near_source + near_target
-    with np.errstate(invalid="ignore", divide="ignore"):
-        zone = np.pi * wavelength_m(frequency_hz) * near_source * near_target / total
-    return np.asarray(area < np.where(total > 0.0, zone, 0.0))
-
-
-def _distance(faces: Faces, points_m: FloatArray) -> FloatArray:
-    """Distance (faces,) from each face (its bounds) to the nearest of the points."""
-    best = np.full(len(faces), np.inf)
-    for chunk in np.array_split(points_m, max(1, len(points_m) * len(faces) // 1_000_000)):
-        height = faces.normal @ chunk.T - faces.offset_m[:, None]
-        a = faces.along @ chunk.T
-        b = faces.across @ chunk.T
-        out_a = np.maximum(np.maximum(faces.lower[:, :1] - a, a - faces.upper[:, :1]), 0.0)
-        out_b = np.maximum(np.maximum(faces.lower[:, 1:] - b, b - faces.upper[:, 1:]), 0.0)
-        if chunk.size:
-            best = np.minimum(best, np.sqrt(height**2 + out_a**2 + out_b**2).min(axis=1))
-    return best

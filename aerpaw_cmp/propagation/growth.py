@@ -16,7 +16,6 @@ from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
@@ -25,7 +24,7 @@ from .compiled import in_threads, thread_count
 from .effort import Effort, Estimate, OnEstimate
 from .image import MINIMUM_LENGTH_M, merge
 from .merging import WINDOW
-from .numba_options import OPTIONS
+from .numba_options import kernel
 from .paths import PathSet
 from .surfaces import Surfaces
 
@@ -455,7 +454,7 @@ def reflection_points(
 # ---------------------------------------------------------------- compiled
 
 
-@njit(**OPTIONS)
+@kernel
 def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type: ignore[no-untyped-def]
     normal, offset, along, across, _, _, plane, _, _, first, flat = mirrors
     count, depth = sequence.shape
@@ -491,7 +490,7 @@ def _points_of(mirrors, order, start, sequence, sources, targets, edge):  # type
     return vertices, good
 
 
-@njit(**OPTIONS)
+@kernel
 def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset, rules):  # type: ignore[no-untyped-def]
     """Whether a triangle cuts the segment ``a`` - ``b``.
 
@@ -582,7 +581,7 @@ def segment_cut(corners, tree, a, b, before, before_offset, after, after_offset,
     return False
 
 
-@njit(**OPTIONS)
+@kernel
 def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-def]
     free = np.zeros(len(targets), np.bool_)
     none = np.zeros(3)
@@ -591,12 +590,12 @@ def _direct(corners, tree, source, targets, rules):  # type: ignore[no-untyped-d
     return free
 
 
-@njit(**OPTIONS)
+@kernel
 def _height(normal, offset, f, p):  # type: ignore[no-untyped-def]
     return normal[f, 0] * p[0] + normal[f, 1] * p[1] + normal[f, 2] * p[2] - offset[f]
 
 
-@njit(**OPTIONS)
+@kernel
 def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-def]
     """Which faces may come first (faces,), and how many of the others are hidden by one convex face."""
     normal, offset, _, _, _, _, _, front_only, usable, _, _ = mirrors
@@ -616,7 +615,7 @@ def _first_faces(mirrors, face_tree, source, rules):  # type: ignore[no-untyped-
     return good, hidden
 
 
-@njit(**OPTIONS)
+@kernel
 def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore[no-untyped-def]
     """Whether one convex face lies between the source and every corner of the outline of face ``f``."""
     _, _, _, _, window, convex, plane, _, _, _, _ = mirrors
@@ -648,7 +647,7 @@ def _wholly_hidden(mirrors, face_tree, source, f, rules, stack):  # type: ignore
     return False
 
 
-@njit(**OPTIONS)
+@kernel
 def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     """Whether the convex face ``g`` cuts the lines from the source to all corners of the outline of ``f``.
 
@@ -676,7 +675,7 @@ def _hides(mirrors, source, f, g, rules):  # type: ignore[no-untyped-def]
     return True
 
 
-@njit(**OPTIONS)
+@kernel
 def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def]
     """Whether a point lies in a convex outline, which runs counter-clockwise round ``normal``, by a margin."""
     for k in range(WINDOW):
@@ -692,7 +691,7 @@ def _well_inside(outline, normal, point, margin):  # type: ignore[no-untyped-def
     return True
 
 
-@njit(**OPTIONS)
+@kernel
 def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     """Side planes of the beam from ``apex`` through an outline, added behind the first ``count``; how many then."""
     m0 = m1 = m2 = 0.0
@@ -721,7 +720,7 @@ def _side_planes(planes, count, apex, outline):  # type: ignore[no-untyped-def]
     return count
 
 
-@njit(**OPTIONS)
+@kernel
 def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     """Whether one plane has the whole outline outside."""
     for p in range(many):
@@ -736,7 +735,7 @@ def _none_within(outline, planes, many):  # type: ignore[no-untyped-def]
     return False
 
 
-@njit(**OPTIONS)
+@kernel
 def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped-def]
     """Whether a point of the plane of face ``f`` lies in one of its triangles."""
     a = along[f, 0] * p[0] + along[f, 1] * p[1] + along[f, 2] * p[2]
@@ -757,7 +756,7 @@ def _in_face(first, flat, along, across, f, p, edge):  # type: ignore[no-untyped
     return False
 
 
-@njit(**OPTIONS)
+@kernel
 def _follow(mirrors, face_tree, corners, tree, targets, target_tree, longest, source, firsts, rules):  # type: ignore[no-untyped-def]
     """All paths whose first face is one of ``firsts``: a walk, depth first, along beams.
 

@@ -15,14 +15,13 @@ lands.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass, replace
+from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray, IntArray
-from . import compiled
 from .faces import corners, inside
 from .paths import Faces, PathSet
 from .solids import Occlusion
@@ -35,12 +34,6 @@ MINIMUM_LENGTH_M = 0.01
 
 SEQUENCE_BUDGET = 200_000
 """Face sequences per tower beyond which the ``image`` engine gives up."""
-
-SEQUENCES_AT_ONCE = 100_000
-"""Sequences of several towers that are held at once."""
-
-TESTS_PER_PAIR = 20
-"""A sequence tried for a pose costs NumPy this part of what the field of an element pair of a link does."""
 
 CELLS_PER_CHUNK = 1_000_000
 """Bounds the memory of every dense step (8 MB per array)."""
@@ -64,8 +57,6 @@ def find_paths(
     excluded: BoolArray | None = None,
     budget: int = SEQUENCE_BUDGET,
     extent_m: FloatArray | None = None,
-    work: int = 0,
-    threads: int | None = None,
     progress: Progress | None = None,
 ) -> PathSet:
     """All paths with at most ``max_depth`` reflections.
@@ -87,11 +78,6 @@ def find_paths(
         Largest number of sequences followed per tower.
     extent_m : (points, 3), optional
         Points that set the tolerance in place of the targets: those of the whole, where the targets are a part.
-    work : int
-        Element pairs of all links of the replay that this search is a part of, besides its own work; decides whether
-        compiled code is worth loading (:mod:`aerpaw_cmp.propagation.compiled`). The paths are the same.
-    threads : int, optional
-        Of compiled code.
     progress : callable, optional
         Called with the share done.
 
@@ -125,35 +111,14 @@ def find_paths(
         ends = _Ends.of(faces, targets_m, alive[tower], tolerance_m) if few else shared
         return Sequences.of(faces, box, facing, sources_m[tower], ends, usable_faces, max_depth, budget, tolerance_m)
 
-    pieces_of_towers: list[PathSet] = []
-    in_order = False
-    for group, levels in _groups(sequences, len(sources_m)):
-        tests = sum(
-            int(alive[t].sum()) * sum(len(x.faces) for x in tree) for t, tree in zip(group, levels, strict=True)
-        )
-        compiled_code = compiled.search_kernels_for(work + tests // TESTS_PER_PAIR)
-        if compiled_code is not None:
-            from .compiled_search import find
-
-            plain = [[(level.faces, level.images_m) for level in tree] for tree in levels]
-            some = np.array(group)
-            pieces = find(
-                compiled_code, faces, plain, sources_m[some], targets_m, alive[some], max_depth, hiding, threads
-            )
-            in_order = len(group) == len(sources_m)
-            pieces_of_towers += (
-                pieces if in_order else [replace(piece, tower=piece.tower + group[0]) for piece in pieces]
-            )
-        else:
-            for tower, tree in zip(group, levels, strict=True):
-                poses, source = np.flatnonzero(alive[tower]), sources_m[tower]
-                for level in tree:
-                    pieces_of_towers.append(
-                        _paths_of_level(faces, level, source, targets_m, poses, tower, max_depth, hiding)
-                    )
+    pieces: list[PathSet] = []
+    for tower, source in enumerate(sources_m):
+        links = np.flatnonzero(alive[tower])
+        for level in sequences(tower):
+            pieces.append(_paths_of_level(faces, level, source, targets_m, links, tower, max_depth, hiding))
         if progress:
-            progress((group[-1] + 1) / len(sources_m))
-    return merge(pieces_of_towers, max_depth, faces, in_order=in_order)
+            progress((tower + 1) / len(sources_m))
+    return merge(pieces, max_depth, faces)
 
 
 def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | None) -> BoolArray:
@@ -165,17 +130,6 @@ def _alive(sources_m: FloatArray, targets_m: FloatArray, excluded: BoolArray | N
             gap2 = np.einsum("ij,ij->i", apart, apart)
             alive[tower] = (gap2 >= MINIMUM_LENGTH_M**2) & (gap2 < np.inf)
     return np.asarray(alive if excluded is None else alive & ~excluded)
-
-
-def _groups(sequences: Callable[[int], list[Sequences]], towers: int) -> Iterator[tuple[range, list[list[Sequences]]]]:
-    """Towers that are searched at once, with their sequences: as many as memory bears."""
-    first, levels, total = 0, [], 0
-    for tower in range(towers):
-        levels.append(sequences(tower))
-        total += sum(len(level.faces) for level in levels[-1])
-        if total > SEQUENCES_AT_ONCE or tower == towers - 1:
-            yield range(first, tower + 1), levels
-            first, levels, total = tower + 1, [], 0
 
 
 def scene_tolerance_m(faces: Faces, *points_m: FloatArray) -> float:
@@ -552,13 +506,7 @@ def _pad(pose: IntArray, tower: int, sequence: IntArray, vertices: FloatArray, m
     return PathSet(pose, np.full(count, tower), np.full(count, depth), faces, points)
 
 
-def merge(
-    pieces: list[PathSet],
-    max_depth: int,
-    faces: Faces | None,
-    *,
-    in_order: bool = False,
-) -> PathSet:
+def merge(pieces: list[PathSet], max_depth: int, faces: Faces | None) -> PathSet:
     """One sorted set of several.
 
     Parameters
@@ -568,8 +516,6 @@ def merge(
         Of the set where there is no path at all.
     faces : Faces or None
         Where given, of paths over coplanar faces that overlap only one is kept.
-    in_order : bool
-        The pieces, one after another, are sorted.
 
     Returns
     -------
@@ -579,15 +525,11 @@ def merge(
     pieces = [piece for piece in pieces if len(piece)]
     if not pieces:
         return PathSet.empty(max_depth)
-    whole = PathSet.one_after_another(pieces)  # by one thread: several would wait for each other's fresh pages
-    order = np.arange(len(whole)) if in_order else _order(whole)
-    kept = len(whole)
+    whole = PathSet.one_after_another(pieces)
+    order = _order(whole)
     if faces is not None:
-        repeated = _repeated(whole, order, faces)
-        if repeated.any():
-            order = order[~repeated[order]]
-            kept = len(order)
-    same = kept == len(whole) and (in_order or bool((np.diff(order) == 1).all()))
+        order = order[~_repeated(whole, order, faces)[order]]
+    same = len(order) == len(whole) and bool((np.diff(order) == 1).all())
     return whole if same else whole.select(order)
 
 

@@ -9,9 +9,6 @@ the UAV element, ``B_i = M_d .. M_i`` and ``n_i`` the normals, reflection ``i`` 
 and the tower's frame becomes ``M_1 .. M_d`` seen from its device axes, so that normals and frames are constants of a
 path and only ``k`` is one of a pair. Each path is evaluated alone and added in the order of the path set: results do
 not depend on chunks and threads, to the last bit.
-
-Scalar functions are leaves (they call :mod:`math` only): :mod:`aerpaw_cmp.propagation.cuda` compiles the same ones for
-a GPU.
 """
 
 from __future__ import annotations
@@ -20,11 +17,10 @@ import inspect
 import math
 
 import numpy as np
-from numba import njit
 
 from ..common.units import FloatArray, IntArray
 from ..site.antennas import HALF_WAVE_DIPOLE_GAIN
-from .numba_options import OPTIONS
+from .numba_options import kernel
 
 LANES = 64
 """Element pairs of a path evaluated at once; a power of two, so that rows of the workspace cannot overlap."""
@@ -37,7 +33,7 @@ _TWO_PI = 2.0 * math.pi
 _DIPOLE = math.sqrt(HALF_WAVE_DIPOLE_GAIN)
 
 
-@njit(**OPTIONS)
+@kernel
 def turn_sine_cosine(turns: float) -> tuple[float, float]:
     """Sine and cosine of an angle in turns, -1/2 to 1/2, within 1 ulp (minimax polynomials of fdlibm)."""
     quarter = (4.0 * turns + _ROUND) - _ROUND
@@ -82,7 +78,7 @@ def turn_sine_cosine(turns: float) -> tuple[float, float]:
     )
 
 
-@njit(**OPTIONS)
+@kernel
 def fresnel(cosine: float, eta_re: float, eta_im: float) -> tuple[float, float, float, float, float, float]:
     """TE and TM coefficients of a half-space and the root ``sqrt(eta - sin^2 theta)``: three complex numbers.
 
@@ -107,7 +103,7 @@ def fresnel(cosine: float, eta_re: float, eta_im: float) -> tuple[float, float, 
     return te_re, te_im, tm_re, tm_im, root_re, root_im
 
 
-@njit(**OPTIONS)
+@kernel
 def slab(r_re: float, r_im: float, echo_re: float, echo_im: float) -> tuple[float, float]:
     """Coefficient of a slab from that of its first face: ``r (1 - e) / (1 - r^2 e)``.
 
@@ -132,7 +128,7 @@ def slab(r_re: float, r_im: float, echo_re: float, echo_im: float) -> tuple[floa
     return (n_re * d_re + n_im * d_im) * scale, (n_im * d_re - n_re * d_im) * scale
 
 
-@njit(**OPTIONS)
+@kernel
 def element_amplitude(kind: int, x: float, y: float, z: float) -> float:
     """E_theta of the patterns that are real formulas; ``x, y, z`` is the unit direction in the device frame.
 
@@ -162,7 +158,7 @@ def element_amplitude(kind: int, x: float, y: float, z: float) -> float:
     return float(10.0 ** ((8.0 - min(down, 30.0)) / 20.0))
 
 
-@njit(**OPTIONS)
+@kernel
 def grid_value(layer: FloatArray, row: float, column: float) -> float:
     """Cubic B-spline with coefficients ``layer``, periodic in both directions, at a place in samples."""
     rows, columns = layer.shape
@@ -188,7 +184,7 @@ def grid_value(layer: FloatArray, row: float, column: float) -> float:
     return total
 
 
-@njit(**OPTIONS)
+@kernel
 def unfold(
     normal: FloatArray,
     offset_m: FloatArray,
@@ -253,7 +249,7 @@ _TE, _TM, _ROOT, _SIZE = 30, 32, 34, 36
 ROWS = 37
 
 
-@njit(**OPTIONS)
+@kernel
 def directions(
     pairs: int,
     first: int,
@@ -308,7 +304,7 @@ def directions(
         w[(_UAV + 2) * LANES + p] = -(t20 * x + t21 * y + t22 * z)
 
 
-@njit(**OPTIONS)
+@kernel
 def patterns(
     pairs: int,
     first: int,
@@ -370,7 +366,7 @@ def patterns(
                 w[out * LANES + p] = max(w[out * LANES + p], 0.0)
 
 
-@njit(**OPTIONS)
+@kernel
 def radiate(
     pairs: int, first: int, at: int, field: int, out: int, real: bool, slants: FloatArray, m: FloatArray, w: FloatArray
 ) -> None:
@@ -424,7 +420,7 @@ def radiate(
             w[k + 2 * LANES + p] = w[(_ROOT + 1) * LANES + p]
 
 
-@njit(**OPTIONS)
+@kernel
 def reflect(pairs: int, normal: FloatArray, eta_re: float, eta_im: float, thickness: float, w: FloatArray) -> None:
     """The wave after one reflection; ``thickness`` in wavelengths, infinite for a half-space.
 
@@ -478,7 +474,7 @@ def reflect(pairs: int, normal: FloatArray, eta_re: float, eta_im: float, thickn
         w[(_WAVE + 5) * LANES + p] = c_im * s2 - (tm_re * b2 + tm_im * a2)
 
 
-@njit(**OPTIONS)
+@kernel
 def receive(pairs: int, wavelength: float, w: FloatArray) -> None:
     """Complex amplitude of each pair, to rows ``_TE``: pattern, spreading and carrier phase."""
     for p in range(pairs):
@@ -495,7 +491,7 @@ def receive(pairs: int, wavelength: float, w: FloatArray) -> None:
         w[(_TE + 1) * LANES + p] = amplitude * (im * cosine - re * sine)
 
 
-@njit(**OPTIONS)
+@kernel
 def fields(
     start: int,
     stop: int,

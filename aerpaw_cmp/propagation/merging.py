@@ -7,13 +7,12 @@ or overlap in one plane, of whatever shape, share that plane, so that a reflecti
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 
 from ..common.errors import InputError
 from ..common.units import BoolArray, FloatArray, IntArray
 from ..site.mitsuba import TriangleScene
 from .boxtree import box_tree, overlapping
-from .numba_options import OPTIONS
+from .numba_options import kernel
 from .paths import Faces
 from .surfaces import Surfaces
 
@@ -156,7 +155,7 @@ def _grown(
     return face, leader
 
 
-@njit(**OPTIONS)
+@kernel
 def _grow(order, corners, normal, offset, edges, triangle_of, start, merge_m):  # type: ignore[no-untyped-def]
     face = np.full(len(corners), -1, np.int64)
     leader = np.empty(len(corners), np.int64)
@@ -184,7 +183,7 @@ def _grow(order, corners, normal, offset, edges, triangle_of, start, merge_m):  
     return face, leader[:count].copy()
 
 
-@njit(**OPTIONS)
+@kernel
 def _lies_in(corners, triangle, normal, offset, merge_m):  # type: ignore[no-untyped-def]
     for k in range(3):
         p = corners[triangle, k]
@@ -193,7 +192,7 @@ def _lies_in(corners, triangle, normal, offset, merge_m):  # type: ignore[no-unt
     return True
 
 
-@njit(**OPTIONS)
+@kernel
 def _shared_planes(tree, corners, first, normal, offset, area, low, high, merge_m):  # type: ignore[no-untyped-def]
     """Face whose plane each face takes: that of a larger one that it touches and lies in, or its own."""
     plane = np.arange(len(normal))
@@ -229,7 +228,7 @@ def _windows(
     return np.ascontiguousarray(window), convex
 
 
-@njit(**OPTIONS)
+@kernel
 def _outlines(flat, first, area):  # type: ignore[no-untyped-def]
     outline = np.empty((len(first) - 1, WINDOW, 2))
     convex = np.zeros(len(first) - 1, np.bool_)
@@ -249,7 +248,7 @@ def _outlines(flat, first, area):  # type: ignore[no-untyped-def]
     return outline, convex
 
 
-@njit(**OPTIONS)
+@kernel
 def _hull(points):  # type: ignore[no-untyped-def]
     """Convex hull, counter-clockwise, without corners that turn by less than 0.1 um (Andrew, 1979)."""
     order = np.argsort(points[:, 1])
@@ -273,7 +272,7 @@ def _hull(points):  # type: ignore[no-untyped-def]
     return hull[:k].copy()
 
 
-@njit(**OPTIONS)
+@kernel
 def _rectangle(points, hull):  # type: ignore[no-untyped-def]
     """Rectangle along the longest side of the hull, round all points."""
     best, axis = -1.0, np.array([1.0, 0.0])

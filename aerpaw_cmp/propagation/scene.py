@@ -32,7 +32,6 @@ class Settings:
     batch: int = 50
     variant: str | None = None
     threads: int | None = None
-    device: str = "auto"
     power_cut_db: float | None = None
 
 

@@ -6,7 +6,7 @@ import os
 import time
 import warnings
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from importlib.util import find_spec
 from pathlib import Path
@@ -21,10 +21,10 @@ from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
 from .channel import Fields, channel_matrices, mean_pair_power, rss_dbm
-from .compiled import ENOUGH_WORK, beams, switch, warn_once
+from .compiled import beams, switch, warn_once
 from .crowns import Crowns
 from .effort import Estimate, OnEstimate
-from .faces import inside_solids, smaller_than_fresnel_zone
+from .faces import inside_solids
 from .interactions import (
     SCATTERING_SAMPLES,
     OtherInteractions,
@@ -168,9 +168,7 @@ def replay(
     crowns: Crowns | None = None,
     cache_dir: str | Path | None = None,
     relevance_db: float | None = None,
-    drop_small_faces: bool = False,
     visibility: Visibility = "centre",
-    variant: str | None = None,
     threads: int | None = None,
     device: Device = "auto",
     whole: Whole | None = None,
@@ -209,20 +207,15 @@ def replay(
         ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
     relevance_db : float, optional
         Say in ``left_out`` which buildings move no RSS by more than this (:mod:`aerpaw_cmp.propagation.relevance`).
-    drop_small_faces : bool
-        Leave out faces smaller than the first Fresnel zone of every link.
     visibility : {"centre", "pairs"}
         Whether all element pairs have the paths of the array centres, or each its own (``image`` only; as many
         searches as a link has element pairs). ``paths`` are those of the centres in any case.
-    variant : {"cuda", "llvm"}, optional
-        ``sionna`` only.
     threads : int, optional
         Of compiled code (default: the cores this process may use); results do not depend on it.
     device : {"auto", "cpu", "cuda"}
-        Of Sionna's search, unless ``variant`` says it ("auto": a GPU where Dr.Jit finds one), and of the field ("cuda"
-        alone evaluates it on a GPU).
+        Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
     whole : Whole, optional
-        What the poses are a part of; see :func:`replay_parts`.
+        What the poses are a part of.
     interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
         ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
         (:mod:`aerpaw_cmp.propagation.interactions`).
@@ -277,17 +270,14 @@ def replay(
         scene = replace(scene, extent_m=whole.extent_m, pairs=whole.pairs)
     if only is not None:
         scene = replace(scene, excluded=scene.excluded | ~only)
-    scene, left_out = _without_small_faces(scene, link, poses) if drop_small_faces else (scene, [])
-    left_out += [*refused, *_buried_towers(site, link)]
-    variant = variant or {"cpu": "llvm", "cuda": "cuda"}.get(device)
+    left_out = [*refused, *_buried_towers(site, link)]
     settings = Settings(
         engine=engine,
         max_depth=max_depth,
         samples=0 if samples == "auto" else samples,
         batch=batch,
-        variant=variant,
+        variant={"cpu": "llvm", "cuda": "cuda"}.get(device),
         threads=threads,
-        device=device,
         power_cut_db=power_cut_db,
     )
     choice = None
@@ -318,8 +308,7 @@ def replay(
     if others is not None:
         result = _with_others(result, link, tuple(interactions), *others)
     if visibility == "pairs":
-        small = drop_small_faces
-        result = _by_pairs(site, link, poses, result, settings, loss, crowns, None if not small else scene.usable, only)
+        result = _by_pairs(site, link, poses, result, settings, loss, crowns, only)
     return replace(
         result,
         seconds=time.perf_counter() - started,
@@ -347,61 +336,6 @@ class Whole:
     pairs: int
 
 
-POSES_PER_PART = 2048
-"""Poses replayed at once by :func:`replay_parts`: some 15 MB for five towers with 4 x 4 elements."""
-
-
-def replay_parts(
-    site: Site,
-    link: Link,
-    poses: Poses | Iterable[Poses],
-    engine: Engine = "image",
-    *,
-    extent_m: FloatArray | None = None,
-    poses_per_part: int = POSES_PER_PART,
-    **options: Any,
-) -> Iterator[Replay]:
-    """Replay a flight part by part, in the memory of one part.
-
-    Parameters
-    ----------
-    site, link, engine
-        As for :func:`replay`.
-    poses : Poses or iterable of Poses
-        Of the whole flight, or in parts that are made as they are asked for.
-    extent_m : (points, 3), optional
-        Points that span all poses; needed where ``poses`` comes in parts.
-    poses_per_part : int
-        Where it comes in one piece.
-    **options
-        Of :func:`replay`.
-
-    Yields
-    ------
-    Replay
-        Of each part; together bit by bit what :func:`replay` gives for all poses at once.
-
-    Raises
-    ------
-    UsageError
-        Parts without ``extent_m``; what :func:`replay` raises.
-    """
-    if isinstance(poses, Poses):
-        known, _ = _within_reach(site, poses)
-        good = known.position_m[np.isfinite(known.position_m).all(axis=1)]
-        extent = np.stack([good.min(axis=0), good.max(axis=0)]) if len(good) else np.zeros((0, 3))
-        whole = Whole(extent, _pairs(link, poses))
-        starts = range(0, len(poses), poses_per_part)
-        runs = (slice(start, start + poses_per_part) for start in starts)
-        parts: Iterable[Poses] = (Poses(poses.position_m[run], poses.rotation[run]) for run in runs)
-    elif extent_m is None:
-        raise UsageError("poses in parts without extent_m", expected="points that span all of them")
-    else:
-        whole, parts = Whole(np.asarray(extent_m, dtype=np.float64), ENOUGH_WORK), poses
-    for part in parts:
-        yield replay(site, link, part, engine, whole=whole, **options)
-
-
 LEVELS_AT_ONCE = 1024
 """Poses of which levels are made at once."""
 
@@ -410,9 +344,6 @@ LONG_SEARCH_S = 60.0
 
 MANY_FACES = 400
 """Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
-
-MOST_NAMED = 50
-"""Small faces that are named one by one; more are counted."""
 
 PAIRS_DIFFER = 1e-9
 """Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
@@ -426,7 +357,6 @@ def _by_pairs(
     settings: Settings,
     loss: Loss | None,
     crowns: Crowns | None,
-    usable: BoolArray | None,
     only: BoolArray | None,
 ) -> Replay:
     """Each element pair with its own paths: every tower element is a source, every UAV element a pose."""
@@ -445,7 +375,7 @@ def _by_pairs(
     several = replace(
         scene,
         sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
-        usable=np.repeat(scene.usable if usable is None else usable[:, : len(scene.faces)], ports, axis=0),
+        usable=np.repeat(scene.usable, ports, axis=0),
         excluded=np.repeat(scene.excluded if only is None else scene.excluded | ~only, ports, axis=0),
     )
     for element in range(len(uav)):
@@ -563,17 +493,6 @@ def _buried_towers(site: Site, link: Link) -> list[str]:
             if inside_solids(replace(site, buildings=(building,)), places[number : number + 1]).any():
                 lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
     return lines
-
-
-def _without_small_faces(scene: Scene, link: Link, poses: Poses) -> tuple[Scene, list[str]]:
-    """Scene without the mirrors that are too small to be any; they still hide what lies behind them."""
-    good = np.isfinite(poses.position_m).all(axis=1)
-    area = None if scene.surfaces is None else scene.surfaces.area_m2
-    small = smaller_than_fresnel_zone(scene.faces, scene.sources_m, poses.position_m[good], link.carrier_hz, area)
-    left_out = [f"{scene.faces.label[i]}: smaller than the first Fresnel zone" for i in np.flatnonzero(small)]
-    if len(left_out) > MOST_NAMED:
-        left_out = [f"{len(left_out)} faces smaller than the first Fresnel zone, such as {left_out[0].split(':')[0]}"]
-    return replace(scene, usable=scene.usable & ~small), left_out
 
 
 def _search_or_read(
@@ -714,8 +633,6 @@ def _by_engine(
             usable=scene.usable,
             excluded=scene.excluded,
             extent_m=scene.extent_m,
-            work=scene.pairs or _pairs(link, poses),
-            threads=settings.threads,
             progress=progress,
         )
     from . import sionna
@@ -834,11 +751,6 @@ def _with_others(
     )
 
 
-def _pairs(link: Link, poses: Poses) -> int:
-    """Element pairs of all links."""
-    return len(poses) * sum(len(array) for array in link.tower_arrays.values()) * len(link.uav_array)
-
-
 def _cache(engine: str, cache_dir: str | Path | None) -> PathCache | None:
     if cache_dir is None:
         if engine != "sionna":
@@ -904,7 +816,6 @@ def _evaluate(
         loss_db,
         threads=settings.threads,
         work=work,
-        device=settings.device,
     )
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     if loss_db is None:

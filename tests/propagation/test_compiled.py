@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
 import dataclasses
 import importlib.util
 import json
+import re
+import shutil
 import subprocess
 import sys
 import types
@@ -19,12 +22,12 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import channel, compiled, compiled_field, compiled_search, image, tracer
+from aerpaw_cmp.propagation import channel, compiled, compiled_field, image, prisms, tracer
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay, replay_parts
+from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.mitsuba import TriangleScene
@@ -207,13 +210,11 @@ def same_paths(one, two):
     np.testing.assert_allclose(one.vertices_m, two.vertices_m, rtol=0, atol=1e-9)
 
 
-def searched(monkeypatch, faces, sources, targets, **options):
-    monkeypatch.setenv(compiled.SWITCH, "never")
-    numpy = image.find_paths(faces, sources, targets, **options)
-    monkeypatch.setenv(compiled.SWITCH, "always")
-    ours = image.find_paths(faces, sources, targets, **options, threads=2)
-    same_paths(numpy, ours)
-    return ours
+def searched(faces, sources, targets, **options):
+    mirrors = image.find_paths(faces, sources, targets, **options)
+    beams, _ = prisms.find_paths(faces, sources, targets, **options, threads=2)
+    same_paths(mirrors, beams)
+    return beams
 
 
 def whole_metres(rng, buildings):
@@ -231,58 +232,45 @@ def whole_metres(rng, buildings):
 
 @needs_numba
 @pytest.mark.parametrize("seed", range(6))
-def test_the_same_paths_among_aligned_and_touching_buildings(monkeypatch, scenes, seed):
+def test_the_same_paths_among_aligned_and_touching_buildings(scenes, seed):
     rng = np.random.default_rng(seed)
     faces = site_faces(scenes.site(whole_metres(rng, 7)))
     targets = rng.integers(-8, 9, (120, 3)).astype(float)
     targets[:, 2] = np.abs(targets[:, 2]) // 2
     targets[5] = np.nan
     sources = np.array([[0.0, 0.0, 5.0], [-7.0, 3.0, 2.0], [8.0, 8.0, 1.0]])
-    found = searched(monkeypatch, faces, sources, targets, max_depth=2)
+    found = searched(faces, sources, targets, max_depth=2)
     assert len(found) > 100
 
 
 @needs_numba
 @pytest.mark.parametrize("max_depth", [0, 1, 3])
-def test_the_same_paths_at_any_depth_and_with_links_left_out(monkeypatch, case, max_depth):
+def test_the_same_paths_at_any_depth_and_with_links_left_out(case, max_depth):
     site, link, poses, _ = case
     scene = Scene.of(site, link, poses)
     usable = scene.usable.copy()
     usable[1, ::3] = False
     excluded = scene.excluded.copy()
     excluded[0, ::4] = True
-    monkeypatch.setattr(compiled_search, "POSES_PER_CHUNK", 13)
     found = searched(
-        monkeypatch, scene.faces, scene.sources_m, poses.position_m[:40],
+        scene.faces, scene.sources_m, poses.position_m[:40],
         max_depth=max_depth, usable=usable, excluded=excluded[:, :40],
     )  # fmt: skip
     assert found.depth.max() == min(max_depth, 2) or max_depth == 3
 
 
 @needs_numba
-def test_towers_searched_one_by_one_give_the_same_set(monkeypatch, case):
-    site, link, poses, paths = case
-    scene = Scene.of(site, link, poses)
-    monkeypatch.setattr(image, "SEQUENCES_AT_ONCE", 1)
-    found = searched(
-        monkeypatch, scene.faces, scene.sources_m, poses.position_m, usable=scene.usable, excluded=scene.excluded
-    )
-    same_paths(found, paths)
-
-
-@needs_numba
-def test_nothing_to_search(monkeypatch, scenes):
+def test_nothing_to_search(scenes):
     faces = site_faces(scenes.site())
-    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.zeros((0, 3))))
-    assert not len(searched(monkeypatch, faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
+    assert not len(searched(faces, np.array([[0.0, 0, 10]]), np.zeros((0, 3))))
+    assert not len(searched(faces, np.array([[0.0, 0, 10]]), np.full((3, 3), np.nan)))
 
 
 @pytest.mark.parametrize("mode", ["never", pytest.param("always", marks=needs_numba)])
 def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, mode):
     """Search, joining of its pieces, field and levels, below the noise floor too."""
     monkeypatch.setenv(compiled.SWITCH, mode)
-    for module, name in ((compiled_field, "PATHS_PER_CHUNK"), (compiled_search, "POSES_PER_CHUNK")):
-        monkeypatch.setattr(module, name, 7)
+    monkeypatch.setattr(compiled_field, "PATHS_PER_CHUNK", 7)
     monkeypatch.setattr(tracer, "LEVELS_AT_ONCE", 7)
     site, link, poses, _ = case
     link = dataclasses.replace(link, noise_floor_dbm=-58.0)
@@ -294,61 +282,6 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, 
         np.testing.assert_array_equal(getattr(one, name), getattr(three, name))
     for name in ("pose", "tower", "depth", "faces", "vertices_m", "tree"):
         np.testing.assert_array_equal(getattr(one.paths, name), getattr(three.paths, name))
-
-
-@pytest.mark.parametrize("mode", ["never", pytest.param("always", marks=needs_numba)])
-def test_parts_are_the_whole_bit_by_bit(monkeypatch, case, mode):
-    monkeypatch.setenv(compiled.SWITCH, mode)
-    site, link, poses, _ = case
-    position = poses.position_m.copy()
-    position[3], position[30] = np.nan, 1e9  # unknown, and no pose of the site
-    poses = Poses(position, poses.rotation)
-    whole = replay(site, link, poses)
-    parts = list(replay_parts(site, link, poses, poses_per_part=17))
-    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
-        np.testing.assert_array_equal(np.concatenate([getattr(p, name) for p in parts]), getattr(whole, name))
-    assert sum(len(part.paths) for part in parts) == len(whole.paths)
-    made = (Poses(poses.position_m[i : i + 20], poses.rotation[i : i + 20]) for i in range(0, len(poses), 20))
-    streamed = list(replay_parts(site, link, made, extent_m=np.array([[-300.0, -300, 0], [300, 300, 60]])))
-    np.testing.assert_allclose(np.concatenate([p.h for p in streamed]), whole.h, rtol=0, atol=1e-14)
-    with pytest.raises(UsageError, match="without extent_m"):
-        next(replay_parts(site, link, iter([poses])))
-
-
-# ---------------------------------------------------------------- CUDA
-
-
-@needs_numba
-def test_cuda_kernel_in_the_simulator_equals_numpy():
-    """Not a GPU: the same source, run thread by thread in Python."""
-    script = Path(__file__).with_name("cuda_simulated.py")
-    said = subprocess.run([sys.executable, str(script)], capture_output=True, text=True, timeout=120)
-    assert said.returncode == 0, said.stderr
-    found = json.loads(said.stdout)
-    assert found["depths"] == [0, 1, 2]
-    assert found["h"] < 1e-11
-    assert found["power"] < 1e-12
-
-
-@needs_numba
-def test_cuda_on_a_gpu(monkeypatch, case):
-    from aerpaw_cmp.propagation import cuda_field
-
-    if reason := cuda_field.available():
-        pytest.skip(reason)
-    link = with_patterns(case[1], PATTERNS["tr38901"])
-    numpy, ours, scene = both(monkeypatch, case, link, device="cuda")
-    assert np.abs(ours.h - numpy.h).max() < bound(case, link, scene, gain=10.0)
-
-
-@needs_numba
-def test_cuda_without_a_device_is_one_message(monkeypatch, case):
-    from aerpaw_cmp.propagation import cuda_field
-
-    monkeypatch.setattr(cuda_field, "available", lambda: "numba finds no CUDA device")
-    site, link, poses, _ = case
-    with pytest.raises(UsageError, match=r"rt\.device: cuda, but numba finds no CUDA device"):
-        replay(site, link, poses, device="cuda")
 
 
 # ---------------------------------------------------------------- choosing and doing without
@@ -383,10 +316,9 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
         raise error
 
     monkeypatch.setattr(compiled, "find_spec", lambda _: True)
-    for name in ("kernels", "search_kernels"):
-        module = types.ModuleType(name)
-        module.try_out = broken
-        monkeypatch.setitem(sys.modules, f"aerpaw_cmp.propagation.{name}", module)
+    module = types.ModuleType("kernels")
+    module.try_out = broken
+    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.kernels", module)
     monkeypatch.setattr(compiled, "ENOUGH_WORK", 1)
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     site, link, poses, paths = case
@@ -398,29 +330,66 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
         replay(site, link, poses)
 
 
+DIPOLE_GAIN = (
+    "from aerpaw_cmp.propagation import kernels; print(kernels.element_amplitude(kernels.DIPOLE, 1.0, 0.0, 0.0))"
+)
+
+
 @needs_numba
-def test_without_a_folder_to_write_nothing_is_kept(monkeypatch):
-    from aerpaw_cmp.propagation import numba_options
+def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(tmp_path):
+    """numba alone would go on with what it compiled before: its cache knows the file of the kernel."""
+    package = Path(compiled.__file__).parents[1]
+    shutil.copytree(package, tmp_path / "aerpaw_cmp", ignore=shutil.ignore_patterns("__pycache__"))
 
-    def read_only(*args, **kwargs):
-        raise OSError(30, "Read-only file system")
+    def amplitude():
+        said = subprocess.run([sys.executable, "-c", DIPOLE_GAIN], cwd=tmp_path, capture_output=True, text=True)
+        assert said.returncode == 0, said.stderr
+        return float(said.stdout)
 
-    monkeypatch.setattr("tempfile.TemporaryFile", read_only)
-    assert not numba_options.can_keep()
-    monkeypatch.undo()
-    assert numba_options.can_keep()
+    before = amplitude()
+    assert amplitude() == before
+    law = tmp_path / "aerpaw_cmp" / "site" / "antennas.py"
+    text = law.read_text(encoding="utf-8")
+    planted = re.sub(r"(?m)^(HALF_WAVE_DIPOLE_GAIN = )", r"\g<1>4.0 * ", text)
+    assert planted != text
+    law.write_text(planted, encoding="utf-8")
+    assert amplitude() == pytest.approx(2.0 * before)
+
+
+@needs_numba
+def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
+    from aerpaw_cmp.propagation.numba_options import ROOM, SOURCES
+
+    known = {(ROOM / name).resolve() for name in SOURCES}
+    holders = {path for path in ROOM.rglob("*.py") if "\n@kernel\n" in path.read_text(encoding="utf-8")}
+    assert len(holders) > 3
+    assert holders <= known
+    for path in holders:
+        tree = ast.parse(path.read_text(encoding="utf-8"))
+        taken = {
+            alias.asname or alias.name: path.parents[node.level - 1] / f"{(node.module or '').replace('.', '/')}.py"
+            for node in tree.body
+            if isinstance(node, ast.ImportFrom) and node.level
+            for alias in node.names
+        }
+        for function in ast.walk(tree):
+            if isinstance(function, ast.FunctionDef) and "kernel" in {
+                getattr(d, "id", "") for d in function.decorator_list
+            }:
+                body = {n.id for statement in function.body for n in ast.walk(statement) if isinstance(n, ast.Name)}
+                assert {taken[name].resolve() for name in body & set(taken)} <= known, function.name
 
 
 NOTHING_CAN_BE_WRITTEN = """
 import json, tempfile
 def refuse(*args, **kwargs):
     raise OSError(30, "Read-only file system")
-tempfile.TemporaryFile = refuse  # how numba finds a folder for its cache
+tempfile.TemporaryFile = refuse  # how a folder for compiled code is tried
 import numpy as np
-from aerpaw_cmp.propagation import boxtree, growth, kernels, merging, prisms, search_kernels
-from aerpaw_cmp.propagation.numba_options import OPTIONS
+from aerpaw_cmp.propagation import boxtree, growth, kernels, merging, prisms
+from aerpaw_cmp.propagation.numba_options import FOLDER
 height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
-print(json.dumps([OPTIONS["cache"], height]))
+print(json.dumps([FOLDER, height]))
 """
 
 
@@ -428,7 +397,7 @@ print(json.dumps([OPTIONS["cache"], height]))
 def test_every_compiled_module_runs_where_nothing_can_be_written():
     said = subprocess.run([sys.executable, "-c", NOTHING_CAN_BE_WRITTEN], capture_output=True, text=True, timeout=300)
     assert said.returncode == 0, said.stderr
-    assert json.loads(said.stdout) == [False, 5.0]
+    assert json.loads(said.stdout) == [None, 5.0]
     assert said.stderr == ""
 
 

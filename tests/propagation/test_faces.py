@@ -7,7 +7,6 @@ from aerpaw_cmp.propagation.faces import (
     inside,
     inside_solids,
     site_faces,
-    smaller_than_fresnel_zone,
     triangles,
 )
 from aerpaw_cmp.site.site import Building
@@ -117,15 +116,3 @@ def test_inside_solids(scenes):
     site = scenes.site([barn(COURT)])
     points = np.array([[2.0, 2, 3], [2, 2, 7], [10, 10, 3], [2, 2, -1], [0, 2, 3], [2, 2, 6]])
     assert inside_solids(site, points).tolist() == [True, False, False, True, False, False]
-
-
-def test_shed_is_no_mirror_far_away_but_is_one_near_by(scenes):
-    site = scenes.site([Building("shed", box(200, 0, 201, 1), 1.0), barn(box(-300, 0, -260, 30), 10.0)])
-    faces = site_faces(site)
-    source = np.array([[0.0, 0.0, 10.0]])
-    far = smaller_than_fresnel_zone(faces, source, np.array([[400.0, 0.0, 60.0]]), 3.4e9)
-    near = smaller_than_fresnel_zone(faces, source, np.array([[201.5, 0.5, 1.0]]), 3.4e9)
-    sheds = np.array([label.startswith("shed") for label in faces.label])
-    assert far[sheds].all()
-    assert not far[~sheds].any()
-    assert not near[sheds].all()

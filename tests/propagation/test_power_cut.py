@@ -10,7 +10,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation import power_cut, tracer
 from aerpaw_cmp.propagation.channel import channel_matrices
-from aerpaw_cmp.propagation.tracer import replay, replay_parts
+from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building
 
 CUT_DB = 6.0
@@ -75,11 +75,9 @@ def test_a_cut_beyond_every_path_changes_nothing(case):
     assert ": 0 of " in cut.left_out[-1]
 
 
-def test_parts_and_pairs_are_cut_alike(case):
+def test_pairs_are_cut_alike(case):
     site, link, poses = case
     whole = replay(site, link, poses, power_cut_db=CUT_DB)
-    parts = list(replay_parts(site, link, poses, poses_per_part=40, power_cut_db=CUT_DB, check_power_cut=False))
-    np.testing.assert_array_equal(np.concatenate([part.h for part in parts]), whole.h)
     pairs = replay(site, link, poses, power_cut_db=CUT_DB, visibility="pairs")
     np.testing.assert_allclose(pairs.h, whole.h, atol=1e-12)  # one element at each end: its centre
 

@@ -3,13 +3,11 @@ import sys
 
 import numpy as np
 import pytest
-from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.tracer import replay
-from aerpaw_cmp.site.site import Building
 
 
 @pytest.fixture
@@ -81,7 +79,6 @@ def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
 
     taller = replace(site, buildings=(replace(site.buildings[0], height_m=99.0), *site.buildings[1:]))
     replay(taller, link, poses, cache_dir=tmp_path)
-    replay(site, link, poses, cache_dir=tmp_path, drop_small_faces=True)
     assert len(list(tmp_path.glob("*.npz"))) >= 3
 
 
@@ -99,20 +96,6 @@ def test_unwritable_cache_is_no_error(case, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
     assert len(replay(*case, cache_dir=blocked).paths)
-
-
-def test_small_faces_are_left_out_by_name_but_still_hide(scenes):
-    shed = Building("shed", box(100, -1, 101, 1), 40.0)
-    kiosk = Building("kiosk", box(60, 20, 60.6, 20.6), 1.0)
-    site = scenes.site([shed, kiosk])
-    poses = scenes.poses([[200.0, 0.0, 20.0], [150.0, 60.0, 50.0]])
-    whole = replay(site, scenes.link(site), poses)
-    reduced = replay(site, scenes.link(site), poses, drop_small_faces=True)
-    assert any(line.startswith("kiosk roof") for line in reduced.left_out)
-    assert not any(line.startswith("ground") for line in reduced.left_out)
-    assert not whole.left_out
-    direct = (reduced.paths.pose == 0) & (reduced.paths.depth == 0)
-    assert not direct.any()  # the shed hides although it does not reflect
 
 
 def test_progress_reaches_one(case):

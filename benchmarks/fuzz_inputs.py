@@ -48,7 +48,7 @@ import numpy as np  # noqa: E402
 from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
 from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
 from aerpaw_cmp.logs import blocks, hdf5_arrays, limits  # noqa: E402
-from aerpaw_cmp.logs.readers import Reader, ReadOptions, catalogue, head_of  # noqa: E402
+from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue  # noqa: E402
 from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
 
 LIMIT_S = 2.0
@@ -294,7 +294,7 @@ def _check_frame(name: str, kind: str, frame: Any, lines: int) -> set[int]:
 
 def _read_log(reader: Reader, binary: bool, data: bytes, index: int) -> bool:
     if index % SNIFF_EVERY == 0:
-        head = head_of(data)
+        head = data[:HEAD_BYTES]
         for one in catalogue():
             one.sniff(head)
     options = OPTIONS[index % len(OPTIONS)]
@@ -411,7 +411,7 @@ def _log_seeds() -> dict[str, list[bytes]]:
             import gzip
 
             data = gzip.decompress(data)
-        readers = [r for r in catalogue() if r.sniff(head_of(data))]
+        readers = [r for r in catalogue() if r.sniff(data[:HEAD_BYTES])]
         if len(readers) != 1:
             continue
         if data.startswith(b"MATLAB 5"):

@@ -6,6 +6,8 @@ A member is named like a file in a folder: ``dataset.zip/LW1/power_log.txt``.
 from __future__ import annotations
 
 import io
+import lzma
+import struct
 import tarfile
 import zipfile
 import zlib
@@ -30,6 +32,8 @@ _MARGIN = 2**20
 _FREE_BYTES = 2**28
 _RATIO = 1200
 """Deflate makes a file at most 1032 times smaller: what claims more lies."""
+_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, NotImplementedError)
+"""What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +81,7 @@ def members(data: bytes, path: str | Path) -> dict[str, Member]:
     """
     try:
         found = list(_zip(data, path) if data.startswith(_ZIP) else _tar(data, path))
-    except (zipfile.BadZipFile, tarfile.TarError, zlib.error, EOFError, OSError, NotImplementedError) as error:
+    except (*_DAMAGE, tarfile.TarError) as error:
         raise InputError(f"a damaged archive ({error})", cause="a cut download", path=path) from error
     _check(found, len(data), path)
     return {member.name: member for member in sorted(found, key=lambda member: member.name)}
@@ -102,7 +106,7 @@ def _unzipped(book: zipfile.ZipFile, entry: zipfile.ZipInfo, path: str | Path, m
     try:
         with book.open(entry) as stream:
             content = stream.read(entry.file_size + 1 if most is None else most)
-    except (zipfile.BadZipFile, zlib.error, EOFError, OSError, NotImplementedError, RuntimeError) as error:
+    except (*_DAMAGE, RuntimeError) as error:
         raise InputError(f"a damaged or locked member ({error})", cause="a cut download", path=place) from error
     if len(content) > entry.file_size:
         raise InputError("the member is larger than the archive says", cause="no log", path=place)

@@ -7,9 +7,7 @@ reported. ``dataset.zip/LW1/power_log.txt`` names a member of an archive.
 from __future__ import annotations
 
 import hashlib
-import io
 import os
-import zlib
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -19,7 +17,7 @@ from ..common.errors import InputError, UsageError, one_line
 from . import archives, blocks, packed
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
-from .readers import HEAD_BYTES, Reader, ReadOptions, by_name, hides_its_content, identify
+from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, by_name, claims, identify
 from .records import ReadResult, has_wall_clock
 
 if TYPE_CHECKING:
@@ -31,7 +29,6 @@ MAX_BYTES = 2**32
 FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
 
-_GZIP = b"\x1f\x8b"
 _UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 _HDF5 = b"\x89HDF\r\n\x1a\n"
 
@@ -71,9 +68,7 @@ def read_bytes(path: str | Path) -> tuple[bytes, str]:
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
     """What a packed file holds, other content as it is."""
-    if packed.form(raw) is not None:
-        return packed.unpacked(raw, path, _most_unpacked(raw))
-    return _gunzip(raw, path) if raw.startswith(_GZIP) else raw
+    return raw if packed.form(raw) is None else packed.unpacked(raw, path, _most_unpacked(raw))
 
 
 def _most_unpacked(raw: bytes) -> int:
@@ -97,25 +92,6 @@ def _raw(place: Path, limit: int | None = None) -> bytes:
         raise InputError("no permission to read", cause="the file belongs to another user", path=place) from error
     except (OSError, ValueError) as error:
         raise InputError(f"cannot be read ({error})", path=place) from error
-
-
-def _gunzip(raw: bytes, path: str | Path) -> bytes:
-    """Content of all members of a gzip file, never more than a log of that size can hold."""
-    most = _most_unpacked(raw)
-    out = io.BytesIO()
-    rest = raw
-    while rest.startswith(_GZIP):
-        machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
-        try:
-            out.write(machine.decompress(rest, most + 1 - out.tell()))
-        except zlib.error as error:
-            raise InputError(f"a damaged gzip file ({error})", cause="a cut download", path=path) from error
-        if out.tell() > most:
-            raise InputError(f"the gzip file unpacks to more than {most} bytes", cause="no log", path=path)
-        if not machine.eof:
-            raise InputError("the gzip file ends too early", cause="a cut download", path=path)
-        rest = machine.unused_data
-    return out.getvalue()
 
 
 def ingest(
@@ -206,30 +182,19 @@ def exists(path: Path) -> bool:
 
 def sniffers_of(path: Path) -> list[str]:
     """Names of the readers whose sniffers accept a log; none for a folder of pieces."""
-    from .readers import catalogue
-
     if path.is_dir():
         return []
-    head = _sniffed(path)
-    return [reader.name for reader in catalogue() if reader.kinds and reader.sniff(head)]
+    if (part := None if _present(path) else archives.inside(path)) is None:
+        return [reader.name for reader in claims(_beginning(path)) if reader.kinds]
+    content = archives.members(read_bytes(part[0])[0], part[0])
+    data = as_utf8(content[part[1]].read(DEEP_BYTES)) if part[1] in content else b""
+    return [reader.name for reader in claims(data) if reader.kinds]
 
 
-def _sniffed(path: Path) -> bytes:
-    """What sniffers see of a log; of a large one no more than that is read."""
-    from .readers import head_of
-
-    if (part := None if _present(path) else archives.inside(path)) is not None:
-        content = archives.members(read_bytes(part[0])[0], part[0])
-        return head_of(as_utf8(content[part[1]].read(None))) if part[1] in content else b""
-    head = _raw(path, HEAD_BYTES)
-    if packed.form(head) is not None:
-        head = packed.head_of(path, HEAD_BYTES)
-    elif head.startswith(_GZIP) and path.stat().st_size > blocks.FROM_BYTES // 16:
-        head = _unpacked_head(head)
-    head = as_utf8(head)
-    if head.startswith(_GZIP) or hides_its_content(head):
-        return head_of(as_utf8(read_bytes(path)[0]))
-    return head
+def _beginning(place: Path, count: int = DEEP_BYTES) -> bytes:
+    """The first bytes of a log, unpacked and as UTF-8; none of a damaged packed file."""
+    head = _raw(place, count)
+    return as_utf8(head if packed.form(head) is None else packed.head_of(place, count))
 
 
 def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None = None) -> IngestedFile:
@@ -303,15 +268,10 @@ def _head(place: Path) -> bytes:
 
 
 def _is_archive(place: Path) -> bool:
-    head = _head(place)
-    if packed.form(head) is not None:
-        head = packed.head_of(place, 1024)
-    if head.startswith(_GZIP):
-        try:
-            head = zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, 1024)
-        except zlib.error:
-            return False
-    return archives.is_archive(head)
+    try:
+        return archives.is_archive(_beginning(place, 1024))
+    except InputError:
+        return False  # reading it says why
 
 
 def _archive(
@@ -338,11 +298,9 @@ def _member(
     chosen: Reader | None,
 ) -> IngestedFile:
     """One file of an archive; what its first bytes show to be no log is not unpacked."""
-    head = member.read(HEAD_BYTES)
-    if chosen is None and member.size > HEAD_BYTES and packed.form(head) is None and not head.startswith(_GZIP):
-        head = as_utf8(head)
-        if not archives.is_archive(head) and not hides_its_content(head):
-            chosen = identify(head, path=str(path))
+    head = member.read(DEEP_BYTES)
+    if chosen is None and member.size > DEEP_BYTES and packed.form(head) is None and not archives.is_archive(head):
+        chosen = identify(as_utf8(head), path=str(path))
     raw = member.read(None)
     digest = hashlib.sha256(raw).hexdigest()
     data = as_utf8(_unpacked(raw, path))
@@ -380,20 +338,14 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
         return _member(place, content[name], content, options, reader)
-    head = as_utf8(_raw(place, HEAD_BYTES))
+    head = _beginning(place)
     if head.startswith(_HDF5):
         raise InputError(
             "an HDF5 file, such as the flight file that 'ingest -o' writes",
             expected="the logs themselves, or the flight file named alone: 'ingest' gives back the logs that it holds",
             path=path,
         )
-    hidden = head.startswith(_GZIP)
-    if packed.form(head) is not None:
-        head = as_utf8(packed.head_of(place, HEAD_BYTES))
-        hidden = not head  # damaged, or empty
-    elif hidden and place.stat().st_size > blocks.FROM_BYTES // 16:
-        head, hidden = as_utf8(_unpacked_head(head)), False
-    if reader is None and not hidden and not hides_its_content(head):
+    if reader is None and head:
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
     if (large := _in_blocks(place, reader, options)) is not None:
         return large
@@ -404,20 +356,13 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 
 
-def _unpacked_head(head: bytes) -> bytes:
-    try:
-        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(head, HEAD_BYTES)
-    except zlib.error:
-        return head  # damaged: reading it says so
-
-
 def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -> IngestedFile | None:
     """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
     from . import limits
 
     begin = _raw(place, HEAD_BYTES)
     other = packed.form(begin) is not None
-    least = blocks.FROM_BYTES // 16 if other or begin.startswith(_GZIP) else blocks.FROM_BYTES
+    least = blocks.FROM_BYTES // 16 if other else blocks.FROM_BYTES
     if place.stat().st_size < least or reader is None or reader.in_blocks is None:
         return None
     if begin[:2] in _UTF_16:

@@ -1,18 +1,19 @@
-"""Logs packed by bzip2 or xz, unpacked piece by piece and bounded; gzip is at home in ``ingest`` and ``blocks``.
+"""Logs packed by gzip, bzip2 or xz, unpacked piece by piece and bounded.
 
-A file may hold several streams, as parallel packers write them. Python may have been built without either library:
-then the message says so.
+A file may hold several streams, as parallel packers write them. Python may have been built without bzip2 or
+xz: then the message says so.
 """
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
 from ..common.errors import InputError
 
-_MAGIC = {b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
+_MAGIC = {b"\x1f\x8b": "gzip", b"BZh": "bzip2", b"\xfd7zXZ\x00": "xz"}
 _PIECE = 2 << 20
 _MOST_RATIO = 1100
 """What unpacks to more than so many times its size is no log: text of the most regular of them takes a hundredth."""
@@ -21,9 +22,9 @@ _MOST_MEMORY = 1 << 28
 
 
 def form(head: bytes) -> str | None:
-    """``bzip2`` or ``xz``, None for any other content."""
+    """``gzip``, ``bzip2`` or ``xz``, None for any other content."""
     for magic, name in _MAGIC.items():
-        if head.startswith(magic) and (name == "xz" or head[3:10] in _BLOCKS):
+        if head.startswith(magic) and (name != "bzip2" or head[3:10] in _BLOCKS):
             return name
     return None
 
@@ -31,7 +32,31 @@ def form(head: bytes) -> str | None:
 _BLOCKS = {b"%d1AY&SY" % level for level in range(1, 10)}
 
 
+class _Gunzip:
+    """One member of a gzip file, with the interface of the other two libraries."""
+
+    def __init__(self) -> None:
+        self._machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
+
+    def decompress(self, data: bytes, most: int) -> bytes:
+        return self._machine.decompress(self._machine.unconsumed_tail + data, most)
+
+    @property
+    def eof(self) -> bool:
+        return self._machine.eof
+
+    @property
+    def unused_data(self) -> bytes:
+        return self._machine.unused_data
+
+    @property
+    def needs_input(self) -> bool:
+        return not self._machine.unconsumed_tail
+
+
 def _machine(name: str, path: str | Path) -> Callable[[], Any]:
+    if name == "gzip":
+        return _Gunzip
     try:
         if name == "bzip2":
             import bz2
@@ -118,7 +143,7 @@ def head_of(place: Path, count: int) -> bytes:
             if len(made) >= count:
                 break
     except InputError:
-        return b""
+        return b""  # damaged further on than the beginning: refused alike when it is read
     return made[:count]
 
 

@@ -17,7 +17,9 @@ from .records import Kind, ReadResult
 
 ENTRY_POINT_GROUP = "aerpaw_cmp.readers"
 HEAD_BYTES = 65_536
-"""Sniffers see at most this much of a file."""
+"""Sniffers see this much of a file first."""
+DEEP_BYTES = 4 << 20
+"""And this much where no log reader knows those."""
 
 InBlocks = Callable[[Iterator[bytes], "ReadOptions"], ReadResult]
 """Reads a log from the pieces of its file."""
@@ -148,17 +150,20 @@ def by_name(name: str) -> Reader:
     )
 
 
-def head_of(data: bytes) -> bytes:
-    """What sniffers see of a file: its first bytes; of a KML, without the styles in front of the first placemark."""
-    head = data[:HEAD_BYTES]
-    if hides_its_content(head) and (place := data.find(b"<Placemark")) > 0:
-        return head[:2048] + data[place : place + HEAD_BYTES - 2048]
-    return head
+_BLANK_LINES = re.compile(rb"\A(?:[ \t]*\r?\n)+")
 
 
-def hides_its_content(head: bytes) -> bool:
-    """Whether the first bytes of a file do not show what it holds: a KML whose styles fill them."""
-    return b"<kml" in head[:2048] and b"<Placemark" not in head and len(head) >= HEAD_BYTES
+def claims(data: bytes) -> list[Reader]:
+    """Readers whose sniffers accept the beginning of a file, blank lines in front of it aside.
+
+    A console or a KML may hold what tells it apart behind much talk or many styles: where no log reader accepts the
+    first ``HEAD_BYTES``, the sniffers see ``DEEP_BYTES``.
+    """
+    data = _BLANK_LINES.sub(b"", data[:DEEP_BYTES])
+    known = [reader for reader in catalogue() if reader.sniff(data[:HEAD_BYTES])]
+    if len(data) > HEAD_BYTES and not any(reader.kinds for reader in known):
+        known = [reader for reader in catalogue() if reader.kinds and reader.sniff(data)] or known
+    return known
 
 
 def identify(data: bytes, *, path: str | None = None) -> Reader:
@@ -171,7 +176,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
     """
     if not data.strip():
         raise InputError("the file is empty", expected="log lines", cause="an aborted run", path=path)
-    head = head_of(data)
+    head = data[:HEAD_BYTES]
     if head.startswith(b"version https://git-lfs"):
         raise InputError(
             "a Git-LFS pointer stands in place of the data",
@@ -179,7 +184,7 @@ def identify(data: bytes, *, path: str | None = None) -> Reader:
             cause="the repository was cloned without 'git lfs pull'",
             path=path,
         )
-    known = [reader for reader in catalogue() if reader.sniff(head)]
+    known = claims(data)
     candidates = [reader for reader in known if reader.kinds]
     if len(candidates) == 1:
         return candidates[0]

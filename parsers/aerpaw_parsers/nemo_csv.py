@@ -13,15 +13,16 @@ import numpy as np
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult
+from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _by_eights, _lines, _nemo, _rows, _table
+from . import _by_eights, _lines, _nemo, _quantities, _rows, _table
 
 _N = rb"(" + _lines.NUMBER + rb")"
 _CELL = rb"(" + _lines.NUMBER + rb"|nan|NaN|)"
 _ROW = re.compile(rb"^" + _N + rb", ?" + _N + (rb", ?" + _CELL) * 7 + rb"[ \t]*\r?$", re.MULTILINE)
 _MOST = 1e12
 """No table has so many rows."""
+_BESIDE = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 
 
@@ -90,13 +91,20 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     number, column = _columns(lines, found)
     content = {"time": column[1], **dict(zip(_COLUMNS, column[2:], strict=True))}
     rows = _rows.built(lines, number, content, options, reader="nemo_csv", reason=_reason, clock="relative_ms")
-    return rows.result([_nemo.pdsch_rank(rows, dict(rows.columns))])
+    beside = [_beside(rows, *one) for one in _BESIDE]
+    return rows.result([_nemo.pdsch_rank(rows, dict(rows.columns)), *beside])
+
+
+def _beside(rows: _rows.Rows, column: str, name: str) -> Stream | None:
+    """Level or ratio of the rows that have one: most stand in rows without a rank."""
+    values = rows.number(column)
+    return _quantities.stream(rows, name, values, where=np.isfinite(values), about={"rat": "nr"})
 
 
 READER = Reader(
     name="nemo_csv",
     title="Keysight Nemo NR rank, CSV with relative times",
-    kinds=("rank",),
+    kinds=("rank", "rss", "kpi"),
     sample="12,-1500.0,35.7280001,-78.6960002,30.5,2.0,-81.5,28.0,12.0",
     sniff=_nemo.sniff,
     read=read,

@@ -19,7 +19,7 @@ from ._nemo import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"
 _GAP = rb"[^\n]{0,60}?"
-_NAME = rb" ?([A-Z][A-Za-z0-9 /_.-]{1,40}(?:\([^()=\n]{1,30}\))?) = "
+_NAME = rb" ?([A-Za-z][A-Za-z0-9 /_.-]{1,40}(?:\([^()=\n]{1,30}\))?) = "
 _RECORD = re.compile(
     rb"rel_time = " + _N + rb" ms" + _GAP + _NAME + _N + rb" ?([A-Za-z/%]{0,8})" + _GAP
     # the position is needed: the phone stands on the aircraft

@@ -184,8 +184,8 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     return repeats, stars.line[chosen], bad
 
 
-_NAMED = re.compile(r"(power|quality|snr)_?log")
-"""What AERPAW's start scripts call the three logs."""
+_NAMED = re.compile(r"(?<![a-z])(power|quality|snr)(?![a-z])|(?:power|quality|snr)(?=_?log)")
+"""What AERPAW's start scripts and emulator call the three logs: ``2025-01-01_power_log.txt``, ``lw1_snr.txt``."""
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
@@ -257,7 +257,7 @@ def _stream(
     frame = _frames.frame("rss", instants.time, samples.line + 1, flag, {"rss_db": value})
     warnings += [*instants.warnings, *_frames.steps_back(frame)]
     named = _NAMED.search(options.file_name.lower())
-    name = options.channel or (named.group(1) if named else "power")
+    name = options.channel or (named.group() if named else "power")
     ratio = name.lower() in ("quality", "snr")
     if options.channel is None and not named:
         warnings.append(
@@ -268,6 +268,7 @@ def _stream(
         options,
         channel=name,
         unit=options.unit or ("dB" if ratio else "dB re full scale"),
+        quantity="SNR" if name.lower() == "snr" else None,
         repeated_samples=len(repeats.line),
     )
     return Stream("rss", name, frame, attributes)

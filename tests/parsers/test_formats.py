@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.logs.readers import ReadOptions, by_name, head_of
+from aerpaw_cmp.logs.readers import ReadOptions, by_name, identify
 from aerpaw_cmp.logs.records import ReadResult, Stream
 from tests.parsers import samples
 from tests.parsers.samples import CASES, OPTIONS, SAMPLES
@@ -366,7 +366,7 @@ def test_kml_with_styles_in_front_is_still_known() -> None:
     styles = b"    <Style id='8'><width>3</width></Style>\n" * 2000
     data = samples.NEMO_KML.replace(b"  <Document>\n", b"  <Document>\n" + styles)
     assert not by_name("nemo_kml").sniff(data[:65536])
-    assert by_name("nemo_kml").sniff(head_of(data))
+    assert identify(data).name == "nemo_kml"
     fence = (
         b"<?xml version='1.0'?>\n<kml><Document><Style/><Placemark><name>fence</name></Placemark></Document></kml>\n"
     )

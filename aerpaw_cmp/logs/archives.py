@@ -32,7 +32,16 @@ _MARGIN = 2**20
 _FREE_BYTES = 2**28
 _RATIO = 1200
 """Deflate makes a file at most 1032 times smaller: what claims more lies."""
-_DAMAGE = (zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, ValueError, NotImplementedError)
+_DAMAGE = (
+    zipfile.BadZipFile,
+    zlib.error,
+    lzma.LZMAError,
+    struct.error,
+    EOFError,
+    OSError,
+    ValueError,
+    NotImplementedError,
+)
 """What Python's libraries raise for damaged archives; a ValueError for a directory that begins before the file does."""
 
 

@@ -424,7 +424,7 @@ def rows(
         texts = [f"{date} {time}".strip() for date, time in pairs]
     name, unit = sheet.plain[column], sheet.unit(column)
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
-    count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s"
+    count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s" if unit or name.endswith(" s") else None
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
     course: _stamps.Course = decided.kept.setdefault("times", _stamps.Course())
     clock, cells, warnings = _stamps.read(texts, options, unit=count, course=course)
@@ -439,7 +439,26 @@ def rows(
     made.warnings += warnings
     if len(made.row) < len(sheet.row):
         sheet.keep(np.isin(sheet.row, made.row))
+    if (counter := sheet.find("time millisecond")) not in (None, column):
+        _finer(made, sheet.numbers(counter))
     return made
+
+
+_MOST_APART_NS = 1_500_000_000
+
+
+def _finer(rows: _rows.Rows, milliseconds: FloatArray) -> None:
+    """Times cut to whole seconds, with the fractions that a column of milliseconds has (AirData)."""
+    time = rows.time.astype(np.int64)
+    known = np.isfinite(milliseconds)
+    if rows.relative or not known.any() or (time % 1_000_000_000).any():
+        return
+    counted = np.round(np.where(known, milliseconds, 0.0) * 1e6).astype(np.int64)
+    zero = (time - counted)[known]
+    if zero.max() - zero.min() > _MOST_APART_NS:
+        rows.warnings.append("the column of milliseconds does not go with the times: it is left out")
+        return
+    rows.time = np.where(known, zero.max() + counted, time).astype("datetime64[ns]")
 
 
 def nothing(data: bytes, reader: str, reason: str) -> ReadResult:

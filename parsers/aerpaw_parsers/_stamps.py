@@ -32,6 +32,7 @@ _IN_NAME = (
     re.compile(r"(?<!\d)(20\d\d)[-_.]?(\d\d)[-_.]?(\d\d)(?!\d)"),
     re.compile(r"(?<!\d)(\d\d)([A-Z][a-z]{2})(\d\d)(?!\d)"),
 )
+"""Dates with hyphens or none, and Nemo's year, month, day: its summary of ``24Feb09`` says ``2024 Feb 09``."""
 
 
 def date_in_name(name: str) -> str | None:
@@ -39,12 +40,13 @@ def date_in_name(name: str) -> str | None:
 
     Examples
     --------
-    >>> date_in_name("24Jun24_141317.1.gpx"), date_in_name("2022-06-10_19:52:44_log.txt"), date_in_name("60m.csv")
-    ('2024-06-24', '2022-06-10', None)
+    >>> date_in_name("24Feb09_172055.1.gpx"), date_in_name("2022-06-10_19:52:44_log.txt"), date_in_name("60m.csv")
+    ('2024-02-09', '2022-06-10', None)
     """
     for pattern in _IN_NAME:
         for found in pattern.finditer(name):
-            year, month, day = found.groups() if pattern is _IN_NAME[0] else (f"20{found[3]}", found[2], found[1])
+            year, month, day = found.groups()
+            year = year if len(year) == 4 else f"20{year}"
             number = int(month) if month.isdigit() else _month(month)
             if 1 <= number <= 12 and 1 <= int(day) <= 31:
                 return f"{year}-{number:02d}-{int(day):02d}"
@@ -187,7 +189,7 @@ def read(
         sum(len(part) for part in groups if known(part.first)) for known in (bool, _NUMBER.fullmatch, _OF_DAY.fullmatch)
     )
     if counts * 2 > some and not any(_DIGITS.fullmatch(text) for text in islice(filter(None, shown), 3)):
-        return _numbers(shown, groups, unit)
+        return _numbers(shown, groups, unit, options)
     if of_day * 2 > some:
         return _of_day(shown, groups, options, course or Course())
     first = _day_first(shown, groups)
@@ -211,8 +213,8 @@ def _in_common(part: _alike.Alike, texts: Sequence[str], day_first: bool) -> Any
 
 
 def _numbers(
-    texts: Sequence[str], groups: Iterable[_alike.Alike], unit: str | None
-) -> tuple[str, FloatArray, list[str]]:
+    texts: Sequence[str], groups: Iterable[_alike.Alike], unit: str | None, options: ReadOptions
+) -> tuple[str, AnyArray, list[str]]:
     """Numbers: epochs by their size, else relative times."""
     value = np.full(len(texts), np.nan)
     for part in groups:
@@ -224,7 +226,14 @@ def _numbers(
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         if middle >= 0.9 * scale:
             return (form, value, []) if form else ("epoch_us", value / 1e3, [])
+    if unit is None and 86_400 < middle < 86_400_000 and not (value % 1 > 0).any():
+        if np.nanmin(value) < 3_600_000:
+            return "relative_ms", value, [_MILLISECONDS]
+        return _on_a_date(value / 1e3, options, [_MILLISECONDS + " of the day"])
     return f"relative_{unit or 's'}", value, []
+
+
+_MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
 
 
 def _of_day(
@@ -240,13 +249,18 @@ def _of_day(
     midnights = course.midnights + np.cumsum(np.nan_to_num(np.diff(seconds, prepend=course.last_s)) < -43_200)
     course.last_s, course.midnights = float(seconds[-1]), int(midnights[-1])
     seconds = seconds + 86_400.0 * midnights
+    warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
+    return _on_a_date(seconds, options, warnings)
+
+
+def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -> tuple[str, AnyArray, list[str]]:
+    """Seconds of the first day; relative where nothing says which day that is."""
     date = options.time_origin[:10] if options.time_origin else date_in_name(options.file_name)
     if date is None or not re.fullmatch(r"\d{4}-\d\d-\d\d", date):
-        return "relative_s", seconds, ["the times have no date and the file name has none either"]
+        return "relative_s", seconds, [*warnings, "the times have no date and the file name has none either"]
     stamps = np.datetime64(date, "us") + np.round(np.nan_to_num(seconds) * 1e6).astype("timedelta64[us]")
     cells = np.datetime_as_string(stamps, unit="us").astype(np.bytes_)
     cells = np.where(np.isnan(seconds), b"-", cells)
-    warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
     source = "time_origin" if options.time_origin else "the file name"
     return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
 

@@ -14,7 +14,7 @@ _HEADER = re.compile(_text.BOM + rb"time((?:,snr_[A-Za-z0-9]{1,12}){1,16})\s*", 
 
 def _row(data: bytes) -> re.Pattern[bytes]:
     """A group per tower; without a header nothing says which column is which tower."""
-    header = _HEADER.match(data[:400])
+    header = _HEADER.match(data[:400].lstrip())
     if header is None:
         return re.compile(rb"(?!)(?P<time>)")
     cells = b"".join(rb",(?P<t%d>" % i + _lines.NUMBER + rb"|nan|NaN|-inf|)" for i in range(header[1].count(b",")))
@@ -22,7 +22,7 @@ def _row(data: bytes) -> re.Pattern[bytes]:
 
 
 def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
-    header = _HEADER.match(rows.data[:400])
+    header = _HEADER.match(rows.data[:400].lstrip())
     towers = [] if header is None else header[1].decode("ascii").upper().split(",SNR_")[1:]
     for i, tower in enumerate(towers):
         if tower in towers[:i]:

@@ -16,6 +16,12 @@ from aerpaw_cmp.logs.records import ReadResult
 from . import _lines, flight_mat, gpx, iq_burst, nemo_kml, oai_log, srsenb_log, srsran_gnb, srsue_log, vehicle_log
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
+_CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")
+_GAIN = re.compile(rb"(?:\d{1,3}\s*\n)?Frequency\tE ?Total\. ?dB")
+_LEVELS = re.compile(rb"(?i)g-?net ?track|\b(?:rsrp|rxlev|rscp|level)\b\W{0,20}-?\d{2,3}\b")
+_CELL_SEARCH = re.compile(rb"Found CELL \d{1,5}\.\d MHz, EARFCN=\d")
+_PLAN = re.compile(rb'"fileType"\s*:\s*"Plan"')
+_PLANNING = re.compile(rb"(?im)^(?:HORIZONTAL\s+\d{1,4}|REVNUM:,TIA)")
 _PATTERN_MAT = re.compile(r"(?i)(rad_?pat|gain|theta\d?|phi\d?|sa\d{4}|rmwb\d{4}\w*|g[rt]_\w+|pattern\w*|antenna\w*)")
 _POWER_REFS = re.compile(rb"(?:\xef\xbb\xbf)?Node,Category,Channel,[^\n]{0,80}Gain,Freq_")
 _UHD = re.compile(rb"\[(?:INFO|WARNING|ERROR)\] \[(?:UHD|B200|X300|MULTI_USRP|GPS|USRP|OV|CONFIG|AD936X|CORES)\]")
@@ -34,7 +40,9 @@ def _texts(head: bytes) -> list[bytes]:
 
 
 def _antenna_text(head: bytes) -> bool:
-    return b"\0" not in head[:400] and _PATTERN.search(head[:400]) is not None
+    if b"\0" in head[:400]:
+        return False
+    return any(form.search(head[:400]) for form in (_PATTERN, _CUT)) or _PLANNING.search(head[:4096]) is not None
 
 
 def _antenna_mat(head: bytes) -> bool:
@@ -52,6 +60,10 @@ def _other_mat(head: bytes) -> bool:
 
 def _kml(head: bytes) -> bool:
     return b"<kml" in head[:2048] and not nemo_kml.sniff(head)
+
+
+def _plain_kml(head: bytes) -> bool:
+    return _kml(head) and _LEVELS.search(head) is None
 
 
 def _gpx(head: bytes) -> bool:
@@ -134,7 +146,13 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     ("antenna_grid", "antenna gain grids of MATLAB (for 'antenna: {model: gain_grid}' in flight.yaml)", _antenna_mat),
     ("matlab_other", "MATLAB variables that are no flight", _other_mat),
     ("power_references", "a table of USRP reference powers", lambda head: _POWER_REFS.match(head) is not None),
-    ("kml_other", "a KML without measurements (a geofence, a map)", _kml),
+    ("antenna_gain", "antenna gain over frequency, without directions", lambda head: _GAIN.match(head) is not None),
+    (
+        "kml_levels",
+        "a KML with levels in a layout that is not read (G-NetTrack, ...): give the program's text log or CSV",
+        lambda head: _kml(head) and _LEVELS.search(head) is not None,
+    ),
+    ("kml_other", "a KML without measurements (a geofence, a map)", _plain_kml),
     ("gpx_other", "a GPX without points", _gpx),
     (
         "at_transcript",
@@ -152,6 +170,16 @@ _KINDS: tuple[tuple[str, str, Callable[[bytes], bool]], ...] = (
     ("positions", "a list of positions without times", _places),
     ("document", "a page of text", _document),
     ("flight_script", "the console of a flight script, without positions", _flight_talk),
+    (
+        "cell_search",
+        "a cell search of srsRAN: cells at one moment, without times",
+        lambda head: _CELL_SEARCH.search(head) is not None,
+    ),
+    (
+        "flight_plan",
+        "a QGroundControl plan: where the aircraft was to fly",
+        lambda head: _PLAN.search(head) is not None,
+    ),
     ("flight_yaml", "a flight file of settings, not a log: give it to 'report'", _yaml),
 )
 

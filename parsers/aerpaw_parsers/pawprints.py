@@ -1,4 +1,4 @@
-"""PawPrints, AERPAW's logger of an Android phone: JSON lines with LTE and NR cells.
+"""PawPrints, AERPAW's logger of an Android phone: JSON lines with LTE and NR cells, or the text of 2023.
 
 ``companion_abs_time`` (ms of UTC, the clock of the aircraft's computer) is the time; where a line lacks it,
 ``abs_time``, the phone's own. A cell's level is its RSRP; 2147483647 and ``Unavailable`` mean that there is none.
@@ -27,8 +27,19 @@ _CONNECTED = tuple(
 """The last line that says which cell serves holds for those after it."""
 
 
+_TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),.*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
+_BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
+_OF_TEXT = {
+    b"4G_LTE": {"fields": 19, "connected": 1, "rsrp": 6, "rsrq": 7, "rssi": 8, "sinr": 5, "arfcn": 11, "pci": 12},
+    b"5G_NR_SA": {"fields": 19, "connected": 2, "rsrp": 7, "rsrq": 8, "sinr": 9, "arfcn": 13, "pci": 14},
+}
+"""Places in a block by its technology; LTE with all quantities switched on in the app, as it is delivered."""
+
+
 def sniff(head: bytes) -> bool:
-    """Whether the first line is an object with a phone's cells and times."""
+    """Whether it is the text of 2023, or the first line is an object with a phone's cells and times."""
+    if head.startswith(b"CELL_LOG_START,"):
+        return True
     first = head.lstrip(b"\xef\xbb\xbf[ \r\n").split(b"\n", 1)[0]
     return (
         head.lstrip(b"\xef\xbb\xbf[ \r\n").startswith(b"{")
@@ -63,6 +74,40 @@ def _readings(found: list[dict[str, Any]]) -> Iterator[_cells.Reading]:
             yield _reading(i, cell, _json.number(one.get("connected_pci")))
 
 
+def _text_cells(line: bytes) -> list[dict[str, Any]] | None:
+    """Cells of a line of the text of 2023 in the words of the JSON; None where a block has other fields."""
+    found = []
+    for block in _BLOCK.findall(line):
+        cells = block.split(b",")
+        rat = next((name for name in _OF_TEXT if name in cells[:2]), b"")
+        place = _OF_TEXT.get(rat)
+        if place is None or len(cells) < place["fields"]:
+            return None
+        one: dict[str, Any] = {
+            key: cells[at].decode("ascii", "replace") for key, at in place.items() if key != "fields"
+        }
+        found.append({**one, "technology": rat.decode(), "is_connected": one["connected"]})
+    return found
+
+
+def _read_text(data: bytes, options: ReadOptions) -> ReadResult:
+    """Cells of the text of 2023: ``CELL_LOG_START,<ms of UTC>,...``, a block per cell."""
+    lines = _lines.split(data)
+    row, groups = _lines.match(lines, _TEXT)
+    cells = [_text_cells(lines.raw(i)) for i in row.tolist()]
+    other = [lines.reject(i, "a block of other fields (quantities switched off in the app?)")
+             for i, one in zip(row.tolist(), cells, strict=True) if one is None]  # fmt: skip
+    kept = np.array([one is not None for one in cells], dtype=bool)
+    rows = _rows.built(
+        lines, row[kept], {"time": np.array([float(one[0]) for one in groups], dtype=np.float64)[kept]}, options,
+        reader="pawprints", reason=lambda _line: "not a whole 'CELL_LOG_START ... CELL_LOG_STOP' (torn line?)",
+        clock="epoch_ms", extra=other,
+    )  # fmt: skip
+    whole = [one for one in cells if one is not None]
+    readings = [_reading(i, cell, np.nan) for i, at in enumerate(rows.at.tolist()) for cell in whole[at]]
+    return rows.result(_cells.streams(rows, readings, source="PawPrints"))
+
+
 def _nr(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
     """Level of the NR leg: the phone tells it apart from the cells, without a PCI."""
     legs = [_json.inside(one, "nr_signal_strength") for one in found]
@@ -94,6 +139,8 @@ def _track(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """A level stream per LTE or NR cell, the level of the NR leg, and the phone's track where it is logged."""
+    if data[:4096].lstrip().startswith(b"CELL_LOG_START,"):
+        return _cells.settled(_read_text(data, options))
     return _settled(_read(data, options))
 
 

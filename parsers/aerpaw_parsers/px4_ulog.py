@@ -2,14 +2,16 @@
 
 The format describes itself: ``F`` messages give the fields of each topic, ``A`` its number, ``D`` its data. Read
 are ``vehicle_global_position``, ``vehicle_attitude`` (quaternion), ``vehicle_local_position`` (velocity) and
-``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix); instance 0 of each. Heights are above ``home_position``, else
-above the first position. Source: PX4 guide, "ULog File Format".
+``vehicle_gps_position`` or ``sensor_gps`` (UTC, fix; the position too, where the log has no global position);
+instance 0 of each. Heights are above ``home_position``, else above the first position.
+Source: PX4 guide, "ULog File Format".
 """
 
 from __future__ import annotations
 
 import re
 import struct
+from collections.abc import Mapping
 
 import numpy as np
 
@@ -112,7 +114,7 @@ def _column(table: AnyArray, *names: str) -> FloatArray | None:
     return next((table[name].astype(np.float64) for name in names if name in (table.dtype.names or ())), None)
 
 
-def _series(table: AnyArray, numbers: list[int], columns: dict[str, FloatArray | None]) -> _autopilot.Series:
+def _series(table: AnyArray, numbers: list[int], columns: Mapping[str, FloatArray | None]) -> _autopilot.Series:
     if not len(table):
         return _autopilot.NONE
     kept = {name: values for name, values in columns.items() if values is not None}
@@ -122,20 +124,19 @@ def _series(table: AnyArray, numbers: list[int], columns: dict[str, FloatArray |
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``."""
     tables, numbers, count, damaged = _topics(data)
-    place, gps_name = tables["vehicle_global_position"], "vehicle_gps_position"
-    gps = tables[gps_name] if len(tables[gps_name]) else tables["sensor_gps"]
-    gps_name = gps_name if len(tables[gps_name]) else "sensor_gps"
-    latitude, longitude, altitude = (_column(place, name) for name in ("lat", "lon", "alt"))
-    if latitude is None or longitude is None or not len(place):
+    gps_name = next((name for name in ("vehicle_gps_position", "sensor_gps") if len(tables[name])), "sensor_gps")
+    gps, place_name = tables[gps_name], "vehicle_global_position"
+    position = _position(tables[place_name])
+    if position is None:
+        position, place_name = _position(gps), gps_name
+    if position is None:
         return ReadResult(
             reader="px4_ulog", streams=(), lines=count + len(damaged), accepted=0, blank=count, rejected=tuple(damaged)
         )
-    height = np.full(len(place), np.nan) if altitude is None else altitude - _home(tables["home_position"], altitude)
-    position = _series(
-        place,
-        numbers["vehicle_global_position"],
-        {"latitude_deg": latitude, "longitude_deg": longitude, "altitude_m": height},
-    )
+    altitude = position["altitude_m"]
+    known = altitude[(position["latitude_deg"] != 0) & np.isfinite(altitude)]  # before the fix all is zero
+    position["altitude_m"] = altitude - _home(tables["home_position"], known)
+    track = _series(tables[place_name], numbers[place_name], position)
     local, attitude = tables["vehicle_local_position"], tables["vehicle_attitude"]
     velocity = {
         f"velocity_{way}_mps": _column(local, name) for way, name in (("north", "vx"), ("east", "vy"), ("down", "vz"))
@@ -146,20 +147,35 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     return _autopilot.result(
         "px4_ulog",
         options,
-        position,
+        track,
         _series(attitude, numbers["vehicle_attitude"], _angles(attitude)),
         _series(local, numbers["vehicle_local_position"], velocity),
         _series(gps, numbers[gps_name], fix),
         utc_minus_clock_s=offset,
         messages=count,
         damaged=damaged,
-        source="PX4 ULog",
+        source="PX4 ULog" if place_name == "vehicle_global_position" else f"PX4 ULog, {place_name}",
     )
+
+
+def _position(table: AnyArray) -> dict[str, FloatArray] | None:
+    """Latitude, longitude and altitude of the estimator's or the receiver's own messages, None where there are none.
+
+    Receivers wrote 1e-7 deg and mm as integers until PX4 1.14, degrees and metres as doubles since.
+    """
+    for names in (("lat", "lon", "alt"), ("latitude_deg", "longitude_deg", "altitude_msl_m")):
+        latitude, longitude, altitude = (_column(table, name) for name in names)
+        if latitude is None or longitude is None or not len(table):
+            continue
+        per_degree, per_metre = (1e7, 1e3) if table.dtype[names[0]].kind == "i" else (1.0, 1.0)
+        height = np.full(len(table), np.nan) if altitude is None else altitude / per_metre
+        return {"latitude_deg": latitude / per_degree, "longitude_deg": longitude / per_degree, "altitude_m": height}
+    return None
 
 
 def _home(table: AnyArray, altitude: FloatArray) -> float:
     home = _column(table, "alt")
-    return float(home[0]) if home is not None and len(home) else float(altitude[0])
+    return float(home[0]) if home is not None and len(home) else float(altitude[0]) if len(altitude) else 0.0
 
 
 def _angles(table: AnyArray) -> dict[str, FloatArray | None]:

@@ -71,6 +71,9 @@ def test_a_missing_member_and_a_damaged_archive_are_messages(tmp_path: Path) -> 
     place.write_bytes(zipped(CONTENT)[:-40])
     with pytest.raises(InputError, match="damaged archive"):
         ingest(place)
+    place.write_bytes(zipped(CONTENT)[:60] + zipped(CONTENT)[-100:])  # a directory that begins before the file does
+    with pytest.raises(InputError, match="damaged archive"):
+        ingest(place)
     whole = zipped(CONTENT)
     at = whole.index(b"x_vehicleOut.txt") + 40
     place.write_bytes(whole[:at] + b"\xff\xff\xff" + whole[at + 3 :])
@@ -109,7 +112,7 @@ def test_what_the_first_bytes_show_to_be_no_log_is_not_unpacked(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     place = tmp_path / "a.zip"
-    place.write_bytes(zipped({"junk.bin": b"\0" * 900_000, "x_vehicleOut.txt": VEHICLE_10}))
+    place.write_bytes(zipped({"junk.bin": b"\0" * 5_000_000, "x_vehicleOut.txt": VEHICLE_10}))
     unpacked: list[tuple[str, int | None]] = []
     plain = archives._unzipped
 

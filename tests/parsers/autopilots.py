@@ -78,13 +78,16 @@ def tlog(version: int = 2) -> bytes:
     return out
 
 
-def ulog() -> bytes:
-    """PX4 .ulg: position, attitude, velocity, GPS and home."""
+def ulog(place: str = "estimator") -> bytes:
+    """PX4 .ulg: position, attitude, velocity, GPS and home; or the receiver's position alone, before or since 1.14."""
+    gps = b"uint64_t timestamp;uint64_t time_utc_usec;uint8_t fix_type;uint8_t satellites_used;"
+    integers, doubles = b"int32_t lat;int32_t lon;int32_t alt;", b"double latitude_deg;double longitude_deg;"
+    more = {"estimator": b"", "integers": integers, "doubles": doubles + b"double altitude_msl_m;"}[place]
     forms = {
         b"vehicle_global_position": b"uint64_t timestamp;double lat;double lon;float alt;",
         b"vehicle_attitude": b"uint64_t timestamp;float[4] q;",
         b"vehicle_local_position": b"uint64_t timestamp;float vx;float vy;float vz;",
-        b"vehicle_gps_position": b"uint64_t timestamp;uint64_t time_utc_usec;uint8_t fix_type;uint8_t satellites_used;",
+        b"vehicle_gps_position": gps + more,
         b"home_position": b"uint64_t timestamp;float alt;",
     }
 
@@ -108,8 +111,14 @@ def ulog() -> bytes:
     )
     for i in range(COUNT):
         now = 30_000_000 + i * 1_000_000
-        out += message(b"D", struct.pack("<HQddf", 0, now, 35.73 + i * 1e-7, -78.7 - i * 1e-7, 90.0 + i))
+        if place == "estimator":
+            out += message(b"D", struct.pack("<HQddf", 0, now, 35.73 + i * 1e-7, -78.7 - i * 1e-7, 90.0 + i))
         out += message(b"D", struct.pack("<HQffff", 1, now, *q))
         out += message(b"D", struct.pack("<HQfff", 2, now, 1.5, 2.5, -0.5))
-        out += message(b"D", struct.pack("<HQQBB", 3, now, START_US + i * 1_000_000, 4, 14))
+        fix = {
+            "estimator": b"",
+            "integers": struct.pack("<iii", 357_300_000 + i, -787_000_000 - i, 90_000 + 1000 * i),
+            "doubles": struct.pack("<ddd", 35.73 + i * 1e-7, -78.7 - i * 1e-7, 90.0 + i),
+        }[place]
+        out += message(b"D", struct.pack("<HQQBB", 3, now, START_US + i * 1_000_000, 4, 14) + fix)
     return out

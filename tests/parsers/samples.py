@@ -174,6 +174,17 @@ GPX_NEMO = GPX.replace(b"2025-03-02T15:00:00.250Z", b"T10:00:00.250Z").replace(
     b"2025-03-02T15:00:01Z", b"T10:00:01.000Z"
 )
 _CELL = b'{"technology": "4G_LTE", "rsrp": %d, "rsrq": -6, "rssi": -51, "rssnr": 2147483647, "earfcn": "66911", "pci": "%d", "is_connected": "%s"}'
+_LTE = (
+    b"BS_INFO_START,4G_LTE,%s,1.01,1.9E8,-97,Unavailable,%d,-12,-65,Unavailable,23,%d,16,8,1,2,3,310,410,BS_INFO_STOP,"
+)
+PAWPRINTS_TEXT = (
+    b"CELL_LOG_START,1740927600250,1.01,2,op,op,Op,"
+    + _LTE % (b"true", -97, 950)
+    + _LTE % (b"false", -99, 66486)
+    + b"CELL_LOG_STOP\n"
+    b"CELL_LOG_START,1740927601250,2.01,1,op,op,Op," + _LTE % (b"true", -98, 950) + b"CELL_LOG_STOP\n"
+    b"CELL_LOG_START,1740927602250,3.01,1,op,op,Op,BS_INFO_START,4G_LTE,true,3.01\n"
+)
 PAWPRINTS = (
     b'{"rel_time": 1.0, "abs_time": 1740927599000, "nr_signal_strength": {"ss_rsrp": "-88", "ss_rsrq": "-11", "ss_sinr": "33"}, '
     b'"connected_pci": 2, "cells": [' + _CELL % (-62, 2, b"true") + b", " + _CELL % (-71, 1, b"false")
@@ -487,7 +498,7 @@ SAMPLES: dict[str, dict[str, tuple[bytes, int, int]]] = {
     "srsue_log": {"console": (SRSUE, 3, 1)},
     "vehicle_log": {"console": (VEHICLE_LOG, 2, 1)},
     "gpx": {"track": (GPX, 2, 1), "nemo": (GPX_NEMO, 2, 1)},
-    "pawprints": {"session": (PAWPRINTS, 2, 1)},
+    "pawprints": {"session": (PAWPRINTS, 2, 1), "text_of_2023": (PAWPRINTS_TEXT, 2, 1)},
     "drive_test": {
         "nemo": (NEMO_WIDE, 3, 1),
         "xcal": (XCAL, 2, 0),
@@ -561,6 +572,15 @@ NO_LOGS: dict[str, bytes] = {
     "positions": b"35.7281, -78.6973\r\n35.7291, -78.6992\r\n",
     "document": b"# A page\n\n## Of text\n\nwords\n",
     "flight_script": b"[2025-03-02 10:00:00.000001] Taking off\n[2025-03-02 10:00:05.000001] Waypoint 0\n",
+    "kml_levels": (
+        b"<?xml version='1.0'?>\n<kml><Document><Placemark><description>RSRP: -81 dBm</description>"
+        b"<Point><coordinates>-78.7,35.7</coordinates></Point></Placemark></Document></kml>\n"
+    ),
+    "antenna_gain": b"1\r\nFrequency\tE Total. dB\r\n3300000000\t-1.25\r\n",
+    "cell_search": (
+        b"Found 1 cells\nFound CELL 930.0 MHz, EARFCN=3500, PHYID=2, 50 PRB, 1 ports, PSS power=-21.3 dBm\n\nBye\n"
+    ),
+    "flight_plan": b'{\n    "fileType": "Plan",\n    "geoFence": {},\n    "mission": {"items": []}\n}\n',
     "flight_yaml": b"flight: f\nsite: lake_wheeler\nlogs:\n  - {path: a.txt}\n",
 }
 """A sample of each kind of file that is no log (the MATLAB ones aside)."""

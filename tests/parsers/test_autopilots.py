@@ -17,11 +17,12 @@ LOGS = {
     "mavlink_tlog": autopilots.tlog(2),
     "px4_ulog": autopilots.ulog(),
 }
+EACH = [*LOGS.items(), *(("px4_ulog", autopilots.ulog(place)) for place in ("integers", "doubles"))]
 
 
-@pytest.mark.parametrize("reader", LOGS)
-def test_the_same_pose_from_each(reader: str) -> None:
-    (stream,) = by_name(reader).read(LOGS[reader], ReadOptions()).streams
+@pytest.mark.parametrize(("reader", "log"), EACH)
+def test_the_same_pose_from_each(reader: str, log: bytes) -> None:
+    (stream,) = by_name(reader).read(log, ReadOptions()).streams
     frame = stream.frame
     assert frame["time"].tolist() == [pd.Timestamp((START_US + i * 10**6) * 1000) for i in range(COUNT)]
     assert frame["latitude_deg"].tolist() == pytest.approx([35.73 + i * 1e-7 for i in range(COUNT)], abs=1e-9)

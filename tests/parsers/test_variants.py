@@ -28,6 +28,7 @@ VARIANTS = {
     "spaces at the end of lines": lambda data: re.sub(rb"\r?\n", b" \n", data),
     "tabs at the end of lines": lambda data: re.sub(rb"\r?\n", b"\t\n", data),
     "a blank line behind each": lambda data: data.replace(b"\n", b"\n\n"),
+    "blank lines in front": lambda data: b"\r\n \n" + data,
     "blank lines at the end": lambda data: data + b"\n\n" if data.endswith(b"\n") else data,
 }
 
@@ -40,6 +41,18 @@ def test_line_ends_and_marks_change_nothing(variant: str, tmp_path: Path) -> Non
         options = replace(OPTIONS, columns=OPTIONS.columns if reader == "generic_csv" else {})
         (file,) = ingest(place, options=options, reader="generic_csv" if reader == "generic_csv" else None)
         assert (file.result.reader, file.result.accepted) == (reader, accepted), (reader, name)
+
+
+LATE = ("controller_log", "srsenb_log", "srsue_log", "quectel_console", "srsran_gnb", "oai_log", "amarisoft")
+
+
+@pytest.mark.parametrize(("reader", "name"), [(r, name) for r in LATE for name in SAMPLES[r]])
+def test_a_table_that_begins_behind_long_talk_is_found(reader: str, name: str, tmp_path: Path) -> None:
+    talk = b"[2025-03-02 09:59:00.000000] --  Software Radio Systems LTE: Setting frequency, please wait\n" * 1500
+    data, accepted, _ = SAMPLES[reader][name]
+    (tmp_path / "log.txt").write_bytes(talk + data)
+    (file,) = ingest(tmp_path / "log.txt", options=OPTIONS)
+    assert (file.result.reader, file.result.accepted) == (reader, accepted)
 
 
 def test_a_mark_in_front_of_a_large_log_is_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,17 +67,22 @@ def nearest(
     """
     from scipy.spatial import cKDTree
 
-    index = np.full((len(targets_m), m), -1, dtype=np.int64)
-    distance = np.full((len(targets_m), m), np.inf)
+    chosen = Neighbours(np.full((len(targets_m), m), -1, dtype=np.int64), np.full((len(targets_m), m), np.inf))
     if len(samples_m) == 0 or len(targets_m) == 0:
-        return Neighbours(index, distance)
+        return chosen
     tree = cKDTree(samples_m)
+    least = m + 1 + (skip is not None)
+    wanted = least
     for start in range(0, len(targets_m), CHUNK):
         part = np.arange(start, min(start + CHUNK, len(targets_m)))
-        _fill_nearest(
-            tree=tree, targets_m=targets_m, todo=part, radius_m=radius_m, skip=skip, index=index, distance=distance
-        )
-    return Neighbours(index, distance)
+        todo = _fill_nearest(tree, targets_m, part, radius_m, skip, wanted, chosen)
+        # scattered samples have no ties; on the paper's grid a ring of equal distance holds up to 12 cells
+        wanted = m + 13 if len(todo) > len(part) // 4 else least
+        ask = m + 13
+        while len(todo):
+            todo = _fill_nearest(tree, targets_m, todo, radius_m, skip, ask, chosen)
+            ask *= 2
+    return chosen
 
 
 def _fill_nearest(
@@ -86,34 +91,34 @@ def _fill_nearest(
     todo: IntArray,
     radius_m: float,
     skip: IntArray | None,
-    index: IntArray,
-    distance: FloatArray,
-) -> None:
-    """Fill the rows ``todo`` of index and distance; ask for more candidates where a tie reaches the last one."""
-    samples_m, m = tree.data, index.shape[1]
-    # a ring of equal distance holds at most 12 cells on the paper's grid; where a ring is larger, ask again
-    wanted = m + 13
-    while len(todo):
-        wanted = min(wanted, len(samples_m))
-        bound = radius_m + TIE_M
-        away, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=bound)
-        exhausted = (wanted == len(samples_m)) | ~np.isfinite(away[:, -1])
-        last = _in_micrometres(away[:, -1])
-        if skip is not None:
-            away[who == skip[todo, None]] = np.inf
-        order = _tie_order(away, np.where(np.isfinite(away), who, 0), samples_m, targets_m[todo])[:, :m]
-        chosen = np.take_along_axis(who, order, axis=1)
-        chosen_distance = np.take_along_axis(away, order, axis=1)
-        if order.shape[1] == m:
-            complete = exhausted | (_in_micrometres(chosen_distance[:, -1]) < last)
-        else:
-            complete = exhausted
-        rows = todo[complete]
-        width = order.shape[1]
-        index[rows, :width] = np.where(np.isfinite(chosen_distance), chosen, -1)[complete]
-        distance[rows, :width] = chosen_distance[complete]
-        todo = todo[~complete]
-        wanted *= 2
+    wanted: int,
+    chosen: Neighbours,
+) -> IntArray:
+    """Fill the rows ``todo`` from ``wanted`` candidates; the rows for which a tie reaches the last candidate."""
+    samples_m, m = tree.data, chosen.index.shape[1]
+    wanted = min(wanted, len(samples_m))
+    away, who = tree.query(targets_m[todo], k=np.arange(1, wanted + 1), distance_upper_bound=radius_m + TIE_M)
+    last = _in_micrometres(away[:, -1])
+    exhausted = (wanted == len(samples_m)) | ~np.isfinite(last)
+    if skip is not None:
+        own = who == skip[todo, None]
+        away[own] = np.inf
+        # the sample left out goes to the end, the order of the others stays
+        order = np.argsort(own, axis=1, kind="stable")
+        away, who = np.take_along_axis(away, order, axis=1), np.take_along_axis(who, order, axis=1)
+    ring = _in_micrometres(away)
+    tied = (ring[:, 1:] == ring[:, :-1]) & np.isfinite(ring[:, 1:])
+    rows = np.flatnonzero(tied.any(axis=1))
+    if len(rows):
+        here = np.where(np.isfinite(away[rows]), who[rows], 0)
+        order = _tie_order(away[rows], here, samples_m, targets_m[todo[rows]])
+        away[rows], who[rows] = (np.take_along_axis(a[rows], order, axis=1) for a in (away, who))
+    complete = exhausted | (_in_micrometres(away[:, m - 1]) < last) if wanted >= m else exhausted
+    width = min(m, wanted)
+    done = todo[complete]
+    chosen.index[done, :width] = np.where(np.isfinite(away[:, :width]), who[:, :width], -1)[complete]
+    chosen.distance_m[done, :width] = away[complete, :width]
+    return todo[~complete]
 
 
 def _in_micrometres(distance_m: FloatArray) -> FloatArray:

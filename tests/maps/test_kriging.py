@@ -473,12 +473,12 @@ def test_targets_of_one_geometry_share_one_system():
     from aerpaw_cmp.maps.kriging import _same_geometry
 
     square = np.array([[0.0, 10.0], [10.0, 0.0], [-10.0, 0.0]])
-    offsets = np.stack([square, 2 * square, square, square[::-1], square + 1e-12])
+    offsets = np.stack([square, 2 * square, square, square[::-1], square + 1e-12], axis=-1).swapaxes(0, 1)
     example, group = _same_geometry(offsets)
     assert len(example) == 3
     assert group[0] == group[2] == group[4]
     assert len({int(group[k]) for k in (0, 1, 3)}) == 3
-    np.testing.assert_allclose(offsets[example][group], offsets, atol=1e-9)
+    np.testing.assert_allclose(offsets[..., example[group]], offsets, atol=1e-9)
 
 
 def test_one_neighbour_gets_all_the_weight():

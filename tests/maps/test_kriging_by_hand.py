@@ -213,11 +213,11 @@ def test_targets_with_neighbours_at_equal_offsets_are_told_from_others():
     rng = np.random.default_rng(6)
     shapes = rng.uniform(-50, 50, (3, 4, 2))
     pick = rng.integers(0, 3, 40)
-    example, group = kriging._same_geometry(shapes[pick])
+    example, group = kriging._same_geometry(np.moveaxis(shapes[pick], 0, 2).swapaxes(0, 1))
     assert len(example) == 3
     assert (pick[example][group] == pick).all()
     swapped = np.stack([shapes[0], shapes[0][::-1], shapes[0] + [0.0, 1e-3]])
-    assert len(kriging._same_geometry(swapped)[0]) == 3
+    assert len(kriging._same_geometry(np.moveaxis(swapped, 0, 2).swapaxes(0, 1))[0]) == 3
 
 
 def test_estimates_do_not_depend_on_how_many_are_made_at_once(monkeypatch):
@@ -249,6 +249,38 @@ def test_one_step_of_refinement_gives_back_digits_that_the_inverse_lost():
         plain = max(abs(float(exact[i] - mpmath.mpf(float(inverse[i])))) for i in range(7))
     assert error < 0.5 * plain
     assert float(exact[7]) == pytest.approx(lagrange[0], abs=1e-9)
+
+
+def smooth(d):
+    return np.exp(-((np.asarray(d) / 110.0) ** 2))
+
+
+@pytest.mark.parametrize(("correlation", "doubted"), [(exponential, (0, 0)), (smooth, (1, 39))])
+def test_weights_are_those_of_fifty_digits(correlation, doubted):
+    """Random neighbourhoods, from well conditioned to nearly singular: each is solved again with mpmath."""
+    import mpmath
+
+    rng = np.random.default_rng(11)
+    points, targets = rng.uniform(0, 150, (60, 2)), rng.uniform(0, 150, (40, 2))
+    model = OrdinaryKriging(correlation, 9, np.inf, sill=1.0).fit(points, np.zeros(60))
+    rule = model.weights(targets)
+    offset = points[rule.index] - targets[:, None]
+    between = 1.0 - correlation(np.linalg.norm(offset[:, :, None] - offset[:, None], axis=-1))
+    to_target = 1.0 - correlation(np.linalg.norm(offset, axis=-1))
+    first, second = np.triu_indices(9, 1)
+    *_, sound = kriging._solve_schur(between[:, second, first].T, to_target.T)
+    assert doubted[0] <= (~sound).sum() <= doubted[1], "the case is not as hard as it should be"
+    for t in range(40):
+        with mpmath.workdps(50):
+            system = mpmath.ones(10, 10)
+            for i, j in itertools.product(range(9), repeat=2):
+                system[i, j] = 0 if i == j else mpmath.mpf(float(between[t, i, j]))
+            system[9, 9] = 0
+            right = mpmath.matrix([*map(float, to_target[t]), 1.0])
+            exact = mpmath.lu_solve(system, right)
+            variance = sum(exact[i] * right[i] for i in range(10))
+        np.testing.assert_allclose(rule.weight[t], [float(w) for w in exact[:9]], rtol=0, atol=1e-9)
+        assert rule.variance[t] == pytest.approx(float(variance), abs=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1e-15, 1e15])

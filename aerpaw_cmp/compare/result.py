@@ -169,6 +169,8 @@ class RssFurther:
     explained_by: Mapping[str, float]
     simulated_sd_db: float | None = None
     """Mean of what learned antennas state."""
+    trained_on: tuple[str, ...] | None = None
+    """SHA-256 of the logs of this series that its antennas or settings were learned from: then no error is given."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -263,6 +265,8 @@ class RankFurther:
     commonest: CommonestRank
     repeat: Mapping[str, RankRepeat]
     receiver: ForecastScore | None = None
+    trained_on: tuple[str, ...] | None = None
+    """SHA-256 of the logs of these reports that the receiver was fitted on: then it has no score."""
     foliage: Mapping[str, Mapping[str, FoliageRankChange]] | None = None
 
 

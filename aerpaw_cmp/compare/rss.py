@@ -7,7 +7,7 @@ files, sites or engines.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import pairwise
 from typing import Any
 
@@ -217,6 +217,24 @@ def compare_rss(
         lag_s=lag_s,
         fitted_on_scored=(() if offset_db is not None else ("offset_db",)) + tuple(fitted_on_scored),
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
+    )
+
+
+LEARNED_HERE = "antennas"
+"""Among the numbers that were fitted on the very samples they would be scored on."""
+
+
+def without_errors(score: RssComparison) -> RssComparison:
+    """A comparison on the flight that the antennas were learned from: offset, counts and baselines, no error."""
+    none = (float("nan"), float("nan"))
+    return replace(
+        score,
+        rmse_db=float("nan"),
+        correlation=float("nan"),
+        intervals=replace(score.intervals, rmse_db=none, correlation=none),
+        identifiable_db=none,
+        trimmed=replace(score.trimmed, rmse_db=float("nan")),
+        fitted_on_scored=(*score.fitted_on_scored, LEARNED_HERE),
     )
 
 

@@ -63,7 +63,8 @@ class RankSeries:
     sinr_db: FloatArray
     position_m: FloatArray | None
     flagged: Mapping[str, int] = field(default_factory=dict)
-    """As in :class:`RssSeries`."""
+    log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
+    """Both as in :class:`RssSeries`."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -338,7 +339,8 @@ def gather(
             elif stream.kind == "rss" and not _unnamed_cell(log, stream):
                 rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number)))
             elif stream.kind == "rank":
-                rank.append((log.path, _rank_series(log, stream, site, tower=log.node or settings.rank.tower)))
+                tower = log.node or settings.rank.tower
+                rank.append((log.path, _rank_series(log, stream, site, tower=tower, number=number)))
         if others := [s.name for s in file.result.streams if _unnamed_cell(log, s)]:
             warnings.append(f"{log.path}: {len(others)} cells that 'cells' does not name are left out")
         names = [s.name for s in file.result.streams]
@@ -548,7 +550,7 @@ def _rss_series(links: LinksSettings, log: LogSettings, stream: Stream, site: Si
     )
 
 
-def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | None) -> RankSeries:
+def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | None, number: int) -> RankSeries:
     home = _known_tower(tower, log, site)
     frame, left_out = scored_rows(stream, log.path)
     position = None
@@ -564,6 +566,7 @@ def _rank_series(log: LogSettings, stream: Stream, site: Site, *, tower: str | N
         sinr_db=sinr,
         position_m=position,
         flagged=left_out,
+        log=np.full(len(frame), number, dtype=np.int64),
     )
 
 

@@ -511,6 +511,8 @@ class FlightFile(Settings):
     towers: dict[str, GroundNode] = Field(default_factory=dict)
     """Nodes of this flight beside those of the site (a rover)."""
     timezone: str | None = None
+    trained_on: list[Annotated[str, Field(pattern="^[0-9a-f]{64}$")]] = []
+    """SHA-256 of the logs that settings of this file were learned from: nothing is scored on them."""
     logs: Annotated[list[LogSettings], Field(min_length=1)]
     link: LinksSettings = LinksSettings()
     rt: RtSettings = RtSettings()

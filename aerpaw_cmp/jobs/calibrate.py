@@ -15,6 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from ..common.errors import InputError, UsageError
+from ..common.provenance import union
 from ..common.stages import Stages
 from ..common.units import FloatArray
 from ..common.yamlfile import load_yaml
@@ -32,6 +33,7 @@ from ..compare.direction_gain import (
 from ..compare.mount import GainOf
 from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
+from ..flight.training import counted_once, flight_logs
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from .calibrate_rank import RankFitSettings
@@ -115,6 +117,11 @@ class Calibration:
     words: tuple[str, ...]
     rank: Any = field(default=None)
 
+    @property
+    def trained_on(self) -> tuple[str, ...]:
+        """SHA-256 of every log that was learned from."""
+        return union(*map(flight_logs, self.flights))
+
 
 def load_calibration(path: Path) -> CalibrationFile:
     """Read and check a calibration.yaml; UsageError as of any settings file."""
@@ -156,8 +163,9 @@ def calibrate(
     stages = stages or Stages()
     settings = load_calibration(path)
     with stages("read"):
-        flights = read_flights(settings, path.parent, logs_root)
+        flights, copies = read_flights(settings, path.parent, logs_root)
     observed, warnings = observe(flights)
+    warnings = [*copies, *warnings]
     recipe = recipe_of(settings, observed, logs_root or path.parent)
     series = [o.samples for o in observed]
     with stages("fit"):
@@ -191,8 +199,8 @@ def calibrate(
 # --- flights -------------------------------------------------------------------------------------------------------
 
 
-def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> list[FlightData]:
-    """Every flight of the calibration, gathered."""
+def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None) -> tuple[list[FlightData], list[str]]:
+    """Every flight of the calibration, gathered, each log once, and what is to be said of copies."""
     out = []
     for name in settings.flights:
         path = folder / name
@@ -202,7 +210,7 @@ def read_flights(settings: CalibrationFile, folder: Path, logs_root: Path | None
     for name in names:
         if names.count(name) > 1:
             raise UsageError(f"two flights are named {name!r}", expected="an own 'flight: {name: ...}' in each file")
-    return out
+    return counted_once(out)
 
 
 def observe(flights: Sequence[FlightData]) -> tuple[list[Observed], list[str]]:
@@ -490,7 +498,8 @@ def score_part(order: ScoreOrder) -> dict[str, tuple[Score, ...]]:
 @lru_cache(maxsize=1)
 def _prepared(path: Path, logs_root: Path | None, _stamp: str) -> tuple[list[Observed], Recipe]:
     settings = load_calibration(path)
-    observed, _ = observe(read_flights(settings, path.parent, logs_root))
+    flights, _ = read_flights(settings, path.parent, logs_root)
+    observed, _ = observe(flights)
     return observed, recipe_of(settings, observed, logs_root or path.parent)
 
 

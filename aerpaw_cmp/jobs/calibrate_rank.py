@@ -19,6 +19,7 @@ from pydantic import Field
 
 from ..common.errors import InputError, UsageError
 from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.provenance import KEY, union
 from ..common.units import FloatArray, IntArray
 from ..compare.forecast import ForecastScore, constant_forecast, score_forecast
 from ..compare.receiver import (
@@ -37,6 +38,7 @@ from ..compare.rss import seconds
 from ..flight.data import FlightData, RankSeries, rank_positions
 from ..flight.replay import attitude_rotation
 from ..flight.settings import Settings
+from ..flight.training import logs_of
 from ..propagation.arrays import Link, Poses
 from ..propagation.geometries import Geometry, every_geometry, singular_values_of
 
@@ -87,6 +89,8 @@ class RankSamples:
     rank: FloatArray
     link: Link
     time_s: FloatArray
+    logs: tuple[str, ...] = ()
+    """SHA-256 of the logs that hold the reports."""
 
     def part(self, rows: Any) -> RankSamples:
         """Some of the samples."""
@@ -114,9 +118,17 @@ class FittedReceiver:
     geometries: tuple[Geometry, ...]
     tied: int
     flights: tuple[str, ...]
-    """It was fitted on: no score there is worth anything."""
+    """Names of those that it was fitted on."""
+    trained_on: tuple[str, ...] = ()
+    """SHA-256 of their logs: no score there is worth anything; receivers of 0.3 have none."""
     mixture: ReceiverMixture
     timing: Timing = Timing()
+
+    def knows(self, samples: RankSamples) -> bool:
+        """Whether it was fitted on these reports: by the content of their logs, or, in 0.3, the name of the flight."""
+        if not self.trained_on:
+            return samples.flight in self.flights
+        return not set(self.trained_on).isdisjoint(samples.logs)
 
     def forecast(self, samples: RankSamples) -> tuple[FloatArray, IntArray]:
         """Probability (n, 4) of each rank, and the one that is said."""
@@ -129,6 +141,7 @@ class FittedReceiver:
             "geometries": [dataclasses.asdict(g) for g in self.geometries],
             "tied": self.tied,
             "flights": list(self.flights),
+            KEY: list(self.trained_on),
             "members": [one.as_dict() for one in self.mixture.members],
             "decision_weight": self.mixture.decision_weight.tolist(),
             "shift_s": self.timing.shift_s,
@@ -137,12 +150,13 @@ class FittedReceiver:
 
     @classmethod
     def from_dict(cls, tower: str, one: Mapping[str, Any]) -> FittedReceiver:
-        """From :meth:`as_dict`; files of 0.3.0 have no timing."""
+        """From :meth:`as_dict`; files of 0.3 have no timing and no logs."""
         return cls(
             tower=tower,
             geometries=tuple(_geometry(g) for g in one["geometries"]),
             tied=int(one["tied"]),
             flights=tuple(str(name) for name in one["flights"]),
+            trained_on=tuple(str(digest) for digest in one.get(KEY, ())),
             mixture=ReceiverMixture(
                 members=tuple(Receiver.from_dict(m) for m in one["members"]),
                 decision_weight=np.asarray(one["decision_weight"], dtype=np.float64),
@@ -228,6 +242,7 @@ def rank_samples(data: FlightData, series: RankSeries) -> RankSamples:
         rank=series.rank[keep],
         link=link,
         time_s=seconds(series.time[keep]),
+        logs=logs_of(data, series),
     )
 
 
@@ -356,6 +371,7 @@ class Tried:
             geometries=kept,
             tied=len(choice.tied),
             flights=tuple(one.flight for one in whole),
+            trained_on=union(*(one.logs for one in whole)),
             mixture=mixture,
             timing=timing,
         )

@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import UsageError
+from ..common.provenance import KEY
 from ..common.units import FloatArray
 from ..common.versions import versions
 from ..compare.calibration import Learned
@@ -74,6 +75,7 @@ def antenna_files(
         f"aerpaw-cmp calibrate: {calibration.settings.calibration}, from {names}",
         "gain of the antenna as mounted: UAV in the body frame (x forward, y left, z up), tower in east-north-up",
         "azimuth counter-clockwise from x; level normalised to a mean of 0 dBi; gain_sd_db: standard deviation",
+        f"{KEY}: {' '.join(calibration.trained_on)}",
     )
     made = datetime.now(timezone.utc).isoformat(timespec="seconds")
     out: dict[str, str | bytes] = {}
@@ -88,7 +90,8 @@ def antenna_files(
             "history": f"{made} written by aerpaw-cmp calibrate, calibration {calibration.settings.calibration}",
             "institution": "not stated",
             "references": "https://arxiv.org/abs/2502.10324",
-            "comment": "; ".join(notes[1:]),
+            "comment": "; ".join(notes[1:-1]),
+            KEY: " ".join(calibration.trained_on),
         }
         sphere = sphere_netcdf(one.gain_dbi, one.sd_db, said, carrier_hz)
         if sphere is not None:
@@ -103,6 +106,9 @@ def settings_text(calibration: Calibration, folder_name: str) -> str:
         f"{MARK}: {calibration.settings.calibration}. Learned from {', '.join(names)}.",
         *(f"# {text}" for text in calibration.words),
         "# Put this into a flight.yaml; files resolve against its folder, or --logs-root.",
+        "# SHA-256 of the logs: nothing is scored on them",
+        f"{KEY}:",
+        *(f"  - {digest}" for digest in calibration.trained_on),
         "link:",
         "  channels:",
     ]
@@ -166,6 +172,7 @@ def record_of(
         name=calibration.settings.calibration,
         generated=datetime.now(timezone.utc).isoformat(timespec="seconds"),
         flights=[data.settings.flight.name for data in calibration.flights],
+        trained_on=calibration.trained_on,
         words=calibration.words,
         warnings=calibration.warnings,
         scores={k: [dataclasses.asdict(s) for s in v] for k, v in calibration.scores.items()},

@@ -22,13 +22,14 @@ from ..common.stages import Progress, silent
 from ..common.versions import versions
 from ..common.yamlfile import load_yaml, nearest
 from ..compare.heldout import rmse
+from ..compare.rss import LEARNED_HERE
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, Settings, load_flight
 from ..report.campaign_data import CampaignData, Failure, HeldOutFold, RankHeldOutFold, RankRow, RssRow
 from .campaign_fit import Bench, Point, Spread, bench_of, fit_all
 from .campaign_plan import compute, kept_outcomes
 from .campaign_rank_fit import K_KEY, fit_rank_all
-from .campaign_tasks import Task, flight_data
+from .campaign_tasks import Task, counted_once, flight_data
 from .over_flights import RepeatSettings, pool_offsets, rank_repeats, repeats, transfer_ranks
 from .place import check_place, open_place
 from .workers import Lost, Workers, open_workers
@@ -172,7 +173,7 @@ def run(
     ) as crew:
         with stage("flights"):
             compute(tasks, orders, crew, progress, outcomes)
-        results = [outcomes[number] for number in range(len(tasks))]
+        results = counted_once(tasks, [outcomes[number] for number in range(len(tasks))])
         rank = tuple(row for o in results for row in o.rank)
         flown = tuple(one for o in results for one in o.flown)
         failures += [o.failure for o in results if o.failure is not None]
@@ -299,7 +300,8 @@ def _tasks_of_fit(
 ) -> tuple[str, dict[str, Task]]:
     """Label of the setting that a fit starts from, and the task of each flight that gave rows under it."""
     label = settings.setting or tasks[0].setting if tasks else ""
-    gave = {row.flight for row in rows if row.setting == label}
+    learned = {row.flight for row in rows if isinstance(row, RssRow) and LEARNED_HERE in row.fitted}
+    gave = {row.flight for row in rows if row.setting == label} - learned
     return label, {task.flight: task for task in tasks if task.setting == label and task.flight in gave}
 
 

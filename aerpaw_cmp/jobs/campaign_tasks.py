@@ -25,6 +25,7 @@ from ..compare.result import FlightResult, RankResult, RssResult
 from ..flight.data import FlightData, gather, read_logs
 from ..flight.overrides import Overrides, overridden
 from ..flight.settings import FlightFile, RssSettings, load_flight
+from ..flight.training import logs_of
 from ..report import campaign_data
 from ..report.campaign_data import Failure, FlownRank, FlownTrack, RankRow, RssRow
 from .flight_run import run_flight
@@ -56,6 +57,23 @@ class Outcome:
     failure: Failure | None = None
     track: FlownTrack | None = None
     flown: tuple[FlownRank, ...] = ()
+
+
+def counted_once(tasks: Sequence[Task], outcomes: Sequence[Outcome]) -> list[Outcome]:
+    """Outcomes in the order of their tasks; a flight that holds the log of an earlier one is a failure that says so.
+
+    A log that comes twice, renamed, copied or packed, would be pooled twice and predicted from itself.
+    """
+    home: dict[str, str] = {}
+    kept = []
+    for task, outcome in zip(tasks, outcomes, strict=True):
+        logs = {digest for rows in (outcome.rss, outcome.rank) for row in rows for digest in row.logs}  # type: ignore[attr-defined]
+        again = sorted(digest for digest in logs if home.setdefault(digest, task.flight) != task.flight)
+        if again:
+            message = f"it holds the same log as {home[again[0]]} (SHA-256 {again[0][:12]}...): it is counted once"
+            outcome = Outcome(failure=Failure(flight=task.flight, setting=task.setting, message=message))
+        kept.append(outcome)
+    return kept
 
 
 def _stamp(path: Path) -> tuple[int, int]:
@@ -106,9 +124,17 @@ def run_task(task: Task) -> Outcome:
         return _failed(task, str(error), error)
     except Exception as error:  # one flight's fault must not cost the others their numbers
         return _failed(task, f"a fault of the program itself: {type(error).__name__}: {error}", error)
+    data, found = flight_run.data, flight_run.result
     return Outcome(
-        rss=tuple(_rss_row(task, flight_run.data.settings.rss, one) for one in flight_run.result.rss),
-        rank=tuple(row for one in flight_run.result.rank for row in _rank_rows(task, one)),
+        rss=tuple(
+            _rss_row(task, data.settings.rss, one, logs_of(data, series))
+            for one, series in zip(found.rss, data.rss, strict=True)
+        ),
+        rank=tuple(
+            row
+            for one, series in zip(found.rank, data.rank, strict=True)
+            for row in _rank_rows(task, one, logs_of(data, series))
+        ),
         track=_flown(task, flight_run.result),
         flown=tuple(
             FlownRank(
@@ -314,8 +340,10 @@ def _elapsed_s(time: AnyArray) -> FloatArray:
     return np.asarray((time - time[:1]) / np.timedelta64(1, "s"), dtype=np.float64)
 
 
-def _rss_row(task: Task, rules: RssSettings, result: RssResult) -> RssRow:
+def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str, ...]) -> RssRow:
     score, clock = result.score, result.further.clock
+    # nothing is pooled or ranked from the flight that its antennas were learned from
+    measured_db = np.full_like(result.measured_db, np.nan) if result.further.trained_on else result.measured_db
     return RssRow(
         flight=task.flight,
         setting=task.setting,
@@ -338,7 +366,7 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult) -> RssRow:
         baselines={name: model.rmse_db for name, model in result.baselines.items()},
         step_db=rules.step_db,
         span_db=rules.span_db,
-        measured_db=result.measured_db,
+        measured_db=measured_db,
         simulated_dbm=result.simulated_dbm,
         time_s=_elapsed_s(result.time),
         start_ns=_start_ns(result.time),
@@ -346,11 +374,12 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult) -> RssRow:
         distance_m=result.geometry["distance_m"],
         heading_deg=result.geometry.get("heading_deg"),
         within=result.further.repeatability,
-        difference=offset.difference_moments(result.measured_db, result.simulated_dbm),
+        difference=offset.difference_moments(measured_db, result.simulated_dbm),
+        logs=logs,
     )
 
 
-def _rank_rows(task: Task, result: RankResult) -> list[RankRow]:
+def _rank_rows(task: Task, result: RankResult, logs: tuple[str, ...]) -> list[RankRow]:
     score = result.score
     return [
         RankRow(
@@ -369,6 +398,7 @@ def _rank_rows(task: Task, result: RankResult) -> list[RankRow]:
             total_variation_ci95=fit.total_variation_ci95,
             wasserstein=fit.wasserstein,
             commonest_agreement=result.further.commonest.agreement,
+            logs=logs,
         )
         for k, fit in score.simulated.items()
     ]

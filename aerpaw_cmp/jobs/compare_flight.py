@@ -43,6 +43,7 @@ from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.losses import direct_foliage_m
 from ..flight.replay import FlightReplay, Replayed, may_share
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
+from ..flight.training import learned_here
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
@@ -152,6 +153,9 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
         levels.measured_db, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db
     )
+    if trained := learned_here(data, series, replayed.link):
+        score, alternatives, residual_by = rss.without_errors(score), {}, {}
+        curve_offset_db = curve_rmse_db = np.zeros(0)
     return RssResult(
         tower=series.tower,
         channel=series.channel,
@@ -169,7 +173,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         variants=_variants(settings, levels, alternatives),
         curve_offset_db=curve_offset_db,
         curve_rmse_db=curve_rmse_db,
-        spans=tuple(_worst(series.time, score.residual_db, position, geometry, direct)),
+        spans=() if trained else tuple(_worst(series.time, score.residual_db, position, geometry, direct)),
         residual_by=residual_by,
         further=RssFurther(
             n_measured_out=score.n_measured_out,
@@ -182,15 +186,16 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             n_flagged=dict(series.flagged),
             clock=None if clock is None else clock.result,
             baseline_rmse_ci95_db=score.baseline_intervals,
-            compared_with=_paired(levels, {**simple, **alternatives}, settings.bootstrap),
-            averaged=_averaged(series, replayed, levels, position, settings),
-            censored=_censored(settings, levels),
-            snr=_snr(series, levels),
+            compared_with={} if trained else _paired(levels, {**simple, **alternatives}, settings.bootstrap),
+            averaged={} if trained else _averaged(series, replayed, levels, position, settings),
+            censored=None if trained else _censored(settings, levels),
+            snr=None if trained else _snr(series, levels),
             expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
             simulated_sd_db=None if stated_sd is None else float(np.nanmean(stated_sd)),
+            trained_on=trained or None,
         ),
         simulated_sd_db=stated_sd,
     )
@@ -514,7 +519,7 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
     )
     paired = foliage_ranks(data.site, data.settings.rt, replayed, kept, settings.k)
     sigma, towers = ranks.singular_values(h), tower_places(replayed)
-    probability, forecast = _receiver_forecast(data, series)
+    probability, forecast, trained = _receiver_forecast(data, series)
     return RankResult(
         tower=series.tower,
         n_samples=len(series.rank),
@@ -534,17 +539,20 @@ def compare_rank_series(data: FlightData, series: RankSeries, replayed: Replayed
             commonest=ranks.commonest_rank(series.rank[rows]),
             repeat=_repeated_rank(series.time[rows], position[rows], series.rank[rows], replayed, rows),
             receiver=forecast,
+            trained_on=trained or None,
             foliage=foliage_rank_difference(paired) or None,
         ),
         probability=probability,
     )
 
 
-def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray | None, ForecastScore | None]:
-    """Probability (n, 4) of each rank by the receiver of the flight file, and its score; None without one."""
+def _receiver_forecast(
+    data: FlightData, series: RankSeries
+) -> tuple[FloatArray | None, ForecastScore | None, tuple[str, ...]]:
+    """Probability (n, 4) of each rank by the receiver of the flight file, its score, and logs that it was fitted on."""
     named = data.settings.rank.receiver
     if named is None:
-        return None, None
+        return None, None, ()
     receivers = read_receiver(data.folder / named)
     if series.tower not in receivers:
         raise InputError(
@@ -554,11 +562,11 @@ def _receiver_forecast(data: FlightData, series: RankSeries) -> tuple[FloatArray
         )
     samples, receiver = rank_samples(data, series), receivers[series.tower]
     probability, said = receiver.forecast(samples)
-    if samples.flight in receiver.flights:  # nothing is scored where it was fitted
-        return probability, None
+    if receiver.knows(samples):  # nothing is scored where it was fitted
+        return probability, None, samples.logs
     constant = receiver.mixture.members[0].constant
     replicates = max(data.settings.rank.bootstrap, 2)
-    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates)
+    return probability, score_forecast(samples.rank, probability, said, constant, replicates=replicates), ()
 
 
 def _repeated_rank(

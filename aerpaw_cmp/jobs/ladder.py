@@ -10,6 +10,7 @@ import dataclasses
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, Literal
 
 import numpy as np
@@ -24,6 +25,7 @@ from ..flight.data import FlightData, RssSeries
 from ..flight.losses import path_loss
 from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_from
 from ..flight.settings import FlightFile, RssSettings
+from ..flight.training import learned_here
 from ..propagation.arrays import Link, Poses
 from ..propagation.channel import mean_pair_power, rss_dbm
 from ..propagation.moving import replay_moving
@@ -228,19 +230,20 @@ class _Climber:
     def _as_set(self) -> Rung:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
         seconds = sum(s.replayed.replay.seconds for s in self._series)
-        if self._learned_here():
+        if self._learned_here:
             nothing = tuple(np.full(len(level), np.nan) for level in levels)
             return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
         return Rung(model=AS_SET, level_db=levels, seconds=seconds)
 
+    @cached_property
     def _learned_here(self) -> bool:
-        """Whether antennas of the flight file were learned from this very flight."""
-        patterns = [p for s in self._series for a in _arrays(s.replayed.link) for p in a.patterns]
-        name = self._data.settings.flight.name
-        return any(isinstance(p, SpherePattern) and name in p.learned_from for p in patterns)
+        """Whether antennas or settings of the flight file were learned from a log of this very flight."""
+        pairs = zip(self._data.rss, self._series, strict=True)
+        return any(learned_here(self._data, series, s.replayed.link) for series, s in pairs)
 
     def _rung(self, model: Model) -> Rung:
-        if model.antennas == "learned" and self._learned_here():
+        learned = model.antennas in ("learned", "installed") or model.ground == "rough"
+        if learned and self._learned_here:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
         levels = [self._level(i, model) for i in range(len(self._series))]

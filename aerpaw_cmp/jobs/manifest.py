@@ -12,8 +12,10 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
+from ..common.files import LARGEST_TABLE
 from ..common.inputs import named_files
 from ..common.outputs import file_digest
+from ..common.provenance import trained_on
 from ..flight.settings import FlightFile
 from ..report.data import InputFile
 
@@ -79,6 +81,14 @@ def digest_of(place: Path, _size: int, _mtime_ns: int) -> str:
     return file_digest(place)
 
 
+@lru_cache(maxsize=1024)
+def _learned_on(place: Path, size: int, _mtime_ns: int) -> tuple[str, ...]:
+    """SHA-256 of the logs that a file says it was learned from."""
+    if size > LARGEST_TABLE:
+        return ()
+    return trained_on(place.read_bytes().decode("utf-8", errors="replace"))
+
+
 def _entry(name: str, place: Path, role: str) -> InputFile:
     status = os.stat(place)  # noqa: PTH116
     return InputFile(
@@ -90,4 +100,5 @@ def _entry(name: str, place: Path, role: str) -> InputFile:
         rejected=0,
         blank=0,
         role=role,
+        learned_on=_learned_on(place, status.st_size, status.st_mtime_ns),
     )

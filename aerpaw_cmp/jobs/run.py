@@ -1065,5 +1065,7 @@ def _calibrated_rank(settings: Any, path: Path, logs_root: Path | None, stages: 
     from .calibrate_rank import fit_rank
 
     with stages("rank"):
-        flights = read_flights(settings, path.parent, logs_root)
-        return fit_rank(flights, settings.rank), any(data.rss for data in flights)
+        flights, copies = read_flights(settings, path.parent, logs_root)
+        ranked = fit_rank(flights, settings.rank)
+        ranked = replace(ranked, warnings=(*copies, *ranked.warnings))
+        return ranked, any(data.rss for data in flights)

@@ -60,7 +60,7 @@ class Whole(Exception):  # noqa: N818 - no error: the caller reads the file in o
 
 
 def read(place: Path, reader: Reader, options: ReadOptions) -> tuple[ReadResult, str]:
-    """What ``reader.read`` gives for the whole file, and its SHA-256.
+    """What ``reader.read`` gives for the whole file, and the SHA-256 of its content after unpacking.
 
     Raises
     ------
@@ -72,7 +72,7 @@ def read(place: Path, reader: Reader, options: ReadOptions) -> tuple[ReadResult,
     assert reader.in_blocks is not None
     digest = hashlib.sha256()
     try:
-        result = reader.in_blocks(_contents(place, digest), options)
+        result = reader.in_blocks(counted(_contents(place), digest), options)
     except zlib.error as error:
         raise InputError(f"a damaged gzip file ({error})", cause="a cut download", path=place) from error
     return result, digest.hexdigest()
@@ -151,13 +151,19 @@ def first_line(data: bytes, options: ReadOptions) -> int:  # noqa: ARG001 - the 
     return data.find(b"\n") + 1
 
 
-def _contents(place: Path, digest: Any) -> Iterator[bytes]:
-    """Chunks of a file, gunzipped where needed; the digest is that of the bytes on disk."""
+def counted(chunks: Iterator[bytes], digest: Any) -> Iterator[bytes]:
+    """The chunks, each added to a digest as it passes."""
+    for chunk in chunks:
+        digest.update(chunk)
+        yield chunk
+
+
+def _contents(place: Path) -> Iterator[bytes]:
+    """Chunks of a file, gunzipped where needed."""
     machine: Any = None
     first, inside, packed, unpacked = True, False, 0, 0
     with place.open("rb") as file:
         while chunk := file.read(_CHUNK):
-            digest.update(chunk)
             if first and chunk.startswith(b"\x1f\x8b"):
                 machine = zlib.decompressobj(zlib.MAX_WBITS | 16)
             first = False

@@ -49,7 +49,7 @@ class IngestedFile:
     path : str
         As the user or the folder gave it.
     sha256 : str
-        Of the bytes on disk, before gunzipping.
+        Of the content after unpacking: a log is known by it, whatever its name or archive.
     result : ReadResult
     """
 

@@ -54,16 +54,15 @@ class Ingested(list[IngestedFile]):
 
 
 def read_bytes(path: str | Path) -> tuple[bytes, str]:
-    """Content of a log, unpacked where it is a gzip, bzip2 or xz file, and the sha256 of the file.
+    """Content of a log, unpacked where it is a gzip, bzip2 or xz file, and its SHA-256: what a log is known by.
 
     Raises
     ------
     InputError
         If the file is missing, not readable, no file, too large, or a damaged packed file.
     """
-    raw = _raw(Path(path))
-    digest = hashlib.sha256(raw).hexdigest()
-    return _unpacked(raw, path), digest
+    data = _unpacked(_raw(Path(path)), path)
+    return data, hashlib.sha256(data).hexdigest()
 
 
 def _unpacked(raw: bytes, path: str | Path) -> bytes:
@@ -133,8 +132,8 @@ def ingest(
             inside, left = _folder(place, options, chosen)
         elif _is_archive(place):
             inside, left = _archive(place, options, chosen)
-        elif chosen is None and _head(place).startswith(_HDF5):
-            files += read_flight(place)
+        elif _head(place).startswith(_HDF5):
+            files += [_of_kind(one, chosen, place) for one in read_flight(place)]
             continue
         else:
             files.append(read_file(place, options=options, reader=chosen))
@@ -233,7 +232,16 @@ def read_log(root: Path, name: str, options: ReadOptions, *, reader: str | None 
         )
     if reader is not None:
         _refuse_other_kind(path, by_name(reader))
-    (file,) = ingest([path], options=options, reader=reader)
+    files = ingest([path], options=options, reader=reader)
+    if len(files) != 1:
+        names = ", ".join(one_line(Path(one.path).name) for one in files[:4])
+        raise UsageError(
+            f"{len(files)} logs stand under one path: {names}",
+            expected=f"one of them, such as {name}/{one_line(Path(files[0].path).name)}",
+            cause="a folder, an archive or a flight file of several logs",
+            path=path,
+        )
+    (file,) = files
     if not file.result.streams:
         raise InputError(
             "no record could be read",
@@ -301,9 +309,9 @@ def _member(
     head = member.read(DEEP_BYTES)
     if chosen is None and member.size > DEEP_BYTES and packed.form(head) is None and not archives.is_archive(head):
         chosen = identify(as_utf8(head), path=str(path))
-    raw = member.read(None)
-    digest = hashlib.sha256(raw).hexdigest()
-    data = as_utf8(_unpacked(raw, path))
+    unpacked = _unpacked(member.read(None), path)
+    digest = hashlib.sha256(unpacked).hexdigest()
+    data = as_utf8(unpacked)
     if archives.is_archive(data[:HEAD_BYTES]):
         raise InputError("an archive inside an archive: unpack it", path=path)
 
@@ -334,6 +342,8 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     place = Path(path)
     if (part := None if _present(place) else archives.inside(place)) is not None:
         archive, name = part
+        if _head(archive).startswith(_HDF5):
+            return _of_kind(_source(archive, name), reader, archive)
         content = archives.members(read_bytes(archive)[0], archive)
         if name not in content:
             raise InputError(f"the archive has no member {name!r}", cause="a misspelt path", path=archive)
@@ -356,6 +366,28 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
     return _read(place, data, digest, reader or identify(data, path=str(path)), options)
 
 
+def _of_kind(file: IngestedFile, chosen: Reader | None, flight_file: Path) -> IngestedFile:
+    """A log of a flight file, which is read already: by the reader that was named, where one was."""
+    if chosen is not None and file.result.reader != chosen.name:
+        raise InputError(
+            f"{one_line(file.path)} was read by {file.result.reader!r}",
+            expected=f"a log of reader {chosen.name!r}",
+            cause="another log, or the wrong reader",
+            path=flight_file,
+        )
+    return file
+
+
+def _source(flight_file: Path, name: str) -> IngestedFile:
+    """One of the logs that a flight file holds, by its path or the end of it."""
+    files = read_flight(flight_file)
+    named = [one for one in files if one.path == name or Path(one.path).as_posix().endswith(f"/{name}")]
+    if len(named) != 1:
+        known = ", ".join(one_line(one.path) for one in files)
+        raise InputError(f"{len(named)} of its logs are called {name!r}", expected=f"one of {known}", path=flight_file)
+    return named[0]
+
+
 def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -> IngestedFile | None:
     """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
     from . import limits
@@ -371,7 +403,8 @@ def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -
     try:
         if other:
             made = hashlib.sha256()
-            result, digest = reader.in_blocks(packed.stream(place, made), given), made.hexdigest()
+            result = reader.in_blocks(blocks.counted(packed.stream(place), made), given)
+            digest = made.hexdigest()
         else:
             result, digest = blocks.read(place, reader, given)
     except blocks.Whole:

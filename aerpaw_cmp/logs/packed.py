@@ -138,7 +138,7 @@ def head_of(place: Path, count: int) -> bytes:
     """The first bytes of what a packed file holds, none where it is damaged: reading it says so."""
     made = b""
     try:
-        for piece in pieces(_chunks(place, None), place):
+        for piece in pieces(_chunks(place), place):
             made += piece
             if len(made) >= count:
                 break
@@ -147,14 +147,12 @@ def head_of(place: Path, count: int) -> bytes:
     return made[:count]
 
 
-def stream(place: Path, digest: Any) -> Iterator[bytes]:
-    """Content of a packed file on disk, some MiB at a time; ``digest`` takes the bytes on disk."""
-    return pieces(_chunks(place, digest), place)
+def stream(place: Path) -> Iterator[bytes]:
+    """Content of a packed file on disk, some MiB at a time."""
+    return pieces(_chunks(place), place)
 
 
-def _chunks(place: Path, digest: Any) -> Iterator[bytes]:
+def _chunks(place: Path) -> Iterator[bytes]:
     with place.open("rb") as file:
         while chunk := file.read(_PIECE):
-            if digest is not None:
-                digest.update(chunk)
             yield chunk

@@ -36,7 +36,8 @@ def join(files: Sequence[IngestedFile]) -> list[IngestedFile]:
 
 def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     """One log of the pieces; its lines are theirs, one behind the other."""
-    digest = hashlib.sha256("".join(file.sha256 for file in group).encode()).hexdigest()
+    pieces = sorted(file.sha256 for file in group)  # whatever the pieces are called
+    digest = hashlib.sha256("".join(pieces).encode()).hexdigest()
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}
     rejected: list[RejectedLine] = []

@@ -150,7 +150,9 @@ def rss_panel(result: RssResult) -> record.RssPanel:
         baselines=tuple(
             _baseline(name, model, result.further.compared_with.get(name)) for name, model in result.baselines.items()
         ),
-        offset_curve=record.OffsetCurve(offset_db=result.curve_offset_db, rmse_db=result.curve_rmse_db),
+        offset_curve=record.OffsetCurve(offset_db=result.curve_offset_db, rmse_db=result.curve_rmse_db)
+        if len(result.curve_offset_db)
+        else None,
         east_m=position[:, 0],
         north_m=position[:, 1],
         up_m=position[:, 2],

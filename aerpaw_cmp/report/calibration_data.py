@@ -38,6 +38,7 @@ class CalibrationData:
     name: str
     generated: str
     flights: Sequence[str]
+    trained_on: Sequence[str]
     words: Sequence[str]
     warnings: Sequence[str]
     scores: Mapping[str, Sequence[Mapping[str, Any]]]

@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from ..common.jsonable import json_safe
+from ..common.provenance import KEY
 from ..compare.calibration import BASELINES
 from . import canvas
 from .calibration_data import AntennaMap, CalibrationData
@@ -37,6 +38,7 @@ def calibration_metrics(data: CalibrationData) -> dict[str, Any]:
             "generated": data.generated,
             "versions": dict(sorted(data.versions.items())),
             "flights": list(data.flights),
+            KEY: list(data.trained_on),
             "scores": {k: list(v) for k, v in data.scores.items()},
             "controls": {k: list(v) for k, v in data.controls.items()},
             "mounts": data.mounts,

@@ -64,6 +64,8 @@ class RssRow:
     pooled_rmse_db: float = float("nan")
     held_out_offset_db: float = float("nan")
     held_out_rmse_db: float = float("nan")
+    logs: tuple[str, ...] = ()
+    """SHA-256 of the logs that hold the samples."""
 
     @property
     def key(self) -> tuple[str, str, str]:
@@ -113,6 +115,8 @@ class RankRow:
     best_k_ci95: Interval | None
     commonest_agreement: float = float("nan")
     """Agreement of always saying the commonest rank: what a model has to beat."""
+    logs: tuple[str, ...] = ()
+    """SHA-256 of the logs that hold the reports."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -15,6 +15,7 @@ from markupsafe import Markup
 from ..common.jsonable import json_safe
 from ..common.stages import Progress, silent
 from ..compare.result import Repeated
+from ..compare.rss import LEARNED_HERE
 from . import campaign_figures, canvas
 from .campaign_data import CampaignData, RankHeldOutFold, RankRow, RssRow
 from .campaign_explorer import payload
@@ -294,6 +295,11 @@ def warnings(data: CampaignData) -> list[str]:
         out += [f"Fitted on {on}: {name} has no effect; its value means nothing." for name in fold.without_effect]
         if not fold.applied_to:
             out.append(f"Fitted on {on}: no flight was held out, so every number of the fit is scored on its own data.")
+    out += [
+        f"{row.flight}, {row.setting}, {row.link}: its antennas were learned from this very log, so it is not scored."
+        for row in data.rss
+        if LEARNED_HERE in row.fitted
+    ]
     out += [
         f"{row.flight}, {row.setting}, {row.link}: the best offset lies at the edge of the searched span."
         for row in data.rss

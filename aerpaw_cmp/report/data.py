@@ -14,6 +14,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
+from ..common.provenance import KEY
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from ..compare.ladder import LadderRow
 from ..compare.result import AuditResult, EngineResult
@@ -57,6 +58,8 @@ class InputFile:
     role: str = ""
     warnings: tuple[str, ...] = ()
     rejected_lines: tuple[RejectedLine, ...] = ()
+    learned_on: tuple[str, ...] = ()
+    """SHA-256 of the logs that this file was learned from; none of other files."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -269,6 +272,11 @@ class RssPanel:
     per_sample: Mapping[str, FloatArray] = field(default_factory=dict)
     """Further columns (n,) of rss.csv, by name with unit."""
     source: Source | None = None
+
+    @property
+    def training(self) -> bool:
+        """Whether the antennas were learned from the very logs of this panel: no error is given then."""
+        return bool(self.extra.get(KEY))
 
     @property
     def name(self) -> str:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..common.jsonable import json_safe
+from ..common.provenance import KEY, union
 from ..logs.records import has_wall_clock
 from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
@@ -42,9 +43,11 @@ def metrics(data: ReportData) -> dict[str, Any]:
                 "blank": f.blank,
                 "role": f.role,
                 "warnings": list(f.warnings),
+                **({"learned_on": list(f.learned_on)} if f.learned_on else {}),
             }
             for f in data.inputs
         ],
+        KEY: list(union(*(f.learned_on for f in data.inputs))),
         "settings": json_safe(data.settings),
         "rss": rss,
         "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},

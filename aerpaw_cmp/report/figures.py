@@ -161,8 +161,8 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
                 if len(panel.time) > POINTS_PER_CLOUD
                 else ""
             ),
-            alt=f"RSS of {panel.name} over time, measured against simulated; RMSE {panel.rmse_db:.1f} dB over "
-            f"{panel.n} samples.",
+            alt=f"RSS of {panel.name} over time, measured against simulated"
+            + (f"; RMSE {panel.rmse_db:.1f} dB over {panel.n} samples." if not panel.training else "; no error given."),
             draw=lambda: rss_over_time(data, panel),
         ),
         FigureSpec(

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..common.provenance import KEY, union
 from ..compare.result import AuditResult
 from .data import Baseline, RankAtK, RankPanel, ReportData, RssPanel
-from .words import count, pretty
+from .words import count, pretty, training_sentence
 
 NO_INTERVAL = "no interval can be given"
 
@@ -36,9 +37,27 @@ def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
     scored = _scored(data.rss)
     first = _rss_sentence(scored) if scored else _rank_sentence(data.rank)
+    if learned := _training(data):
+        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, _trust(data)) if part)
     if not first:
         return ("Nothing could be compared: no sample has a measurement, a pose and a path at once.", _trust(data))
     return first, " ".join(part for part in (_fails(scored), _trust(data)) if part)
+
+
+def _training(data: ReportData) -> str:
+    """The sentence of a training flight; nothing where nothing was learned from the logs of this one."""
+    for panels, what in ((data.rss, "the antennas"), (data.rank, "the receiver")):
+        learned = [panel for panel in panels if panel.extra.get(KEY)]
+        if learned:
+            names = [panel.name if isinstance(panel, RssPanel) else panel.tower for panel in learned]
+            return training_sentence(names, what, union(*(panel.extra[KEY] for panel in learned)))
+    return ""
+
+
+def _baseline_sentence(panels: Sequence[RssPanel]) -> str:
+    """What a model without anything learned leaves on the panels of a training flight."""
+    best = best_baseline([panel for panel in panels if panel.training])
+    return "" if best is None else f"For comparison, {pretty(best[0])}: RMSE {best[1]:.1f} dB."
 
 
 def _scored(panels: Sequence[RssPanel]) -> list[RssPanel]:

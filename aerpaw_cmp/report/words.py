@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+from ..common.provenance import KEY
 from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE
 from .data import Interval, RankPanel, ReportData, RssPanel
@@ -107,8 +108,20 @@ def _pooled(rows: Sequence[LadderRow]) -> float:
     return math.sqrt(sum(row.n * row.rmse_heldout_db**2 for row in rows) / n) if n else float("nan")
 
 
+def training_sentence(names: Sequence[str], what: str, digests: Sequence[str]) -> str:
+    """First words of a report on a log that something was learned from: no error of it is a prediction's."""
+    shown = ", ".join(f"{digest[:12]}..." for digest in digests[:3]) + (" and others" if len(digests) > 3 else "")
+    return (
+        f"Training flight: {what} of {_listed(list(names))} {'was' if what == 'the receiver' else 'were'} learned from "
+        f"this flight's own log (SHA-256 {shown}). No error of the learned model is given here: it would be the error "
+        "of the fit."
+    )
+
+
 def rss_verdict(panel: RssPanel) -> str:
     """How well one channel is predicted, and whether the baselines do better."""
+    if panel.training:
+        return training_sentence([panel.name], "the antennas", panel.extra[KEY])
     if panel.n == 0 or not math.isfinite(panel.rmse_db):
         return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
     text = (
@@ -143,11 +156,12 @@ def rank_verdict(panel: RankPanel) -> str:
     if not scored:
         return f"{panel.tower} rank: nothing to score; no sample has both a reported rank and a simulated one."
     best = min(scored, key=lambda at: at.total_variation)
+    learned = f" {training_sentence([panel.tower], 'the receiver', panel.extra[KEY])}" if panel.extra.get(KEY) else ""
     agree = f" and agrees pose by pose in {100 * best.agreement:.0f} %" if math.isfinite(best.agreement) else ""
     kappa = f" (kappa {best.kappa:.2f}; 0 is chance{_beside_kappa(panel)})" if math.isfinite(best.kappa) else ""
     return (
         f"{panel.tower} rank: of the K shown, K = {best.k:.10g} comes nearest to the reported distribution "
-        f"(total variation {best.total_variation:.2f}){agree}{kappa}."
+        f"(total variation {best.total_variation:.2f}){agree}{kappa}.{learned}"
     )
 
 

@@ -12,6 +12,7 @@ import numpy as np
 from ..common.cf import CONVENTIONS, DB
 from ..common.errors import InputError
 from ..common.files import LARGEST_TABLE, read_bounded
+from ..common.provenance import trained_on
 from ..common.units import FloatArray, db_from_power, power_from_db
 from .antennas import HIGHEST_DBI, MeasuredPattern
 
@@ -27,7 +28,9 @@ class SpherePattern(MeasuredPattern):
     gain_dbi, sd_db : (thetas, phis)
         Zenith angle 0 to 180 deg and azimuth 0 to below 360 deg, both equally spaced.
     learned_from : tuple of str
-        Flights that the gain was learned from, where the file says so: on those it must not be scored.
+        Names of the flights that the gain was learned from, where the file says so.
+    trained_on : tuple of str
+        SHA-256 of their logs: on those it must not be scored.
     """
 
     def __init__(
@@ -37,9 +40,11 @@ class SpherePattern(MeasuredPattern):
         sd_db: FloatArray,
         frequency_hz: float | None = None,
         learned_from: tuple[str, ...] = (),
+        trained_on: tuple[str, ...] = (),
     ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
         self.learned_from = learned_from
+        self.trained_on = trained_on
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
@@ -165,7 +170,7 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     gain[row, column] = values[:, 2]
     if len(header) > 3:
         sd[row, column] = values[:, 3]
-    return SpherePattern(name or path.stem, gain, sd, learned_from=_flights_in(text))
+    return SpherePattern(name or path.stem, gain, sd, learned_from=_flights_in(text), trained_on=trained_on(text))
 
 
 LEARNED = "# aerpaw-cmp calibrate: "

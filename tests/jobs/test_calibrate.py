@@ -199,7 +199,8 @@ def test_dataset12_each_way(tmp_path: Path) -> None:
 def test_workers_score_to_the_same_digit(folder: Path, metrics: dict) -> None:
     """They read the flights themselves; splits and controls are those of one process, in its order."""
     path = folder / "calibration.yaml"
-    observed, _ = observe(read_flights(load_calibration(path), folder, None))
+    flights, _ = read_flights(load_calibration(path), folder, None)
+    observed, _ = observe(flights)
     crew = SentByPickle()
     scores, controls = score_on(crew, path, None, recipe_of(load_calibration(path), observed, folder))
     assert max(crew.sizes) < 2000

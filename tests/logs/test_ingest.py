@@ -127,14 +127,33 @@ def test_summary_of_a_single_sample_has_no_rate(tmp_path: Path) -> None:
     assert stream["rate_hz"] is None
 
 
-def test_sha256_is_of_the_file_on_disk(tmp_path: Path) -> None:
+def test_a_log_is_known_by_its_content_however_it_is_packed(tmp_path: Path) -> None:
+    import bz2
     import hashlib
+    import lzma
+    import zipfile
 
-    packed = gzip.compress(VEHICLE)
-    (tmp_path / "a.gz").write_bytes(packed)
-    (one,) = ingest(tmp_path / "a.gz", options=OPTIONS)
-    assert one.sha256 == hashlib.sha256(packed).hexdigest()
-    assert one.result.accepted == 3
+    for name, pack in (("a.txt", bytes), ("b.gz", gzip.compress), ("c.bz2", bz2.compress), ("d.xz", lzma.compress)):
+        (tmp_path / name).write_bytes(pack(VEHICLE))
+    with zipfile.ZipFile(tmp_path / "e.zip", "w") as book:
+        book.writestr("in/e.txt.gz", gzip.compress(VEHICLE))
+    write_flight(tmp_path / "f.h5", ingest(tmp_path / "b.gz", options=OPTIONS))
+    files = ingest([*sorted(tmp_path.glob("[a-e].*")), tmp_path / "f.h5"], options=OPTIONS)
+    assert len(files) == 6
+    assert {one.sha256 for one in files} == {hashlib.sha256(VEHICLE).hexdigest()}
+    assert {one.result.accepted for one in files} == {3}
+
+
+def test_one_of_several_logs_under_a_path_is_named(tmp_path: Path) -> None:
+    (tmp_path / "a.txt").write_bytes(VEHICLE)
+    (tmp_path / "b.txt").write_bytes(VEHICLE + VEHICLE.splitlines(keepends=True)[-1].replace(b"35.", b"36.", 1))
+    write_flight(tmp_path / "f.h5", ingest(sorted(tmp_path.glob("*.txt")), options=OPTIONS))
+    with pytest.raises(UsageError, match=r"2 logs stand under one path: a.txt, b.txt; expected one of them"):
+        read_log(tmp_path, "f.h5", OPTIONS)
+    for name in ("a.txt", "b.txt"):
+        assert read_log(tmp_path, f"f.h5/{name}", OPTIONS).sha256 == read_log(tmp_path, name, OPTIONS).sha256
+    with pytest.raises(InputError, match=r"0 of its logs are called 'c.txt'"):
+        read_log(tmp_path, "f.h5/c.txt", OPTIONS)
 
 
 def test_gzip_members_are_joined(tmp_path: Path) -> None:

@@ -44,7 +44,7 @@ def test_a_packed_log_is_the_log(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
         place.write_bytes(content)
         (file,) = ingest(place, options=OPTIONS)
         same(file.result, plain.result)
-        assert file.sha256 == hashlib.sha256(content).hexdigest()
+        assert file.sha256 == plain.sha256 == hashlib.sha256(LOG).hexdigest()
         assert sniffers_of(place) == ["sounder_log"]
 
 

@@ -1,0 +1,73 @@
+"""Series whose own logs the antennas, the receiver or the settings of a flight were learned from."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable, Sequence
+
+import numpy as np
+
+from ..common.provenance import union
+from ..propagation.arrays import Link
+from ..site.installed import InstalledPattern
+from ..site.sphere_pattern import SpherePattern
+from .data import FlightData, RankSeries, RssSeries
+
+
+def logs_of(data: FlightData, series: RssSeries | RankSeries) -> tuple[str, ...]:
+    """SHA-256 of the logs that hold a series."""
+    if not len(series.log):
+        return union(file.sha256 for file in data.files)
+    return tuple(data.files[number].sha256 for number in np.unique(series.log))
+
+
+def flight_logs(data: FlightData) -> tuple[str, ...]:
+    """SHA-256 of every log of a flight that holds RSS or rank."""
+    return union(*(logs_of(data, s) for s in data.rss), *(logs_of(data, s) for s in data.rank))
+
+
+def learned_patterns(link: Link) -> list[SpherePattern]:
+    """Antennas of both ends that were learned from flights."""
+    arrays = [*link.tower_arrays.values(), link.uav_array]
+    each = [p.base if isinstance(p, InstalledPattern) else p for array in arrays for p in array.patterns]
+    return [p for p in each if isinstance(p, SpherePattern)]
+
+
+def learned_here(data: FlightData, series: RssSeries, link: Link) -> tuple[str, ...]:
+    """Logs of a series that its antennas, or the settings of its flight file, were learned from; none: it is unseen.
+
+    Antenna files of 0.3 name flights, not logs: there the name decides.
+    """
+    own, patterns = logs_of(data, series), learned_patterns(link)
+    if any(not p.trained_on and data.settings.flight.name in p.learned_from for p in patterns):
+        return own
+    return common(own, [data.settings.trained_on, *(p.trained_on for p in patterns)])
+
+
+def common(own: Sequence[str], learned: Iterable[Iterable[str]]) -> tuple[str, ...]:
+    """Those of some logs that something was learned from."""
+    known = set(union(*learned))
+    return tuple(digest for digest in own if digest in known)
+
+
+def counted_once(flights: Sequence[FlightData]) -> tuple[list[FlightData], list[str]]:
+    """Flights without the series whose log an earlier flight holds already, and what is to be said of that.
+
+    A log that comes twice, renamed, copied or packed, would be predicted from itself.
+    """
+    home: dict[str, str] = {}
+    kept: list[FlightData] = []
+    said: list[str] = []
+    for data in flights:
+        name = data.settings.flight.name
+        again = {digest: home[digest] for digest in flight_logs(data) if digest in home}
+        for digest, first in again.items():
+            said.append(f"{name} holds the same log as {first} (SHA-256 {digest[:12]}...): it is counted once")
+        rss = tuple(s for s in data.rss if not set(logs_of(data, s)) & set(again))
+        rank = tuple(s for s in data.rank if not set(logs_of(data, s)) & set(again))
+        if not again:
+            kept.append(data)
+        elif rss or rank:
+            kept.append(dataclasses.replace(data, rss=rss, rank=rank))
+        home |= {digest: name for digest in flight_logs(data) if digest not in home}
+    return kept, said

@@ -1,0 +1,196 @@
+"""Nothing learned is scored on a log that it was learned from, whatever that log is called or packed in."""
+
+from __future__ import annotations
+
+import bz2
+import gzip
+import json
+import shutil
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import yaml
+
+from aerpaw_cmp.__main__ import main
+from aerpaw_cmp.common.provenance import trained_on
+from aerpaw_cmp.flight.data import load_data
+from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.training import counted_once, flight_logs
+from aerpaw_cmp.jobs.calibrate import calibrate
+from aerpaw_cmp.jobs.calibrate_rank import FittedReceiver, RankSamples
+from tests.jobs.test_calibrate import YAW_DEG, settings, write
+
+pytestmark = pytest.mark.usefixtures("few_pictures")
+
+LOG = "first/USRP1.txt"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Two flights, antennas learned from the first and second, and a third flight that nobody learned from."""
+    place = tmp_path_factory.mktemp("training")
+    for name in ("first", "second", "aside"):
+        path = write(place / f"{name}.yaml", settings(name, {"model": "tr38901"}, YAW_DEG))
+        assert main(["simulate", str(path)]) == 0
+        write(path, settings(name, {"model": "iso"}))
+    write(place / "calibration.yaml", {"calibration": "planted", "flights": ["first.yaml", "second.yaml"]})
+    assert main(["calibrate", str(place / "calibration.yaml"), "-o", str(place / "calibrated.yaml")]) == 0
+    return place
+
+
+def renamed(source: Path) -> str:
+    shutil.copy(source, source.with_name("other_name.txt"))
+    return "first/other_name.txt"
+
+
+def gzipped(source: Path) -> str:
+    source.with_name("g.gz").write_bytes(gzip.compress(source.read_bytes()))
+    return "first/g.gz"
+
+
+def zipped_twice(source: Path) -> str:
+    with zipfile.ZipFile(source.with_name("z.zip"), "w", zipfile.ZIP_DEFLATED) as book:
+        book.writestr("deep/down/log.bz2", bz2.compress(source.read_bytes()))
+    return "first/z.zip/deep/down/log.bz2"
+
+
+def ingested(source: Path) -> str:
+    target = source.with_name("flight.h5")
+    packed = source.parent / gzipped(source).split("/")[1]
+    assert main(["ingest", str(packed), "-o", str(target), "--force", "--timezone", "America/New_York"]) == 0
+    return "first/flight.h5"
+
+
+COPIES = [renamed, gzipped, zipped_twice, ingested]
+
+
+def copy_of(folder: Path, copy: Callable[[Path], str], **rest: Any) -> Path:
+    """A flight of another name whose log is a copy of the first flight's."""
+    content = settings("first", {"model": "iso"}, **rest)
+    content["flight"]["name"] = "nobody_knows_me"
+    content["flight"].pop("plan")
+    content["logs"][1]["path"] = copy(folder / LOG)
+    return write(folder / f"copy_{copy.__name__}.yaml", content)
+
+
+def report(folder: Path, flight: Path) -> tuple[dict[str, Any], str]:
+    """Numbers of a report, and its first sentences."""
+    assert main(["report", str(flight), "-o", str(folder / "out"), "--audit", "none", "--figures", "none"]) == 0
+    page = (folder / "out" / "report.html").read_text(encoding="utf-8")
+    begin = page.index('class="verdict">') + len('class="verdict">')
+    return json.loads((folder / "out" / "metrics.json").read_text()), page[begin : page.index("</p>", begin)]
+
+
+def test_every_learned_file_names_the_logs_by_content(folder: Path) -> None:
+    flights = [load_data(load_flight(folder / f"{name}.yaml"), folder) for name in ("first", "second")]
+    logs = {digest for data in flights for digest in flight_logs(data)}
+    assert len(logs) == 2
+    files = [folder / "calibrated.yaml", *(folder / "calibrated").glob("LW1*.csv"), folder / "calibrated/metrics.json"]
+    assert len(files) == 4
+    for file in files:
+        assert set(trained_on(file.read_text(encoding="utf-8"))) == logs, file
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_a_copy_of_a_training_log_is_not_scored(folder: Path, copy: Callable[[Path], str]) -> None:
+    learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
+    metrics, words = report(folder, copy_of(folder, copy, link=learned["link"]))
+    assert words.startswith("Training flight: the antennas of LW1 USRP1 were learned from this flight")
+    here = metrics["rss"]["LW1"]["USRP1"]
+    assert [here[key] for key in ("rmse_db", "correlation", "rmse_ci95_db")] == [None, None, [None, None]]
+    assert (here["compared_with"], here["variants"], here["averaged"]) == ({}, {}, {})
+    assert len(here["trained_on"]) == 1
+    assert set(here["trained_on"]) < set(metrics["trained_on"])
+    assert here["baselines"]["free_space"]["rmse_db"] > 1  # nothing of it was learned
+    inputs = [one for one in metrics["inputs"] if one.get("learned_on")]
+    assert {Path(one["path"]).suffix for one in inputs} == {".csv"}
+    rungs = [row for row in metrics["ladder"] if "learned" in row["model"]]
+    assert len(rungs) >= 2
+    assert all(row["rmse_heldout_db"] is None and not row["recommended"] for row in rungs)
+
+
+def test_an_unseen_flight_is_scored_with_the_same_antennas(folder: Path) -> None:
+    learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
+    metrics, words = report(folder, write(folder / "u.yaml", settings("aside", {"model": "iso"}, link=learned["link"])))
+    assert "Training flight" not in words
+    assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] > 0
+    assert "trained_on" not in metrics["rss"]["LW1"]["USRP1"]
+    assert len(metrics["trained_on"]) == 2
+
+
+def test_settings_that_were_learned_count_as_antennas_do(folder: Path) -> None:
+    """Fitted numbers in a flight file (a mount, a roughness) have no file that could say where they come from."""
+    own = settings("first", {"model": "iso"}, trained_on=list(trained_on((folder / "calibrated.yaml").read_text())))
+    metrics, words = report(folder, write(folder / "own.yaml", own))
+    assert words.startswith("Training flight")
+    assert metrics["rss"]["LW1"]["USRP1"]["rmse_db"] is None
+    as_set = [row for row in metrics["ladder"] if row["model"].startswith("as set")]
+    assert [row["rmse_heldout_db"] for row in as_set] == [None]
+
+
+@pytest.mark.parametrize("copy", COPIES)
+def test_calibrate_counts_a_copy_once(folder: Path, copy: Callable[[Path], str]) -> None:
+    flights = ["first.yaml", copy_of(folder, copy).name]
+    found = calibrate(write(folder / "twice.yaml", {"calibration": "twice", "flights": flights}))
+    assert [data.settings.flight.name for data in found.flights] == ["first"]
+    assert not any(found.scores.values())
+    assert "nobody_knows_me holds the same log as first (SHA-256 " in found.warnings[0]
+    three = calibrate(write(folder / "three.yaml", {"calibration": "three", "flights": [*flights, "second.yaml"]}))
+    assert {score.flight for score in three.scores["flight_left_out"]} == {"first", "second"}
+
+
+def test_two_logs_of_one_flight_in_two_flight_files(folder: Path) -> None:
+    """Only the series of the log that comes twice is left out; what else the later flight holds counts."""
+    both = settings("aside", {"model": "iso"})
+    both["logs"].append({"path": LOG, "reader": "sounder_log", "node": "LW2", "channel": "USRP9"})
+    flights = [load_data(load_flight(folder / "first.yaml"), folder)]
+    kept, said = counted_once([*flights, load_data(load_flight(write(folder / "both.yaml", both)), folder)])
+    assert [[(s.tower, s.channel) for s in data.rss] for data in kept] == [[("LW1", "USRP1")], [("LW1", "USRP1")]]
+    assert len(said) == 1
+
+
+def test_campaign_counts_a_copy_once(folder: Path, tmp_path: Path) -> None:
+    flights = ["first.yaml", copy_of(folder, zipped_twice).name, "second.yaml"]
+    path = write(folder / "campaign.yaml", {"campaign": "copies", "flights": flights})
+    assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
+    found = json.loads((tmp_path / "out" / "campaign.json").read_text())
+    assert [row["flight"] for row in found["rss"]] == ["first", "second"]
+    (failure,) = found["failures"]
+    assert failure["flight"] == "nobody_knows_me"
+    assert failure["message"].startswith("it holds the same log as first (SHA-256 ")
+
+
+def test_campaign_scores_no_flight_that_its_antennas_were_learned_from(folder: Path, tmp_path: Path) -> None:
+    learned = yaml.safe_load((folder / "calibrated.yaml").read_text())
+    names = [copy_of(folder, gzipped, link=learned["link"]).name]
+    for name in ("aside", "second"):
+        names.append(write(folder / f"l_{name}.yaml", settings(name, {"model": "iso"}, link=learned["link"])).name)
+    path = write(folder / "campaign.yaml", {"campaign": "learned", "flights": names})
+    assert main(["campaign", str(path), "-o", str(tmp_path / "out"), "--fresh"]) == 0
+    found = json.loads((tmp_path / "out" / "campaign.json").read_text())
+    errors = {row["flight"]: (row["rmse_db"], row["pooled_rmse_db"]) for row in found["rss"]}
+    assert set(errors) == {"nobody_knows_me", "aside", "second"}
+    assert np.isfinite(errors.pop("aside")).all()
+    assert set(errors.values()) == {(None, None)}
+    page = (tmp_path / "out" / "campaign.html").read_text(encoding="utf-8")
+    assert page.count("its antennas were learned from this very log, so it is not scored") == 2
+
+
+def test_a_receiver_knows_its_reports_by_content() -> None:
+    def one(flight: str, *logs: str) -> RankSamples:
+        return RankSamples(
+            flight=flight, tower="LW1", tower_m=np.zeros(3), poses=None, rank=np.zeros(0), link=None,  # type: ignore[arg-type]
+            time_s=np.zeros(0), logs=logs,
+        )  # fmt: skip
+
+    def receiver(**more: Any) -> FittedReceiver:
+        return FittedReceiver(tower="LW1", geometries=(), tied=1, flights=("a",), mixture=None, **more)  # type: ignore[arg-type]
+
+    by_content = receiver(trained_on=("1" * 64,))
+    assert by_content.knows(one("b", "2" * 64, "1" * 64))
+    assert not by_content.knows(one("a", "2" * 64))
+    assert receiver().knows(one("a", "2" * 64))  # of 0.3: the name is all there is

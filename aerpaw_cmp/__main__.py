@@ -8,20 +8,24 @@ This is the one place where an exception becomes a message and an exit code:
 2     wrong usage or configuration
 3     an input could not be read, or an output not written
 70    a fault of the program itself (``--debug`` shows where)
-130   interrupted
+130   interrupted; 143 by SIGTERM, 129 by SIGHUP
 141   whoever read the output has gone (``aerpaw-cmp ... | head``)
 ====  ==========================================================
 """
 
 from __future__ import annotations
 
+import errno
 import os
+import signal
 import sys
 
-from .common import interrupts
+from .common import interrupts, terminal
 
 INTERNAL_ERROR = 70
-INTERRUPTED = 130
+SIGNALLED = 128
+"""Plus the number of the signal."""
+OUTPUT_FAULT = 3
 BROKEN_PIPE = 141
 _COMPLETE = "_AERPAW_CMP_COMPLETE"
 _SHELL_IS_NAMED = "_TYPER_COMPLETE_TEST_DISABLE_SHELL_DETECTION"
@@ -101,6 +105,8 @@ def _message(error: BaseException) -> tuple[str, int]:
         return f"{command}: {wording().rstrip('.')}; '{command} --help' tells the options", 2
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("aerpaw_cmp"):
         return f"aerpaw-cmp: the Python package '{error.name}' is not installed; 'make setup' installs everything", 1
+    if isinstance(error, FileNotFoundError) and _is_homeless():
+        return "aerpaw-cmp: the working folder was removed; expected a folder that exists ('cd' to one)", 2
     kind = type(error).__name__
     return (
         f"aerpaw-cmp: internal error, {kind}: {str(error).strip() or 'no message'}\n"
@@ -108,6 +114,14 @@ def _message(error: BaseException) -> tuple[str, int]:
         f"and the output of 'aerpaw-cmp doctor', to {ISSUES}.",
         INTERNAL_ERROR,
     )
+
+
+def _is_homeless() -> bool:
+    try:
+        os.getcwd()  # noqa: PTH109  pathlib is not loaded for --help
+    except OSError:
+        return True
+    return False
 
 
 def _notes(error: BaseException | None) -> list[str]:
@@ -123,7 +137,8 @@ def _run(arguments: list[str]) -> int:
     from . import cli
 
     code = cli.main(arguments)
-    sys.stdout.flush()  # a reader that has gone shows here, not at interpreter exit
+    if code == SIGNALLED + signal.SIGINT:
+        interrupts.look()  # typer makes this code, without a word, of what came while it read the command line
     return code
 
 
@@ -141,8 +156,7 @@ def main(arguments: list[str] | None = None) -> int:
         The exit code; exceptions end here.
     """
     arguments = list(sys.argv[1:] if arguments is None else arguments)
-    if callable(reconfigure := getattr(sys.stdout, "reconfigure", None)):
-        reconfigure(errors="backslashreplace")  # a file name that the terminal cannot show is no reason to fail
+    terminal.guard()
     before_dashes = arguments[: arguments.index("--")] if "--" in arguments else arguments
     debug = "--debug" in before_dashes or os.environ.get("AERPAW_CMP_DEBUG", "0") not in ("", "0")
     if "--debug" in before_dashes:
@@ -151,28 +165,50 @@ def main(arguments: list[str] | None = None) -> int:
         os.environ.setdefault(_SHELL_IS_NAMED, "1")
     try:
         code = _quick_answer(arguments)
-        if code is not None:
-            return code
-        with interrupts.noted():
-            return _run(arguments)
+        if code is None:
+            with interrupts.noted():
+                code = _run(arguments)
     except KeyboardInterrupt as interrupt:
         exec("")  # CPython remembers an interrupt that left an exec(), and would end by the signal in place of 130
-        print("; ".join(["aerpaw-cmp: interrupted", *_notes(interrupt)]), file=sys.stderr)
-        return INTERRUPTED
-    except BrokenPipeError:
-        # the interpreter flushes standard output once more at exit: give it a place that accepts
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
-        return BROKEN_PIPE
+        code = _interrupted(interrupt)
     except Exception as error:
-        if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
-            return INTERRUPTED
-        if debug:
-            import traceback
+        code = _failed(error, debug)
+    return _code_of_output(code)
 
-            traceback.print_exc()
-        text, code = _message(error)
-        print(text, file=sys.stderr)
+
+def _interrupted(interrupt: KeyboardInterrupt) -> int:
+    """Tell what is kept; 128 and the number of the signal."""
+    by = interrupts.last()
+    word = "interrupted" if by == signal.SIGINT else f"ended by {by.name}"
+    print("; ".join([f"aerpaw-cmp: {word}", *_notes(interrupt)]), file=sys.stderr)
+    return SIGNALLED + by
+
+
+def _failed(error: Exception, debug: bool) -> int:
+    if type(error).__name__ == "Abort":  # click's word for a Ctrl-C at a prompt
+        return SIGNALLED + signal.SIGINT
+    if debug:
+        import traceback
+
+        traceback.print_exc()
+    text, code = _message(error)
+    print(text, file=sys.stderr)
+    return code
+
+
+def _code_of_output(code: int) -> int:
+    """The exit code, if standard output takes what was printed: seen here, not at the interpreter's exit."""
+    fault = terminal.output_fault()
+    if fault is None or code:
         return code
+    if isinstance(fault, BrokenPipeError):
+        return BROKEN_PIPE
+    cause = "closed, or not open for writing" if fault.errno == errno.EBADF else "a full disk"
+    print(
+        f"aerpaw-cmp: standard output does not take the results ({fault.strerror}). Likely cause: {cause}",
+        file=sys.stderr,
+    )
+    return OUTPUT_FAULT
 
 
 if __name__ == "__main__":

@@ -80,6 +80,7 @@ SMALLEST: dict[str, list[str]] = {
     "field_models": ["--quick"],
     "field_table": ["--quick", "--out", "{folder}"],
     "freeze": ["record", "{folder}/record.npz"],
+    "fuzz_commands": ["--calls", "20"],
     "fuzz_inputs": ["--inputs", "20"],
     "ingest": ["--quick"],
     "kernel": ["--poses", "200", "--pairs", "1"],

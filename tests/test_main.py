@@ -196,3 +196,40 @@ def test_a_reader_that_goes_away_is_no_fault() -> None:
     )
     os.close(write)
     assert (done.returncode, done.stderr) == (141, "")
+
+
+FULL = Path("/dev/full")
+
+
+@pytest.mark.skipif(not FULL.exists(), reason="Linux has a disk that is always full")
+@pytest.mark.parametrize(
+    ("line", "redirect", "code", "said"),
+    [
+        ("--help", ">/dev/full", 3, "standard output does not take the results (No space left on device)"),
+        ("formats", ">/dev/full", 3, "standard output does not take the results (No space left on device)"),
+        ("formats --json", ">&-", 3, "standard output does not take the results (Bad file descriptor)"),
+        ("formats", "<&-", 0, ""),
+        ("reprot", "2>/dev/full", 2, ""),
+        ("reprot", "2>&- >&-", 2, ""),
+        ("reprot", "2>/dev/full >/dev/full", 2, ""),
+        ("formats", ">/dev/full 2>/dev/full", 3, ""),
+    ],
+)
+def test_a_standard_stream_that_is_full_or_closed_is_no_fault_of_the_program(
+    line: str, redirect: str, code: int, said: str
+) -> None:
+    command = ["sh", "-c", f'"$0" -m aerpaw_cmp {line} {redirect}', sys.executable]
+    done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True, check=False, timeout=60)
+    assert done.returncode == code, done.stderr
+    assert said in done.stderr
+    assert done.stderr.count("\n") == bool(said)
+
+
+def test_an_output_does_not_take_the_place_of_a_closed_stream(tmp_path: Path) -> None:
+    """Else the first file that is opened would be standard output, and get what is printed."""
+    command = ["sh", "-c", '"$0" -m aerpaw_cmp ingest sample_logs/UAV/modem_ri.csv --timezone UTC -o "$1" >&- 2>&- <&-']
+    done = subprocess.run([*command, sys.executable, str(tmp_path / "f.h5")], cwd=ROOT, check=False, timeout=60)
+    assert done.returncode == 3  # the table could not be shown
+    from aerpaw_cmp.logs.flight_file import is_flight_file
+
+    assert is_flight_file(tmp_path / "f.h5")

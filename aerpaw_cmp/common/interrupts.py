@@ -1,9 +1,11 @@
-"""Ctrl-C is never lost: what Python swallows of it is raised again where a job can be left.
+"""Ctrl-C, SIGTERM and SIGHUP are never lost: what Python swallows of one is raised again where a job can be left.
 
 An interrupt is an exception that may come anywhere, also where Python cannot raise one: in what runs around a fork, in
 a finaliser, in the callback of a weak reference ("Exception ignored in ..."); before Python 3.12 one inside a class
 body becomes a RuntimeError. A command notes that it came, looks again before each stage and before an output takes its
 name, and holds it back for the moments in which a half-done step would be told wrongly.
+
+SIGTERM is what scancel, systemd and docker send, SIGHUP what a closed terminal does: both end a command as Ctrl-C does.
 """
 
 from __future__ import annotations
@@ -11,16 +13,32 @@ from __future__ import annotations
 import signal
 import sys
 import threading
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    _Handler = Callable[[int, FrameType | None], Any] | int | signal.Handlers | None
+
+SIGNALS = tuple(getattr(signal, name) for name in ("SIGINT", "SIGTERM", "SIGHUP") if hasattr(signal, name))
+"""What ends a command in order."""
+
+AT_END: list[Callable[[], None]] = []
+"""Undone when :func:`noted` ends: hidden places whose owner an interrupt did not let finish its first step."""
 
 _came = False
+_last: int = signal.SIGINT
 
 
 def came() -> bool:
     """Whether an interrupt came since :func:`noted` began; False outside of it."""
     return _came
+
+
+def last() -> signal.Signals:
+    """The signal of the latest interrupt, also after :func:`noted` has ended."""
+    return signal.Signals(_last)
 
 
 def look() -> None:
@@ -37,19 +55,20 @@ def look() -> None:
 
 @contextmanager
 def noted() -> Iterator[None]:
-    """Note the interrupts of a command; one in the background, which ignores them, goes on doing so.
+    """Note the interrupts of a command; a signal that the process ignores (nohup, background) stays ignored.
 
     Raises
     ------
     KeyboardInterrupt
         For whatever became of one on its way, which is its cause then.
     """
-    global _came
-    if not _is_ours_to_set() or signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
+    global _came, _last
+    ours = _set(SIGNALS, _note)
+    if not ours:
         yield
         return
+    _last = signal.SIGINT
     previous = sys.unraisablehook
-    signal.signal(signal.SIGINT, _note)
     # Python shows a traceback of what it swallows: this one is not lost
     sys.unraisablehook = lambda what: None if what.exc_type is KeyboardInterrupt else previous(what)
     try:
@@ -59,33 +78,47 @@ def noted() -> Iterator[None]:
             raise
         raise KeyboardInterrupt from error
     finally:
+        _set(SIGNALS, signal.SIG_IGN, _note)
+        while AT_END:
+            AT_END.pop()()
         _came = False
         sys.unraisablehook = previous
-        signal.signal(signal.SIGINT, signal.default_int_handler)
+        for number, before in ours:
+            signal.signal(number, before)
 
 
-def _note(number: int, frame: FrameType | None) -> None:
-    global _came
-    _came = True
-    signal.default_int_handler(number, frame)
+def _set(numbers: tuple[int, ...], handler: _Handler, *untouched: _Handler) -> list[tuple[int, _Handler]]:
+    """Take the signals that nobody else handles or ignores; gives their handlers of before."""
+    if threading.current_thread() is not threading.main_thread():
+        return []
+    untouched = untouched or (signal.SIG_DFL, signal.default_int_handler)
+    ours = [(number, signal.getsignal(number)) for number in numbers if signal.getsignal(number) in untouched]
+    for number, _ in ours:
+        signal.signal(number, handler)
+    return ours
+
+
+def _note(number: int, _frame: FrameType | None) -> None:
+    global _came, _last
+    _came, _last = True, number
+    raise KeyboardInterrupt
 
 
 @contextmanager
 def held() -> Iterator[None]:
     """Hold interrupts back until the block has ended; they are raised then."""
-    before = signal.getsignal(signal.SIGINT)
-    if not _is_ours_to_set() or not callable(before):
+    if threading.current_thread() is not threading.main_thread():
         yield
         return
     seen: list[int] = []
-    signal.signal(signal.SIGINT, lambda number, _frame: seen.append(number))
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    ours = {number: handler for number, handler in before.items() if callable(handler)}
+    for number in ours:
+        signal.signal(number, lambda number, _frame: seen.append(number))
     try:
         yield
     finally:
-        signal.signal(signal.SIGINT, before)
-    if seen:
-        before(seen[0], None)
-
-
-def _is_ours_to_set() -> bool:
-    return threading.current_thread() is threading.main_thread()
+        for number, handler in ours.items():
+            signal.signal(number, handler)
+    if seen and callable(handler := ours[seen[0]]):
+        handler(seen[0], None)

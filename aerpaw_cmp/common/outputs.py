@@ -36,7 +36,7 @@ from typing import Any, BinaryIO
 
 from .errors import OutputError, UsageError, add_note, one_line
 from .files import plain_mode, sync
-from .interrupts import came, held, look
+from .interrupts import AT_END, came, held, look
 
 SUMS = "SHA256SUMS"
 """The list of a result folder; ``sha256sum -c SHA256SUMS`` checks it."""
@@ -670,8 +670,11 @@ class _Place:
         self.target, self.named = target, named
         self.part = beside(target, "part")
         self._further: list[int] = []
+        self._left = False
         with explained_os_errors(named):
-            self.descriptor = self._claim(folder)
+            with held():  # an interrupt finds the place known to AT_END, or not made
+                self.descriptor = self._claim(folder)
+                AT_END.append(self.leave)
             try:
                 if folder:
                     _clear(self.part, target, keep=True)
@@ -724,6 +727,11 @@ class _Place:
 
     def leave(self) -> None:
         """Remove what did not take the name, and unlock."""
+        if self._left:
+            return
+        self._left = True
+        if self.leave in AT_END:
+            AT_END.remove(self.leave)
         descriptors = (self.descriptor, *self._further)
         if any(self._is_there(descriptor) for descriptor in descriptors):  # else another run's place, or none
             with contextlib.suppress(OSError):

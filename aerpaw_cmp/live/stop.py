@@ -8,6 +8,8 @@ import signal
 import threading
 from collections.abc import Iterator
 
+from ..common.interrupts import SIGNALS
+
 
 class Stop:
     """A request to end, from a signal or another thread; wakes the waiting tap."""
@@ -35,11 +37,11 @@ class Stop:
 
     @contextlib.contextmanager
     def on_signals(self) -> Iterator[None]:
-        """SIGINT, SIGTERM and SIGHUP ask for the end (in the main thread only)."""
+        """SIGINT, SIGTERM and SIGHUP ask for the end (in the main thread only); an ignored one (nohup) stays so."""
         if threading.current_thread() is not threading.main_thread():
             yield
             return
-        signals = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+        signals = [number for number in SIGNALS if signal.getsignal(number) is not signal.SIG_IGN]
         before = [(number, signal.signal(number, self._on_signal)) for number in signals]
         try:
             yield

@@ -10,10 +10,11 @@ import sys
 import pytest
 
 from aerpaw_cmp import __main__
-from aerpaw_cmp.common import interrupts
+from aerpaw_cmp.common import interrupts, outputs
 from aerpaw_cmp.common.errors import InputError, add_note
 from aerpaw_cmp.common.outputs import OutputFile, OutputFolder
 from aerpaw_cmp.common.stages import Stages
+from aerpaw_cmp.live.stop import Stop
 
 
 @pytest.fixture(autouse=True)
@@ -129,24 +130,49 @@ def test_a_process_that_ignores_interrupts_goes_on_ignoring_them():
     assert not interrupts.came()
 
 
-@pytest.mark.parametrize("at", ["before", "after_in_parent"])
-@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="work is shared by forked processes on Linux only")
-def test_an_interrupt_around_a_fork_is_raised(at):
-    script = f"""
-import os, signal
-from aerpaw_cmp.common import interrupts
-from aerpaw_cmp.common.forked import in_order
-signal.signal(signal.SIGINT, signal.default_int_handler)
-os.register_at_fork({at}=lambda: os.kill(os.getpid(), signal.SIGINT))
-try:
-    with interrupts.noted():
-        list(in_order([lambda: 1, lambda: 2], processes=2))
-    print("lost")
-except KeyboardInterrupt:
-    print("interrupted")
-"""
-    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=False, timeout=60)
-    assert (done.stdout, done.stderr) == ("interrupted\n", "")
+@pytest.mark.parametrize(("name", "code"), [("SIGTERM", 143), ("SIGHUP", 129), ("SIGINT", 130)])
+def test_each_signal_is_told_and_ends_with_its_code(name, code, monkeypatch, capsys, tmp_path):
+    def job(_arguments: list[str]) -> int:
+        with OutputFile(tmp_path / "out", own=lambda _: True):
+            os.kill(os.getpid(), getattr(signal, name))
+        raise AssertionError("not interrupted")
+
+    monkeypatch.setattr(__main__, "_run", job)
+    assert __main__.main(["ingest"]) == code
+    word = "interrupted" if name == "SIGINT" else f"ended by {name}"
+    assert capsys.readouterr().err == f"aerpaw-cmp: {word}; {tmp_path / 'out'} was not written\n"
+    assert list(tmp_path.iterdir()) == []
+    assert signal.getsignal(signal.SIGTERM) == signal.SIG_DFL
+
+
+@pytest.mark.parametrize("kind", ["file", "folder"])
+def test_an_interrupt_while_the_hidden_place_is_made_leaves_none(tmp_path, kind, monkeypatch, capsys):
+    plain = outputs._lock
+
+    def locked(descriptor: int) -> bool:
+        os.kill(os.getpid(), signal.SIGTERM)
+        return plain(descriptor)
+
+    def job(_arguments: list[str]) -> int:
+        name = tmp_path / "out"
+        with OutputFile(name, own=lambda _: True) if kind == "file" else OutputFolder(name, job="report"):
+            raise AssertionError("not interrupted")
+
+    monkeypatch.setattr(outputs, "_lock", locked)
+    monkeypatch.setattr(__main__, "_run", job)
+    assert __main__.main(["ingest"]) == 143
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_hang_up_that_nohup_ignores_stays_ignored():
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with interrupts.noted(), interrupts.held():
+            os.kill(os.getpid(), signal.SIGHUP)
+        with Stop().on_signals():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_an_interrupt_that_met_an_exec_ends_with_its_exit_code(tmp_path):

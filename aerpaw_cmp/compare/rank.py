@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, power_from_db
+from .inertia import LANES, LARGEST, certain_rank
 from .statistics import (
     NO_INTERVAL,
     REPLICATES,
@@ -138,7 +139,21 @@ def channel_rank(h: ArrayLike, k: float) -> IntArray:
     >>> channel_rank(h, 10), channel_rank(1e-150 * h, 1000), channel_rank(0 * h, 10)
     (array(2), array(4), array(0))
     """
-    return rank_from_singular_values(singular_values(h), k)
+    matrix = np.asarray(h, dtype=np.complex128)
+    if matrix.ndim < 2 or not 1 <= min(matrix.shape[-2:]) <= LARGEST or not k >= 1:
+        return rank_from_singular_values(singular_values(matrix), k)
+    flat = matrix.reshape(-1, *matrix.shape[-2:])
+    rank = np.zeros(len(flat), dtype=np.int64)
+    for start in range(0, len(flat), LANES):
+        part = flat[start : start + LANES]
+        some, certain = certain_rank(part, k)
+        doubtful = np.flatnonzero(~certain)
+        if len(doubtful):
+            there = part[doubtful].any(axis=(1, 2))  # most matrices in doubt have no path at all
+            some[doubtful] = 0
+            some[doubtful[there]] = rank_from_singular_values(singular_values(part[doubtful[there]]), k)
+        rank[start : start + LANES] = some
+    return rank.reshape(matrix.shape[:-2])
 
 
 def _ranks(rank: ArrayLike) -> FloatArray:

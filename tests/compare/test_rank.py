@@ -8,6 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.stats import wasserstein_distance
 
+from aerpaw_cmp.compare.inertia import certain_rank
 from aerpaw_cmp.compare.rank import (
     agreement,
     capacity_rank,
@@ -22,6 +23,7 @@ from aerpaw_cmp.compare.rank import (
     histogram_test,
     k_curve,
     k_grid,
+    rank_from_singular_values,
     repeat_rank,
     shift_test,
     singular_values,
@@ -389,3 +391,33 @@ def test_rows_without_a_report_are_counted():
     measured = channel_rank(h, 5).astype(float)
     measured[[3, 7, 20]] = NAN
     assert compare_rank(measured, h, replicates=50).n_no_csi == 3
+
+
+def _with_singular_values(rng, sigma, n_rx, n_tx):
+    """Channels (t, n_rx, n_tx) with the given singular values (t, m) between random unitary frames."""
+    t, m = sigma.shape
+    left, right = unitary(rng, n_rx, t)[:, :, :m], unitary(rng, n_tx, t)[:, :, :m]
+    return (left * sigma[:, None]) @ right.conj().transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("k", [1.0, 1.25, 10.0, 1000.0, 1e5])
+@pytest.mark.parametrize(("n_rx", "n_tx"), [(4, 4), (2, 4), (4, 2), (3, 3), (1, 4), (4, 1), (5, 3)])
+def test_ranks_by_counting_are_those_of_singular_values(n_rx, n_tx, k):
+    """Random channels, and all that is hard: values near the threshold, equal ones, graded ones, none, extreme scales."""
+    rng = np.random.default_rng(int(k) + 10 * n_rx + n_tx)
+    m, n = min(n_rx, n_tx), 400
+    near = 1.0 / k * (1.0 + 10.0 ** rng.uniform(-16, -2, (n, m)) * rng.choice([-1, 0, 1], (n, m)))
+    near[:, 0] = 1.0
+    graded = 10.0 ** -(np.arange(m) * rng.uniform(0, 6, (n, 1)))
+    deficient = rng.choice([0.0, 1.0, 1.0 / k], (n, m))
+    equal = 1.0 + 1e-9 * rng.normal(size=(n, m))
+    h = [_with_singular_values(rng, sigma, n_rx, n_tx) for sigma in (near, graded, deficient, equal)]
+    h.append(rng.normal(size=(3 * n, n_rx, n_tx)) + 1j * rng.normal(size=(3 * n, n_rx, n_tx)))
+    h = np.concatenate(h) * 10.0 ** rng.choice([0.0, -5.0, -150.0, 140.0], (7 * n, 1, 1))
+    h[::50, 0, 0], h[1::50, -1, -1], h[2::50] = np.nan, np.inf, 0.0
+    expected = rank_from_singular_values(singular_values(h), k)
+    np.testing.assert_array_equal(channel_rank(h, k), expected)
+    assert channel_rank(h.reshape(7, n, n_rx, n_tx), k).shape == (7, n)
+    if k in (10.0, 1000.0) and m > 1:
+        _, certain = certain_rank(h[4 * n :], k)
+        assert certain.mean() > 0.4, "counting decides nothing"

@@ -24,16 +24,16 @@ from typing import Any
 import numpy as np
 
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import compiled, compiled_field
+from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.bench import random_scene
-from aerpaw_cmp.propagation.channel import channel_matrices
+from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import Replay, replay
 
 TOWERS = 5
 FLOPS = {"pair": 213, "reflection": 115, "slab": 105}
-"""Additions, multiplications, divisions and roots of `propagation/kernels.py`: per element pair of a path (isotropic),
-per reflection of a pair, and more where the face is a slab; a sine with its cosine counts 36, an exponential 20."""
+"""Additions, multiplications, divisions and roots of the field: per element pair of a path (isotropic), per
+reflection of a pair, and more where the face is a slab; a sine with its cosine counts 36, an exponential 20."""
 
 
 def timed(mode: str, case, threads: int | None = 1) -> tuple[Replay, float, float]:
@@ -46,7 +46,7 @@ def timed(mode: str, case, threads: int | None = 1) -> tuple[Replay, float, floa
 
 def serial(case) -> tuple[float, float]:
     """CPU seconds of a compiled replay, and those outside the parts that threads share."""
-    modules: tuple[Any, ...] = (compiled, compiled_field)
+    modules: tuple[Any, ...] = (compiled,)
     real, shared = compiled.in_threads, 0.0
 
     def watched(*arguments):

@@ -14,8 +14,10 @@ ROW = re.compile(r"^\| (?P<equation>.*?) \| (?P<formula>.*) \| `(?P<function>[\w
 
 def place(function: str) -> str:
     """``aerpaw_cmp/room/module.py:line`` of ``room.module.name[.method]``; LookupError when there is none."""
-    room, module, *names = function.split(".")
-    path = ROOT / "aerpaw_cmp" / room / f"{module}.py"
+    path, names = ROOT / "aerpaw_cmp", function.split(".")
+    while path.is_dir():
+        path = path / names.pop(0)
+    path = path.with_suffix(".py")
     node: ast.AST = ast.parse(path.read_text(encoding="utf-8"))
     for name in names:
         inside = [n for n in getattr(node, "body", []) if getattr(n, "name", None) == name]

@@ -17,8 +17,8 @@ from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
-from ..propagation.channel import Fields, channel_matrices
 from ..propagation.effort import Estimate
+from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.paths import Faces, PathSet
 from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay

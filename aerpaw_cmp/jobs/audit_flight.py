@@ -26,7 +26,7 @@ from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSe
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
 from ..propagation.audit import Audit, audit
-from ..propagation.channel import mean_pair_power
+from ..propagation.field.sum import mean_pair_power
 from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ..propagation.interactions import summary
 from ..propagation.moving import site_with_tower_at

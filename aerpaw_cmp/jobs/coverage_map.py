@@ -50,8 +50,8 @@ from ..maps.netcdf import write_netcdf
 from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
-from ..propagation.channel import channel_matrices, rss_dbm
 from ..propagation.crowns import Crowns
+from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ..propagation.paths import PathSet
 from ..propagation.scene import Scene

@@ -6,7 +6,7 @@ import numpy as np
 
 from ..common.units import FloatArray, db_from_amplitude, wavelength_m
 from ..site.materials import material
-from .channel import reflection_coefficients
+from .field.fresnel import reflection_coefficients
 
 
 def free_space_dbm(

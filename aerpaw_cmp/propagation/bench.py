@@ -20,7 +20,7 @@ from ..common.units import ComplexArray, FloatArray, wavelength_m
 from ..site.site import Building, Site, Tower
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from .audit import RANK_K, Difference, compare
-from .channel import mean_pair_power, rss_dbm
+from .field.sum import mean_pair_power, rss_dbm
 from .scene import Scene
 from .tracer import Replay, replay
 

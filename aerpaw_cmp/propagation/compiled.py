@@ -54,7 +54,7 @@ def switch() -> str:
 
 def kernels_for(work: int) -> ModuleType | None:
     """Compiled kernels of the field, or None: the work (element pairs of links) is too small, or they cannot run."""
-    return _chosen("kernels", work)
+    return _chosen("field.kernels", work)
 
 
 def beams() -> State:

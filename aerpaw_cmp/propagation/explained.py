@@ -7,7 +7,7 @@ the level whatever the arrays are; with one element at both ends they are the ga
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -23,7 +23,9 @@ from ..common.units import (
     wavelength_m,
 )
 from .arrays import Link, Poses
-from .channel import FaceMaterials, chunk_field, reflection_coefficients
+from .field.fresnel import FaceMaterials, reflection_coefficients
+from .field.geometry import Elements, geometry
+from .field.sum import amplitudes, pattern_ends
 from .image import images_of, scene_tolerance_m, trace_back
 from .obstacles import first_obstacle, why_not_there
 from .paths import Faces, PathSet
@@ -120,19 +122,17 @@ def explain_paths(
     -------
     tuple of ExplainedPath
     """
-    seen: list[tuple[str, AnyArray]] = []
-    rows = np.arange(len(paths))
-    array = next(iter(link.tower_arrays.values()))
+    elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
+    table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
     explained = []
-    for row in rows:
-        seen.clear()
+    for row in range(len(paths)):
+        seen: list[tuple[str, AnyArray]] = []
         one = paths.select(np.array([row]))
-        tables = FaceMaterials.of(faces, link.carrier_hz)
-        field = chunk_field(
-            one, np.zeros(1, np.int64), faces, tables, source_m, array, poses, link, lambda *step: seen.append(step)
-        )
+        columns = geometry(replace(one, tower=np.zeros(1, np.int64)), faces, table, source_m[None], poses, link)
+        ends = pattern_ends(columns, elements, link)
+        field = amplitudes(columns, elements, ends, wavelength, lambda *step: seen.append(step))  # noqa: B023
         further = {name: float(loss[row]) for name, loss in further_db.items()}
-        explained.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field, further))
+        explained.append(_explained(one, faces, source_m, poses.position_m[0], link, seen, field[0], further))
     return tuple(sorted(explained, key=lambda path: -path.level_dbm))
 
 
@@ -146,10 +146,10 @@ def _explained(
     field: AnyArray,
     further_db: dict[str, float],
 ) -> ExplainedPath:
-    waves = [(np.abs(value) ** 2).sum(axis=0) for name, value in seen if name == "wave"]
+    waves = [value for name, value in seen if name == "wave"]
     spreading = next(value for name, value in seen if name == "spreading") ** 2
-    uav = (np.abs(next(value for name, value in seen if name == "uav")) ** 2).sum(axis=0)
-    powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, np.abs(field) ** 2]
+    uav = next(value for name, value in seen if name == "uav")
+    powers = [*waves, waves[-1] * spreading, waves[-1] * spreading * uav, (field**2).sum(axis=1)]
     mean = np.array([1.0, *(float(power.mean()) for power in powers)])
     with np.errstate(divide="ignore", invalid="ignore"):
         steps = db_from_power(mean[1:]) - db_from_power(mean[:-1])
@@ -184,7 +184,7 @@ def _explained(
         arrival_elevation_deg=_elevation_deg(back),
         terms_db=terms,
         level_dbm=link.transmit_power_dbm + sum(terms.values()),
-        phase_deg=float(np.degrees(np.angle(field[0, 0, 0]))),
+        phase_deg=float(np.degrees(np.arctan2(field[0, 1], field[0, 0]))),
         planes=tuple(path.faces[0, :depth].tolist()),
     )
 

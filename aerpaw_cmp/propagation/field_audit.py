@@ -20,7 +20,7 @@ from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Array, Isotropic, Link, Poses
-from .channel import channel_matrices
+from .field.sum import channel_matrices
 from .image import planes_of
 from .paths import Faces, PathSet
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of

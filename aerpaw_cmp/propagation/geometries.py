@@ -3,7 +3,7 @@
 Which way a modem's antennas point and how its ports are slanted is hardly ever written down. Trying thousands of
 geometries takes no thousand replays: the field of an element slanted by ``s`` is ``cos s`` times that of a vertical
 plus ``sin s`` times that of a horizontal one at the same place, so one evaluation with both at every port
-(:func:`aerpaw_cmp.propagation.channel.channel_matrices`, float64, every pair of elements) serves all slants, and the
+(:func:`aerpaw_cmp.propagation.field.sum.channel_matrices`, float64, every pair of elements) serves all slants, and the
 ground reflection is one ray that is added at any strength.
 
 The rank that a modem reports is for its whole band. Over 100 MHz the ground ray turns against the direct one by about a
@@ -22,7 +22,7 @@ import numpy as np
 
 from ..common.units import ComplexArray, FloatArray
 from .arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
-from .channel import channel_matrices
+from .field.sum import channel_matrices
 from .paths import Faces, PathSet
 
 Ground = Literal["coherent", "power_sum"]

@@ -17,7 +17,7 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db
 from .arrays import Link, Poses
-from .channel import radiated
+from .field.sum import radiated
 from .paths import PathSet
 
 Interaction = Literal["reflection", "diffraction", "scattering", "refraction"]

@@ -18,7 +18,7 @@ from ..common.errors import UsageError
 from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray
 from ..site.site import Site, Tower
 from .arrays import Link, Poses
-from .channel import Fields, channel_matrices
+from .field.sum import Fields, channel_matrices
 from .paths import Faces, PathSet
 from .tracer import Loss, Replay, Whole, replay
 

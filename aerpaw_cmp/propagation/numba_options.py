@@ -16,9 +16,13 @@ from typing import Any
 
 import numba
 from numba.core import config
+from numba.extending import register_jitable
 
 ROOM = Path(__file__).parent
-SOURCES = ("kernels.py", "growth.py", "merging.py", "boxtree.py", "image.py", "numba_options.py", "../site/antennas.py")
+SOURCES = (
+    "field/dyads.py", "field/fresnel.py", "field/kernels.py",
+    "growth.py", "merging.py", "boxtree.py", "image.py", "numba_options.py",
+)  # fmt: skip
 """Files of kernels, and those whose functions and constants they take in."""
 
 
@@ -46,6 +50,7 @@ def cache_folder() -> Path | None:
 
 
 FOLDER = cache_folder()
+_MATHS: dict[str, Any] = {"error_model": "numpy", "fastmath": False}
 
 
 def kernel(function: Callable[..., Any]) -> Any:
@@ -53,6 +58,11 @@ def kernel(function: Callable[..., Any]) -> Any:
     before = config.CACHE_DIR
     config.CACHE_DIR = "" if FOLDER is None else str(FOLDER)  # numba asks for it when a function is decorated
     try:
-        return numba.njit(cache=FOLDER is not None, nogil=True, error_model="numpy", fastmath=False)(function)
+        return numba.njit(cache=FOLDER is not None, nogil=True, **_MATHS)(function)
     finally:
         config.CACHE_DIR = before
+
+
+def law(function: Callable[..., Any]) -> None:
+    """Let kernels call a law of plain Python, which NumPy evaluates as it is."""
+    register_jitable(**_MATHS)(function)

@@ -121,8 +121,8 @@ class PathSet:
         """Paths (paths,) that bounce off a crown."""
         return np.asarray((self.tree >= 0).any(axis=1))
 
-    def select(self, rows: AnyArray) -> PathSet:
-        """The paths of a mask or of indices."""
+    def select(self, rows: AnyArray | slice) -> PathSet:
+        """The paths of a mask, of indices or of a slice."""
         pose, tower, depth, tree = self.pose[rows], self.tower[rows], self.depth[rows], self.tree[rows]
         return PathSet(
             pose=pose, tower=tower, depth=depth, faces=self.faces[rows], vertices_m=self.vertices_m[rows], tree=tree

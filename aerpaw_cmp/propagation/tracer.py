@@ -20,11 +20,11 @@ from ..site.site import Site
 from . import image
 from .arrays import Array, Link, Poses
 from .cache import PathCache
-from .channel import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .compiled import beams, switch, warn_once
 from .crowns import Crowns
 from .effort import Estimate, OnEstimate
 from .faces import inside_solids
+from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .interactions import (
     SCATTERING_SAMPLES,
     OtherInteractions,
@@ -54,7 +54,7 @@ class Replay:
     Parameters
     ----------
     rss_dbm : (poses, towers)
-        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.channel.rss_dbm`. NaN without a path.
+        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.field.sum.rss_dbm`. NaN without a path.
     rss_power_dbm : (poses, towers)
         From the sum of the paths' powers.
     h : (poses, towers, n_rx, n_tx) complex128

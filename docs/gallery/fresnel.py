@@ -7,7 +7,7 @@ ground) has the pseudo-Brewster angle, where the ground reflection of a vertical
 import matplotlib.pyplot as plt
 import numpy as np
 
-from aerpaw_cmp.propagation.channel import reflection_coefficients
+from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
 from aerpaw_cmp.site.materials import material
 
 carrier_hz = 3.4e9

@@ -16,7 +16,7 @@ from aerpaw_cmp.flight import simulate
 from aerpaw_cmp.jobs import explain
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.propagation import tracer
-from aerpaw_cmp.propagation.channel import mean_pair_power
+from aerpaw_cmp.propagation.field.sum import mean_pair_power
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
 SETTINGS = {

@@ -11,7 +11,6 @@ from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import channel as field_module
 from aerpaw_cmp.propagation.arrays import (
     Array,
     Isotropic,
@@ -22,7 +21,9 @@ from aerpaw_cmp.propagation.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.propagation.channel import mean_pair_power, reflection_coefficients, rss_dbm
+from aerpaw_cmp.propagation.field import sum as field_module
+from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
+from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.materials import material
 

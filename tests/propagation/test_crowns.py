@@ -12,8 +12,8 @@ from shapely.geometry import box
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Array
 from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.channel import channel_matrices
 from aerpaw_cmp.propagation.crowns import FACES_PER_CROWN, Crowns
+from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import Isotropic

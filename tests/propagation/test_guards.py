@@ -101,7 +101,7 @@ def peak_bytes(poses, link, site):
 
 
 def test_memory_beyond_the_results_does_not_grow_with_the_poses(scenes, monkeypatch):
-    monkeypatch.setattr("aerpaw_cmp.propagation.channel.PAIRS_PER_CHUNK", 4_000)
+    monkeypatch.setattr("aerpaw_cmp.propagation.field.sum.PAIRS_PER_CHUNK", 4_000)
     monkeypatch.setattr("aerpaw_cmp.propagation.image.CELLS_PER_CHUNK", 20_000)
     site = scenes.site()
     link = scenes.link(site, tower_comparison_array(), uav_comparison_array(0.0882))

@@ -19,7 +19,7 @@ from aerpaw_cmp.propagation.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.channel import channel_matrices
+from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.interactions import OtherPaths, other_searches, path_powers, summary
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import NOT_IN_RANKS, replay

@@ -9,7 +9,7 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation import power_cut, tracer
-from aerpaw_cmp.propagation.channel import channel_matrices
+from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import channel, field_audit, reference, solids
+from aerpaw_cmp.propagation import field_audit, reference, solids
 from aerpaw_cmp.propagation.arrays import (
     linear_array,
     rotation_from_aircraft,
@@ -15,6 +15,7 @@ from aerpaw_cmp.propagation.arrays import (
     uav_comparison_array,
 )
 from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.field import dyads, sum
 from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
@@ -148,11 +149,19 @@ def _wrap(monkeypatch, where, name, change):
     monkeypatch.setattr(where, name, lambda *args: change(clean(*args)))
 
 
+def _turned(h, by):
+    return np.stack([h[..., 0] * by.real - h[..., 1] * by.imag, h[..., 0] * by.imag + h[..., 1] * by.real], axis=-1)
+
+
 FAULTS = {
-    "reflections times -0.1": (channel, "_reflect", lambda wave: -0.1 * wave),
-    "TE and TM exchanged": (channel, "reflection_coefficients", lambda r: r[::-1]),
-    "0.011 rad": (channel, "chunk_field", lambda h: h * np.exp(0.011j)),
-    "0.11 dB": (channel, "chunk_field", lambda h: h * 10 ** (0.11 / 20)),
+    "reflections times -0.1": (
+        dyads,
+        "reflected",
+        lambda wave: tuple(tuple(-0.1 * part for part in half) for half in wave),
+    ),
+    "TE and TM exchanged": (sum, "coefficients", lambda r: (*r[2:], *r[:2])),
+    "0.011 rad": (sum, "amplitudes", lambda h: _turned(h, np.exp(0.011j))),
+    "0.11 dB": (sum, "amplitudes", lambda h: h * 10 ** (0.11 / 20)),
     "nothing hides": (solids.Occlusion, "segments", np.zeros_like),
 }
 

@@ -6,7 +6,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, uav_comparison_array
-from aerpaw_cmp.propagation.channel import channel_matrices, mean_pair_power
+from aerpaw_cmp.propagation.field.sum import channel_matrices, mean_pair_power
 from aerpaw_cmp.propagation.relevance import idle_objects
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building

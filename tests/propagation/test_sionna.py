@@ -8,11 +8,12 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import channel, field_audit
+from aerpaw_cmp.propagation import field_audit
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.channel import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.field import dyads
+from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.scene import Scene
 from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building, Trees
@@ -87,9 +88,17 @@ def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, mo
     assert clean.paths > 50
     assert clean.power_max_db < 0.03
     assert clean.phase_max_rad < 3e-3
-    reflect = channel._reflect
+    reflect = dyads.reflected
     for factor in (-0.1, 10 ** (0.1 / 20), np.exp(0.011j)):
-        monkeypatch.setattr(channel, "_reflect", lambda *a, factor=factor: factor * reflect(*a))
+
+        def faulty(*a, factor=complex(factor)):
+            re, im = reflect(*a)
+            return (
+                tuple(factor.real * x - factor.imag * y for x, y in zip(re, im, strict=True)),
+                tuple(factor.imag * x + factor.real * y for x, y in zip(re, im, strict=True)),
+            )
+
+        monkeypatch.setattr(dyads, "reflected", faulty)
         assert audited().failures
 
 

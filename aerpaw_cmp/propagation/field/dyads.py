@@ -1,0 +1,224 @@
+"""Laws of one element pair over one path: directions, the element's field vector, the dyad of a reflection, reception.
+
+A path over mirrors ``M_1 .. M_d`` is straight in the space of the last image. With ``k`` the unit vector from the
+image of the tower element to the UAV element and ``n`` the normal of a face in that space, a reflection turns the
+field vector ``w`` into::
+
+    -r_tm w + (r_te + r_tm) s (s . w) / |s|^2,    s = k x n,    cos theta = |k . n|
+
+which is ``r_te e_s + r_tm e_p'`` of the textbook, mirrored. At normal incidence ``s`` is not defined, but there
+``r_te + r_tm`` is zero. Every law takes arrays or numbers: NumPy evaluates it as it is, and
+:mod:`aerpaw_cmp.propagation.field.kernels` compiles the same source.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+Number = Any
+"""A float, or an array of any shape."""
+Vector = tuple[Number, Number, Number]
+Rotation = tuple[Vector, Vector, Vector]
+"""Axes of a device, as rows."""
+
+_ROUND = 6755399441055744.0  # 1.5 * 2**52: adding and taking it off rounds to an integer, ties to even
+
+
+def select(condition: Number, yes: Number, no: Number) -> Number:
+    """``yes`` where the condition holds, else ``no``; both are evaluated."""
+    return np.where(condition, yes, no)
+
+
+def larger(a: Number, b: Number) -> Number:
+    """The larger of two numbers."""
+    return np.maximum(a, b)
+
+
+def smaller(a: Number, b: Number) -> Number:
+    """The smaller of two numbers."""
+    return np.minimum(a, b)
+
+
+def sine_cosine(turns: Number) -> tuple[Number, Number]:
+    """Sine and cosine of an angle in turns, within 1 ulp of the angle's part of a turn (polynomials of fdlibm)."""
+    turns = turns - ((turns + _ROUND) - _ROUND)
+    quarter = (4.0 * turns + _ROUND) - _ROUND
+    x = (turns - 0.25 * quarter) * (2.0 * np.pi)
+    z = x * x
+    tail = 2.75573137070700676789e-06 + z * (-2.50507602534068634195e-08 + z * 1.58969099521155010221e-10)
+    tail = 8.33333333332248946124e-03 + z * (-1.98412698298579493134e-04 + z * tail)
+    sine = x + x * z * (-1.66666666666666324348e-01 + z * tail)
+    tail = -2.75573143513906633035e-07 + z * (2.08757232129817482790e-09 + z * -1.13596475577881948265e-11)
+    tail = -1.38888888888741095749e-03 + z * (2.48015872894767294178e-05 + z * tail)
+    cosine = 1.0 - (0.5 * z - z * z * (4.16666666666666019037e-02 + z * tail))
+    odd = quarter * quarter == 1.0
+    sine_there, cosine_there = select(odd, cosine, sine), select(odd, sine, cosine)
+    return (
+        select((quarter < 0.0) | (quarter > 1.5), -sine_there, sine_there),
+        select((quarter > 0.5) | (quarter < -1.5), -cosine_there, cosine_there),
+    )
+
+
+def turned(m: Rotation, v: Vector) -> Vector:
+    """A site vector in device axes."""
+    return (
+        m[0][0] * v[0] + m[0][1] * v[1] + m[0][2] * v[2],
+        m[1][0] * v[0] + m[1][1] * v[1] + m[1][2] * v[2],
+        m[2][0] * v[0] + m[2][1] * v[1] + m[2][2] * v[2],
+    )
+
+
+def turned_back(m: Rotation, v: Vector) -> Vector:
+    """A device vector in site axes."""
+    return (
+        m[0][0] * v[0] + m[1][0] * v[1] + m[2][0] * v[2],
+        m[0][1] * v[0] + m[1][1] * v[1] + m[2][1] * v[2],
+        m[0][2] * v[0] + m[1][2] * v[1] + m[2][2] * v[2],
+    )
+
+
+def direction(image_m: Vector, frame: Rotation, tower_m: Vector, place_m: Vector, axes: Rotation, uav_m: Vector) -> Any:
+    """Unit vector from the image of a tower element to a UAV element, and their distance [m].
+
+    Parameters
+    ----------
+    image_m, place_m : Vector
+        Image of the tower's array, centre of the UAV's [m].
+    frame, axes : Rotation
+        Device axes of the tower in the last space, and of the UAV.
+    tower_m, uav_m : Vector
+        Places of the elements in their devices [m].
+
+    Returns
+    -------
+    x, y, z, length
+        Zero where the two meet.
+    """
+    here, there = turned_back(frame, tower_m), turned_back(axes, uav_m)
+    x = place_m[0] + there[0] - (image_m[0] + here[0])
+    y = place_m[1] + there[1] - (image_m[1] + here[1])
+    z = place_m[2] + there[2] - (image_m[2] + here[2])
+    length = np.sqrt(x * x + y * y + z * z)
+    scale = select(length > 0.0, 1.0 / larger(length, 1e-300), 0.0)
+    return x * scale, y * scale, z * scale, length
+
+
+def slant_rotation(e_theta: Number, e_phi: Number, cosine: Number, sine: Number) -> tuple[Number, Number]:
+    """Field of an element slanted from vertical: the pattern stays, its polarisation turns in the (theta, phi) basis.
+
+    Source: 3GPP TR 38.901 section 7.3.2.
+
+    Parameters
+    ----------
+    e_theta, e_phi : Number
+        Of the pattern.
+    cosine, sine : Number
+        Of the slant: 0 vertical, pi/2 horizontal.
+
+    Returns
+    -------
+    e_theta, e_phi : Number
+    """
+    return e_theta * cosine - e_phi * sine, e_theta * sine + e_phi * cosine
+
+
+def field_vector(m: Rotation, toward: Vector, e_theta: Number, e_phi: Number) -> Vector:
+    """Field ``e_theta theta + e_phi phi`` of a device with axes ``m``, radiated ``toward``, as a vector in site axes.
+
+    Sines and cosines of theta and phi are ratios of the direction's components; at a pole phi is 0.
+
+    Parameters
+    ----------
+    m : Rotation
+        Device axes as rows, in the space of ``toward``.
+    toward : Vector
+        Unit vector away from the device.
+    e_theta, e_phi : Number
+
+    Returns
+    -------
+    Vector
+    """
+    x, y, z = turned(m, toward)
+    across = np.sqrt(x * x + y * y)
+    off_pole = across > 0.0
+    scale = select(off_pole, 1.0 / larger(across, 1e-300), 0.0)
+    cosine, sine = select(off_pole, x * scale, 1.0), y * scale
+    a = e_theta * (z * cosine) - e_phi * sine
+    b = e_theta * (z * sine) + e_phi * cosine
+    return turned_back(m, (a, b, -e_theta * across))
+
+
+def incidence(toward: Vector, normal: Vector) -> Number:
+    """Cosine of the angle of incidence."""
+    return np.abs(normal[0] * toward[0] + normal[1] * toward[1] + normal[2] * toward[2])
+
+
+def reflected(
+    re: Vector, im: Vector, toward: Vector, normal: Vector, te_re: Number, te_im: Number, tm_re: Number, tm_im: Number
+) -> tuple[Vector, Vector]:
+    """Field vector after the dyad of one reflection.
+
+    Parameters
+    ----------
+    re, im : Vector
+        The wave before.
+    toward, normal : Vector
+        Unit vectors of the ray and of the face, in the last space.
+    te_re, te_im, tm_re, tm_im : Number
+        Coefficients of the face at this angle.
+
+    Returns
+    -------
+    re, im : Vector
+    """
+    (x, y, z), (n0, n1, n2) = toward, normal
+    s0, s1, s2 = y * n2 - z * n1, z * n0 - x * n2, x * n1 - y * n0
+    scale = 1.0 / larger(s0 * s0 + s1 * s1 + s2 * s2, 1e-300)
+    q_re, q_im = (te_re + tm_re) * scale, (te_im + tm_im) * scale
+    a = s0 * re[0] + s1 * re[1] + s2 * re[2]
+    b = s0 * im[0] + s1 * im[1] + s2 * im[2]
+    c_re, c_im = a * q_re - b * q_im, a * q_im + b * q_re
+    return (
+        (
+            c_re * s0 - (tm_re * re[0] - tm_im * im[0]),
+            c_re * s1 - (tm_re * re[1] - tm_im * im[1]),
+            c_re * s2 - (tm_re * re[2] - tm_im * im[2]),
+        ),
+        (
+            c_im * s0 - (tm_re * im[0] + tm_im * re[0]),
+            c_im * s1 - (tm_re * im[1] + tm_im * re[1]),
+            c_im * s2 - (tm_re * im[2] + tm_im * re[2]),
+        ),
+    )
+
+
+def spreading(cycles: Number) -> Number:
+    """``lambda / (4 pi L)`` of a length in wavelengths, at most 1: nobody receives more than was sent."""
+    return smaller(1.0, 1.0 / (4.0 * np.pi * cycles))
+
+
+def received(wave_re: Vector, wave_im: Vector, uav_re: Vector, uav_im: Vector, cycles: Number) -> tuple[Number, Number]:
+    """Complex amplitude of a pair: the UAV's pattern (not conjugated: reciprocity), spreading and carrier phase.
+
+    Parameters
+    ----------
+    wave_re, wave_im : Vector
+        The wave that arrives.
+    uav_re, uav_im : Vector
+        Field vector that the UAV's element would radiate back.
+    cycles : Number
+        Length of the path in wavelengths.
+
+    Returns
+    -------
+    re, im : Number
+    """
+    (a0, a1, a2), (b0, b1, b2), (g0, g1, g2), (h0, h1, h2) = wave_re, wave_im, uav_re, uav_im
+    re = g0 * a0 + g1 * a1 + g2 * a2 - (h0 * b0 + h1 * b1 + h2 * b2)
+    im = g0 * b0 + g1 * b1 + g2 * b2 + (h0 * a0 + h1 * a1 + h2 * a2)
+    sine, cosine = sine_cosine(cycles)
+    amplitude = spreading(cycles)
+    return amplitude * (re * cosine + im * sine), amplitude * (im * cosine - re * sine)

@@ -1,0 +1,165 @@
+"""What the field asks of paths and arrays, as columns: the space of the last image, and elements spread over pairs."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from ...common.units import AnyArray, FloatArray, IntArray
+from ...site.antennas import Isotropic
+from ..arrays import Array, Link, Pattern, Poses
+from ..paths import Faces, PathSet
+from . import dyads
+
+
+class Geometry(NamedTuple):
+    """Some paths, each in the space of its last image.
+
+    ``image_m`` (paths, 3) is the tower there, ``frame`` (paths, 3, 3) its device axes as rows, ``normal`` (paths, most,
+    3) those of the faces and ``face`` (paths, most, 3) what :meth:`FaceMaterials.table` has of them; ``place_m`` and
+    ``axes`` are the UAV's. ``depth`` and ``tower`` (paths,) are those of the path set.
+    """
+
+    image_m: FloatArray
+    frame: FloatArray
+    normal: FloatArray
+    face: FloatArray
+    depth: IntArray
+    tower: IntArray
+    place_m: FloatArray
+    axes: FloatArray
+
+    def some(self, rows: AnyArray) -> Geometry:
+        """Those of a mask or of indices."""
+        return Geometry._make(column[rows] for column in self)
+
+
+class Elements(NamedTuple):
+    """Elements of both ends, spread over the pairs of a link: pair p joins UAV element p // ports and port p % ports.
+
+    Places (towers, 3, pairs) and (3, pairs) in the devices [m]; cosine and sine of the slants (towers, 2, pairs) and
+    (2, pairs).
+    """
+
+    tower_m: FloatArray
+    tower_slant: FloatArray
+    uav_m: FloatArray
+    uav_slant: FloatArray
+
+    @classmethod
+    def of(cls, link: Link) -> Elements:
+        """The elements of a link whose towers have one number of ports."""
+        arrays, uav = list(link.tower_arrays.values()), link.uav_array
+        pair = np.arange(len(arrays[0]) * len(uav))
+        port, element = pair % len(arrays[0]), pair // len(arrays[0])
+        towers = [_columns(array, port) for array in arrays]
+        return cls(np.stack([t[0] for t in towers]), np.stack([t[1] for t in towers]), *_columns(uav, element))
+
+
+def _columns(array: Array, element: IntArray) -> tuple[FloatArray, FloatArray]:
+    """Places (3, pairs) and slants (2, pairs) of chosen elements."""
+    slant = array.slant_rad[element]
+    return np.ascontiguousarray(array.positions_m[element].T), np.stack([np.cos(slant), np.sin(slant)])
+
+
+Ends = tuple[FloatArray | None, FloatArray | None]
+"""Pattern fields of tower and UAV; None for 1 along theta in all directions."""
+
+
+def geometry(
+    paths: PathSet, faces: Faces, table: FloatArray, sources_m: FloatArray, poses: Poses, link: Link
+) -> Geometry:
+    """Columns of some paths.
+
+    Parameters
+    ----------
+    paths : PathSet
+    faces : Faces
+    table : (faces + 1, 3)
+        Their materials: :meth:`FaceMaterials.table`.
+    sources_m : (towers, 3)
+        Centres of the tower arrays [m].
+    poses : Poses
+    link : Link
+
+    Returns
+    -------
+    Geometry
+    """
+    depth = int(paths.depth.max(initial=0))
+    sequence = paths.faces[:, :depth]
+    mounts = np.stack([array.mount.T for array in link.tower_arrays.values()])
+    image, frame = sources_m[paths.tower], mounts[paths.tower]
+    normals = np.where((sequence >= 0)[..., None], faces.normal[sequence], 0.0)
+    for step in range(depth):
+        normal = normals[:, step].copy()  # zero where there is no face: nothing is mirrored
+        offset = np.where(sequence[:, step] >= 0, faces.offset_m[sequence[:, step]], 0.0)
+        image = image - 2.0 * ((image * normal).sum(axis=1) - offset)[:, None] * normal
+        for vectors in (frame, normals[:, :step]):
+            vectors -= 2.0 * np.einsum("nij,nj->ni", vectors, normal)[..., None] * normal[:, None, :]
+    first, last = paths.pose.min(initial=len(poses)), paths.pose.max(initial=0)
+    axes = np.einsum("nij,jk->nki", poses.rotation[first : last + 1], link.uav_array.mount)
+    return Geometry(
+        image_m=image,
+        frame=frame,
+        normal=normals,
+        face=table[sequence],
+        depth=paths.depth,
+        tower=paths.tower,
+        place_m=poses.position_m[paths.pose],
+        axes=axes[paths.pose - first],
+    )
+
+
+def rows_of(matrix: FloatArray) -> dyads.Rotation:
+    """Rotations (n, 3, 3) as the laws take them, against pairs (n, pairs)."""
+    return tuple(tuple(matrix[:, i, j, None] for j in range(3)) for i in range(3))  # type: ignore[return-value]
+
+
+def parts_of(vector: AnyArray) -> dyads.Vector:
+    """Vectors (n, 3) as the laws take them, against pairs (n, pairs)."""
+    return vector[:, 0, None], vector[:, 1, None], vector[:, 2, None]
+
+
+def directions(g: Geometry, elements: Elements) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Unit vectors and lengths (paths, pairs) from the towers' images to the UAV."""
+    tower_m = elements.tower_m[g.tower]
+    found = dyads.direction(
+        parts_of(g.image_m), rows_of(g.frame), (tower_m[:, 0], tower_m[:, 1], tower_m[:, 2]),
+        parts_of(g.place_m), rows_of(g.axes), tuple(elements.uav_m),  # type: ignore[arg-type]
+    )  # fmt: skip
+    return found  # type: ignore[no-any-return]
+
+
+def pattern_fields(array: Array, element: IntArray, m: dyads.Rotation, toward: dyads.Vector) -> FloatArray:
+    """E_theta and E_phi (paths, 4, pairs: real and imaginary parts) of chosen elements ``toward`` site directions.
+
+    Parameters
+    ----------
+    array : Array
+    element : (pairs,) int
+    m : Rotation
+        Device axes as rows.
+    toward : Vector
+        Unit vectors (paths, pairs) away from the device.
+
+    Returns
+    -------
+    (paths, 4, pairs)
+    """
+    x, y, z = dyads.turned(m, toward)
+    theta, phi = np.arctan2(np.hypot(x, y), z), np.arctan2(y, x)  # arccos would lose half of the digits at the poles
+    fields = np.empty((len(theta), 4, theta.shape[1]))
+    patterns = array.patterns if len(array.patterns) > 1 else array.patterns * len(array)
+    for pattern in {id(p): p for p in patterns}.values():
+        pairs = np.flatnonzero([patterns[e] is pattern for e in element])
+        e_theta, e_phi = pattern.field(theta[:, pairs], phi[:, pairs])
+        for part, value in enumerate((e_theta.real, e_theta.imag, e_phi.real, e_phi.imag)):
+            fields[:, part, pairs] = value
+    return fields
+
+
+def plain(patterns: tuple[Pattern, ...]) -> bool:
+    """Whether every pattern is 1 along theta in all directions; a class derived from Isotropic may mean another."""
+    return all(type(pattern) is Isotropic for pattern in patterns)

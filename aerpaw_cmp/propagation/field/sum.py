@@ -1,0 +1,302 @@
+"""The sum over paths: channel matrices in float64 for every pair of elements, and levels.
+
+For a pair (tower element ``t``, UAV element ``u``) and a path over the faces ``f1 .. fd`` the image of ``t`` gives the
+length ``L`` and all directions; the entry of the channel matrix is::
+
+    g_u . M_d ... M_1 . g_t   *   min(1, lambda / (4 pi L))   *   exp(-j 2 pi L / lambda)   *   10^(-loss / 20)
+
+with ``g`` the complex field of the element as a vector and ``M_k`` the dyad of reflection ``k`` with the Fresnel
+coefficients of ITU-R P.2040 at this pair's own angle (:mod:`dyads`, :mod:`fresnel`). Time factor ``e^{+j omega t}``.
+The pattern of the receiving element enters without conjugation (reciprocity), so turning a link round transposes H.
+Each path is evaluated alone and added in the order of the path set: results do not depend on chunks and threads.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from ...common.errors import UsageError
+from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
+from .. import compiled
+from ..arrays import Array, Link, Poses
+from ..paths import Faces, PathSet
+from . import dyads
+from .fresnel import FaceMaterials, coefficients
+from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
+
+PAIRS_PER_CHUNK = 8_000
+"""Element pairs that NumPy evaluates at once: their columns stay in the cache of a core."""
+
+PATHS_PER_PART = 4096
+"""Paths between whose ends threads change: some milliseconds of work."""
+
+
+@dataclass(frozen=True, slots=True)
+class Fields:
+    """What the paths of a replay add up to.
+
+    Parameters
+    ----------
+    h : (poses, towers, n_rx, n_tx) complex
+        Coherent sum over paths; zero without a path.
+    path_power : (paths,)
+        Mean over element pairs of ``|h|^2`` of each path alone.
+    power : (poses, towers)
+        Sum of ``path_power``: what a receiver sees on average when the phases of the paths are random.
+    """
+
+    h: ComplexArray
+    path_power: FloatArray
+    power: FloatArray
+
+
+def channel_matrices(
+    paths: PathSet,
+    faces: Faces,
+    sources_m: FloatArray,
+    poses: Poses,
+    link: Link,
+    loss_db: FloatArray | None = None,
+    *,
+    threads: int | None = None,
+    work: int | None = None,
+) -> Fields:
+    """Channel matrices of a path set.
+
+    Source: arXiv 2502.10324 eq. 1; arXiv 2502.10324 eq. 6.
+
+    Parameters
+    ----------
+    paths : PathSet
+    faces : Faces
+        That the paths refer to.
+    sources_m : (towers, 3)
+        Array centres, in the order of ``link.tower_arrays``.
+    poses : Poses
+    link : Link
+    loss_db : (paths,), optional
+        Further loss of each path, such as foliage.
+    threads : int, optional
+        Of compiled code (default: the cores this process may use); results do not depend on it.
+    work : int, optional
+        Element pairs of all links of the replay that this call is a part of; decides whether compiled code is worth
+        loading (:mod:`aerpaw_cmp.propagation.compiled`).
+
+    Returns
+    -------
+    Fields
+
+    Raises
+    ------
+    UsageError
+        If the towers' arrays have different numbers of elements, or an array has patterns for some elements only.
+
+    Notes
+    -----
+    Compiled code differs from NumPy's by rounding alone: some 1e-15 of H (``tests/propagation/test_compiled.py``).
+    """
+    arrays = list(link.tower_arrays.values())
+    ports, uavs = _ports(arrays), len(link.uav_array)
+    _check_patterns([*arrays, link.uav_array])
+    kernels = compiled.kernels_for(len(poses) * len(arrays) * ports * uavs if work is None else work)
+    evaluate = amplitudes if kernels is None else kernels.amplitudes
+    elements, wavelength = Elements.of(link), wavelength_m(link.carrier_hz)
+    table = FaceMaterials.of(faces, link.carrier_hz).table(wavelength)
+    order = _by_link(paths, len(arrays))
+    ordered = paths if order is None else paths.select(order)
+    lost = None if loss_db is None else amplitude_from_db(-(loss_db if order is None else loss_db[order]))
+    h = np.zeros((len(poses) * len(arrays), ports * uavs), dtype=np.complex128)
+    power = np.zeros(len(paths))
+
+    def run(part: slice) -> None:
+        some = ordered.select(part)
+        columns = geometry(some, faces, table, sources_m, poses, link)
+        amplitude = evaluate(columns, elements, pattern_ends(columns, elements, link), wavelength)
+        if lost is not None:
+            amplitude *= lost[part, None, None]
+        power[part] = np.einsum("npc,npc->n", amplitude, amplitude) / (ports * uavs)
+        key = some.pose * len(arrays) + some.tower
+        first = np.flatnonzero(np.diff(key, prepend=-1))
+        h[key[first]] = np.add.reduceat(amplitude.view(np.complex128)[..., 0], first, axis=0)
+
+    compiled.in_threads(run, _parts(ordered.pose), 1 if kernels is None else threads)
+    if order is not None:
+        power[order] = power.copy()
+    matrices = h.reshape(len(poses), len(arrays), uavs, ports)
+    matrices = np.ascontiguousarray(matrices.swapaxes(2, 3)) if link.uav_transmits else matrices
+    links = paths.pose * len(arrays) + paths.tower
+    summed = np.bincount(links, weights=power, minlength=len(poses) * len(arrays)).astype(np.float64)
+    return Fields(matrices, power, summed.reshape(len(poses), len(arrays)))
+
+
+def amplitudes(
+    g: Geometry,
+    elements: Elements,
+    ends: Ends,
+    wavelength: float,
+    record: Callable[[str, AnyArray], None] | None = None,
+) -> FloatArray:
+    """Complex amplitudes of some paths: what each adds to H, before further losses.
+
+    Parameters
+    ----------
+    g : Geometry
+    elements : Elements
+    ends : (paths, 4, pairs) or None, twice
+        Pattern fields of tower and UAV: :func:`pattern_ends`.
+    wavelength : float
+        [m]
+    record : callable, optional
+        Gets the power (paths, pairs) of the "wave" after the tower and after each reflection, the "spreading" of the
+        amplitude, and the power of the "uav"; for paths of one depth.
+
+    Returns
+    -------
+    (paths, pairs, 2)
+        Real and imaginary parts.
+    """
+    pairs = elements.tower_m.shape[2]
+    out = np.empty((len(g.depth), pairs, 2))
+    step = max(1, PAIRS_PER_CHUNK // pairs)
+    for depth in np.unique(g.depth):
+        rows = np.flatnonzero(g.depth == depth)
+        for start in range(0, len(rows), step):
+            few = rows[start : start + step]
+            tower, uav = (None if e is None else e[few] for e in ends)
+            out[few] = _of_one_depth(g.some(few), elements, (tower, uav), wavelength, record)
+    return out
+
+
+def _of_one_depth(
+    g: Geometry, elements: Elements, ends: Ends, wavelength: float, record: Callable[[str, AnyArray], None] | None
+) -> FloatArray:
+    x, y, z, length = directions(g, elements)
+    toward, slant = (x, y, z), elements.tower_slant[g.tower]
+    re, im = _vectors(rows_of(g.frame), toward, ends[0], slant[:, 0], slant[:, 1])
+    for step in range(g.depth[0]):
+        if record is not None:
+            record("wave", _power(re, im))
+        normal, face = parts_of(g.normal[:, step]), parts_of(g.face[:, step])
+        re, im = dyads.reflected(re, im, toward, normal, *coefficients(dyads.incidence(toward, normal), *face))
+    uav = _vectors(rows_of(g.axes), (-x, -y, -z), ends[1], *elements.uav_slant)
+    cycles = length / wavelength
+    with np.errstate(divide="ignore"):
+        if record is not None:
+            steps = ("wave", _power(re, im)), ("spreading", dyads.spreading(cycles)), ("uav", _power(*uav))
+            for name, value in steps:
+                record(name, value)
+        return np.stack(dyads.received(re, im, *uav, cycles), axis=-1)
+
+
+def _vectors(
+    m: dyads.Rotation, toward: dyads.Vector, fields: FloatArray | None, cosine: FloatArray, sine: FloatArray
+) -> tuple[dyads.Vector, dyads.Vector]:
+    """Field vectors of elements in site axes: real parts, then imaginary ones."""
+    if fields is None:
+        return dyads.field_vector(m, toward, *dyads.slant_rotation(1.0, 0.0, cosine, sine)), (0.0, 0.0, 0.0)
+    theta_re, theta_im, phi_re, phi_im = fields.swapaxes(0, 1)
+    re = dyads.field_vector(m, toward, *dyads.slant_rotation(theta_re, phi_re, cosine, sine))
+    if not (theta_im.any() or phi_im.any()):
+        return re, (0.0, 0.0, 0.0)
+    return re, dyads.field_vector(m, toward, *dyads.slant_rotation(theta_im, phi_im, cosine, sine))
+
+
+def _power(re: dyads.Vector, im: dyads.Vector) -> FloatArray:
+    return np.asarray(sum(part**2 for part in (*re, *im)))
+
+
+def pattern_ends(g: Geometry, elements: Elements, link: Link) -> Ends:
+    """Pattern fields (paths, 4, pairs) of both ends along the paths; None where all are 1 along theta."""
+    arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    plain_towers, plain_uav = all(plain(array.patterns) for array in arrays), plain(uav.patterns)
+    if plain_towers and plain_uav:
+        return None, None
+    x, y, z, _ = directions(g, elements)
+    ports, pair = len(arrays[0]), np.arange(x.shape[1])
+    towers = None if plain_towers else np.empty((len(x), 4, len(pair)))
+    if towers is not None:
+        for number, array in enumerate(arrays):
+            rows = np.flatnonzero(g.tower == number)
+            towers[rows] = pattern_fields(array, pair % ports, rows_of(g.frame[rows]), (x[rows], y[rows], z[rows]))
+    away = (-x, -y, -z)
+    return towers, None if plain_uav else pattern_fields(uav, pair // ports, rows_of(g.axes), away)
+
+
+def radiated(array: Array, turn: FloatArray, direction: FloatArray) -> ComplexArray:
+    """Field vectors (3, paths, elements) in site axes of an array's elements in one direction (3, paths) per path.
+
+    ``turn`` (paths, 3, 3) turns the device into the site; directions point away from the device.
+    """
+    m, (x, y, z) = rows_of(turn.transpose(0, 2, 1)), direction[:, :, None]
+    fields = None
+    if not plain(array.patterns):
+        x, y, z = (np.repeat(part, len(array), axis=1) for part in (x, y, z))
+        fields = pattern_fields(array, np.arange(len(array)), m, (x, y, z))
+    re, im = _vectors(m, (x, y, z), fields, np.cos(array.slant_rad), np.sin(array.slant_rad))
+    return np.stack([a + 1j * b for a, b in zip(re, im, strict=True)])
+
+
+def _check_patterns(arrays: Sequence[Array]) -> None:
+    for array in arrays:
+        if len(array.patterns) not in (1, len(array)):
+            raise UsageError(
+                f"{len(array.patterns)} patterns for {len(array)} elements",
+                expected="one shared pattern or one per element",
+            )
+
+
+def _ports(arrays: Sequence[Array]) -> int:
+    counts = {len(array) for array in arrays}
+    if len(counts) != 1:
+        raise UsageError(
+            f"tower arrays of {sorted(counts)} elements",
+            expected="the same number of elements at every tower of a link",
+        )
+    return counts.pop()
+
+
+def _by_link(paths: PathSet, towers: int) -> IntArray | None:
+    """Order of the paths by pose and tower, None where they have it: a link is summed in one run."""
+    key = paths.pose * towers + paths.tower
+    return None if (np.diff(key) >= 0).all() else np.argsort(key, kind="stable")
+
+
+def _parts(pose: IntArray) -> list[slice]:
+    """Runs of paths between poses: threads must not share a link."""
+    edges = [0]
+    while edges[-1] < len(pose):
+        stop = min(edges[-1] + PATHS_PER_PART, len(pose))
+        if stop < len(pose):  # to the end of the pose
+            stop = int(np.searchsorted(pose, pose[stop - 1], side="right"))
+        edges.append(stop)
+    return [slice(start, stop) for start, stop in pairwise(edges)]
+
+
+def rss_dbm(power: FloatArray, transmit_power_dbm: float, noise_floor_dbm: float = -np.inf) -> FloatArray:
+    """Received power [dBm]; NaN where ``power`` is zero (no path) or the level is below the noise floor [dBm].
+
+    ``power`` is the mean over element pairs of ``|h|^2``: the transmit power is shared equally by the transmitting
+    ports, which send independent signals, and the received power is the mean over the receiving ports. With one
+    element at both ends it is ``|h|^2``.
+    """
+    level = transmit_power_dbm + db_from_power(power)
+    return np.asarray(np.where((power > 0.0) & (level >= noise_floor_dbm), level, np.nan))
+
+
+def mean_pair_power(h: ComplexArray) -> FloatArray:
+    """Mean over the last two axes of ``|h|^2``; tiny and huge channels neither vanish nor overflow."""
+    parts = np.ascontiguousarray(h).view(np.float64).reshape(*h.shape[:-2], 2 * h.shape[-2] * h.shape[-1])
+    pairs = max(parts.shape[-1] // 2, 1)
+    with np.errstate(over="ignore", under="ignore"):
+        power = np.asarray(np.einsum("...i,...i->...", parts, parts) / pairs)
+    odd = ~((power > 1e-280) & (power < 1e280))  # squares may have lost digits: scaled by the largest entry
+    if odd.any():
+        some = h[odd]
+        scale = np.abs(some).max(axis=(-2, -1), keepdims=True, initial=0.0)
+        safe = np.where(scale > 0.0, scale, 1.0)
+        power[odd] = (np.abs(some / safe) ** 2).mean(axis=(-2, -1)) * scale[..., 0, 0] ** 2
+    return power

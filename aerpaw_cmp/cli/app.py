@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Annotated, Any, Optional, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import typer
+from typer.core import TyperCommand
 
 from ..common.commands import COMMANDS
 from .shown import say
@@ -66,7 +67,12 @@ Quiet = Annotated[
 
 
 def command(
-    name: str, *, examples: Sequence[str], of: typer.Typer = app, text: str | None = None
+    name: str,
+    *,
+    examples: Sequence[str],
+    of: typer.Typer = app,
+    text: str | None = None,
+    kind: type[TyperCommand] | None = None,
 ) -> Callable[[_Function], _Function]:
     """Register a function as a command.
 
@@ -79,9 +85,11 @@ def command(
         The program, or a group of commands such as ``site_app``.
     text : str, optional
         One line of help; without it that of :data:`aerpaw_cmp.common.commands.COMMANDS`.
+    kind : type, optional
+        Reads the arguments in its own way.
     """
     epilog = "\b\nExamples:\n" + "\n".join(f"  {line}" for line in examples)
-    register = of.command(name, help=COMMANDS[name] if text is None else text, epilog=epilog)
+    register = of.command(name, cls=kind, help=COMMANDS[name] if text is None else text, epilog=epilog)
 
     def take(function: _Function) -> _Function:
         register(_with_quiet(function))

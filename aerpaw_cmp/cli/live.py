@@ -7,10 +7,27 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, Optional
 
 import typer
+from typer.core import TyperCommand
 
 from ..common.errors import UsageError
 from .app import Force, Json, command
 from .shown import print_files, print_json, say
+
+WEB = "127.0.0.1:8765"
+
+
+class WebCommand(TyperCommand):
+    """A command whose ``--web`` may stand without an address."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        """Put the usual address behind a bare ``--web``: an address is what holds a colon and no slash."""
+        given = []
+        for index, word in enumerate(args):
+            given.append(word)
+            following = args[index + 1] if index + 1 < len(args) else ""
+            if word == "--web" and (":" not in following or "/" in following or following.startswith("-")):
+                given.append(WEB)
+        return super().parse_args(ctx, given)
 
 
 @command(
@@ -18,13 +35,20 @@ from .shown import print_files, print_json, say
     examples=[
         "aerpaw-cmp tap",
         "aerpaw-cmp tap /dev/ttyUSB2 -o taplog --no-csi-alarm 5 --duration 600",
-        "aerpaw-cmp tap --replay taplog --no-status",
+        "aerpaw-cmp tap /tmp/modem -o taplog --web --flight sample_logs/flight.yaml",
+        "aerpaw-cmp tap --play taplog --speed 20",
         "aerpaw-cmp tap -o taplog --export csv",
     ],
+    kind=WebCommand,
 )
 def tap(
-    port: Annotated[str | None, typer.Argument(help="Serial port; without it the first AT port of a Quectel.")] = None,
-    out: Annotated[Path, typer.Option("-o", "--out", help="Folder of the log segments.")] = Path("tap"),
+    port: Annotated[
+        Optional[list[str]],  # noqa: UP045
+        typer.Argument(help="Serial port, or several; without it the first AT port of a Quectel."),
+    ] = None,
+    out: Annotated[
+        Path, typer.Option("-o", "--out", help="Folder of the log segments; of several ports, a folder in it for each.")
+    ] = Path("tap"),
     status: Annotated[bool, typer.Option("--status/--no-status", help="A status line on standard error.")] = True,
     enable_csi: Annotated[
         bool, typer.Option("--enable-csi", help="Switch CSI reporting on; restored on exit.")
@@ -36,19 +60,30 @@ def tap(
     sync_s: Annotated[float, typer.Option(help="Longest time between a record and its sync to disk.")] = 1.0,
     duration: Annotated[Optional[float], typer.Option(help="End by itself after so many seconds.")] = None,  # noqa: UP045
     wait: Annotated[float, typer.Option(help="Wait so many seconds for the port to appear.")] = 0.0,
-    replay: Annotated[Optional[Path], typer.Option(help="Tap a transcript or tap log instead of a port.")] = None,  # noqa: UP045
+    web: Annotated[
+        Optional[str],  # noqa: UP045
+        typer.Option(help=f"Also show the flight as a page, at HOST:PORT [default: {WEB}]; 0.0.0.0 asks for a token."),
+    ] = None,
+    play: Annotated[
+        Optional[list[Path]],  # noqa: UP045
+        typer.Option(help="Show an earlier log as that page and tap nothing; repeat it for several modems."),
+    ] = None,
+    speed: Annotated[float, typer.Option(help="Seconds of the log per second, with --play.")] = 1.0,
     export: Annotated[
         Optional[Literal["csv"]],  # noqa: UP045
         typer.Option(help="Write the log below OUT as a table and end."),
     ] = None,
-    flight: Annotated[Optional[Path], typer.Option(help="flight.yaml: also show the rank the replay predicts.")] = None,  # noqa: UP045
+    flight: Annotated[
+        Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")
+    ] = None,
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
     force: Force = False,
     as_json: Json = False,
 ) -> int:
     """Log the modem's rank indicator until interrupted."""
+    from ..common.jsonable import json_safe
+
     if export is not None:
-        from ..common.jsonable import json_safe
         from ..live.export import export_csv
 
         exported = export_csv(out, out / "tap.csv", force=force)
@@ -58,14 +93,16 @@ def tap(
             print(exported)
         return 0
     _needs_posix("tap")
-    from ..common.jsonable import json_safe
+    from ..jobs.live_tap import Shown, play_logs, tap_modems
     from ..live.log import LogSettings
-    from ..live.session import TapSettings, format_status
-    from ..live.tap import run_tap
+    from ..live.session import TapSettings
 
+    shown = Shown(web=web or (WEB if play else None), flight=flight, telemetry=telemetry, say=say)
+    if play:
+        play_logs(play, speed, shown)
+        return 0
     settings = TapSettings(
         folder=out,
-        port=port,
         ri_hz=ri_hz,
         other_hz=other_hz,
         enable_csi=enable_csi,
@@ -73,36 +110,46 @@ def tap(
         no_csi_exit=no_csi_exit,
         duration_s=duration,
         wait_for_port_s=wait,
-        replay=replay,
         log=LogSettings(sync_interval_s=sync_s),
     )
-    predict = None
-    if flight is not None:
-        from ..jobs.run import live_prediction
+    line = StatusLine(status and not say.quiet)
+    summaries = tap_modems(settings, port or [None], shown, on_status=line)
+    for summary in summaries:
+        rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
+        say(f"{line.end}ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}")
+    if as_json:
+        print_json(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries}))
+    else:
+        print_files([path for summary in summaries for path in summary.segments])
+    return max(summary.exit_code for summary in summaries)
 
-        predict = live_prediction(flight, telemetry)
-    terminal = sys.stderr.isatty()
-    status = status and not say.quiet
 
-    def show(now: Any) -> None:
+class StatusLine:
+    """The status of one modem or more on standard error: on a terminal a line that is written over."""
+
+    def __init__(self, wanted: bool) -> None:
+        self._wanted, self._terminal = wanted, sys.stderr.isatty()
+        self._lines: dict[str, str] = {}
+
+    @property
+    def end(self) -> str:
+        """What leaves the line behind."""
+        return "\n" if self._terminal else ""
+
+    def __call__(self, name: str, now: Any) -> None:
+        """Show the status of the modem of this name; no name where there is only one."""
+        from ..live.session import format_status
+
+        head = f"{name}: " if name else ""
         if now.message:
-            print(("\r\033[K" if terminal else "") + now.message, file=sys.stderr, flush=True)
-        if status:
-            line = format_status(now)
-            print(f"\r\033[K{line}" if terminal else line, end="" if terminal else "\n", file=sys.stderr, flush=True)
+            print(("\r\033[K" if self._terminal else "") + head + now.message, file=sys.stderr, flush=True)
+        self._lines[name] = head + format_status(now)
+        if self._wanted and self._terminal:
+            print("\r\033[K" + " | ".join(self._lines.values()), end="", file=sys.stderr, flush=True)
+        elif self._wanted:
+            print(self._lines[name], file=sys.stderr, flush=True)
         if now.alarm:
             print("\a", end="", file=sys.stderr, flush=True)
-
-    summary = run_tap(settings, on_status=show, predict=predict)
-    rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
-    say(
-        ("\n" if terminal else "") + f"ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}"
-    )
-    if as_json:
-        print_json(json_safe(summary))
-    else:
-        print_files(summary.segments)
-    return int(summary.exit_code)
 
 
 def _needs_posix(command: str) -> None:
@@ -124,6 +171,7 @@ def _needs_posix(command: str) -> None:
     "modem-sim",
     examples=[
         "aerpaw-cmp modem-sim --link /tmp/modem",
+        "aerpaw-cmp modem-sim --link demo/modem --flight sample_logs/flight.yaml --telemetry demo/vehicleOut.txt",
         "aerpaw-cmp modem-sim --source taplog --fault echo=true --fault unplug_every_s=20",
     ],
 )
@@ -135,6 +183,10 @@ def modem_sim(
     kind: Annotated[
         Literal["modem", "gps", "diag", "silent", "rubbish"], typer.Option(help="What the port behaves like.")
     ] = "modem",
+    flight: Annotated[
+        Path | None, typer.Option(help="flight.yaml: fly it again from now on, with its ranks; needs --telemetry.")
+    ] = None,
+    telemetry: Annotated[Path | None, typer.Option(help="New file for the telemetry of --flight, which grows.")] = None,
     fault: Annotated[Optional[list[str]], typer.Option(help="NAME=VALUE, e.g. echo=true, unplug_every_s=20.")] = None,  # noqa: UP045
     as_json: Json = False,
 ) -> int:
@@ -142,7 +194,21 @@ def modem_sim(
     _needs_posix("modem-sim")
     from ..live.simulator import ModemSimSettings, run_modem_sim
 
-    settings = ModemSimSettings(link=link, source=source, kind=kind, faults=_faults(fault or []))  # type: ignore[arg-type]  # checked there
+    if (flight is None) != (telemetry is None):
+        raise UsageError("--flight or --telemetry stands alone", expected="both: the flight to fly, and its new log")
+    flown = None
+    if flight is not None and telemetry is not None:
+        from ..jobs.live_twin import FlownAgain
+
+        flown = FlownAgain(flight, telemetry)
+    settings = ModemSimSettings(
+        link=link,
+        source=source,
+        kind=kind,
+        faults=_faults(fault or []),
+        rank=None if flown is None else flown.rank,
+        rsrp=None if flown is None else flown.rsrp,
+    )
 
     def ready(port: object) -> None:
         if as_json:
@@ -150,7 +216,7 @@ def modem_sim(
         else:
             print(port, flush=True)
 
-    return run_modem_sim(settings, on_ready=ready)
+    return run_modem_sim(settings, on_ready=ready, meanwhile=flown)
 
 
 def _faults(pairs: list[str]) -> Any:

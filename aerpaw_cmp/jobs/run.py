@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
@@ -608,50 +608,6 @@ def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz
         label = f"{towers[paths.tower[index]]}, {count} reflection{'' if count == 1 else 's'}{off}"
         lines.append(PathLine(points_m=np.vstack([source, corners, point[0]]), label=label))
     return tuple(lines)
-
-
-def live_prediction(flight: Path, telemetry: Path | None) -> Callable[[int], int | None]:
-    """The rank that the image engine predicts at the present pose, for ``aerpaw-cmp tap --flight``.
-
-    ``telemetry`` is the growing log; without it, the first telemetry log of the flight file. The middle K counts.
-    """
-    import numpy as np
-
-    from ..compare.rank import channel_rank
-    from ..flight.data import choose_site
-    from ..flight.replay import replay_poses
-    from ..flight.settings import load_flight
-    from ..live.follow import TelemetryFollower, TelemetrySample, predict_along
-    from ..logs.readers import by_name
-    from ..propagation.arrays import Poses, rotation_from_aircraft
-
-    settings = load_flight(flight)
-    site = choose_site(settings.site, flight.parent)
-    link = settings.link.rank.build([settings.rank.tower], flight.parent)
-    log = next((entry for entry in settings.logs if entry.reader in (None, "vehicle_out")), settings.logs[0])
-    follower = TelemetryFollower(
-        telemetry or flight.parent / log.path,
-        options=log.options(settings.timezone),
-        reader=by_name(log.reader or "vehicle_out"),
-    )
-    k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
-
-    def rank_at(sample: TelemetrySample) -> int | None:
-        if not np.isfinite(sample.latitude_deg):
-            return None
-        east, north = site.frame.to_local(sample.latitude_deg, sample.longitude_deg)
-        up = max(sample.altitude_m + site.datum.takeoff_ground_m, 0.5)
-        rotation = np.eye(3)
-        if settings.rt.attitude != "ignored" and np.isfinite(sample.yaw_deg):
-            level = settings.rt.attitude == "level"
-            roll, pitch = (0.0, 0.0) if level else (sample.roll_deg, sample.pitch_deg)
-            rotation = rotation_from_aircraft(np.asarray(roll), np.asarray(pitch), np.asarray(sample.yaw_deg))
-        pose = Poses(np.array([[float(east), float(north), up]]), rotation[None])
-        replayed = replay_poses(site, settings.rt, link, pose, engine="image")
-        rank = int(channel_rank(replayed.h[0, 0], k))
-        return rank or None
-
-    return predict_along(follower, rank_at)
 
 
 @dataclass(frozen=True, slots=True)

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import math
 import os
+import time
 from bisect import bisect_left
 from collections import deque
 from collections.abc import Callable
@@ -11,7 +14,7 @@ from pathlib import Path
 
 from ..common.errors import InputError
 from ..logs.readers import Reader, ReadOptions, identify
-from .predict import Predict
+from .predict import Predict, Prediction
 
 TAIL_BYTES = 65_536
 """Of a log that is long already, only its end is read."""
@@ -28,9 +31,12 @@ class TelemetrySample:
     roll_deg: float
     pitch_deg: float
     yaw_deg: float
+    fix: float = math.nan
 
 
-_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg")
+_COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "roll_deg", "pitch_deg", "yaw_deg", "fix")
+DELAYS = 20
+"""Looks at the log over which its least delay is taken: a line may wait some time before it is written."""
 
 
 class TelemetryFollower:
@@ -60,6 +66,7 @@ class TelemetryFollower:
         self._reader = reader
         self._keep_ns = int(keep_s * 1e9)
         self._samples: deque[TelemetrySample] = deque()
+        self._delays: deque[float] = deque(maxlen=DELAYS)
         self._position = 0
         self._identity: tuple[int, int] | None = None
 
@@ -102,7 +109,13 @@ class TelemetryFollower:
         )
         while self._samples[-1].utc_ns - self._samples[0].utc_ns > self._keep_ns:
             self._samples.popleft()
+        self._delays.append((time.time_ns() - self._samples[-1].utc_ns) / 1e9)
         return len(frame)
+
+    @property
+    def delay_s(self) -> float | None:
+        """Least delay between the time in a line and its arrival, lately; negative: the log's clock is ahead."""
+        return min(self._delays) if self._delays else None
 
     def latest(self) -> TelemetrySample | None:
         """The last sample."""
@@ -140,19 +153,27 @@ class TelemetryFollower:
         return data[:end]
 
 
-def predict_along(follower: TelemetryFollower, rank_at: Callable[[TelemetrySample], int | None]) -> Predict:
-    """``predict`` for :func:`~aerpaw_cmp.live.tap.run_tap`: the rank at the pose of the followed log.
+def predict_along(follower: TelemetryFollower, replay_at: Callable[[TelemetrySample], Prediction]) -> Predict:
+    """``predict`` for :func:`~aerpaw_cmp.live.tap.run_tap`: the prediction at the pose of the followed log.
 
     Parameters
     ----------
     follower : TelemetryFollower
-    rank_at : callable
-        Rank of the replay at a pose; None out of coverage.
+    replay_at : callable
+        Prediction of the replay at a pose.
     """
 
-    def predict(utc_ns: int) -> int | None:
+    def predict(utc_ns: int) -> Prediction | None:
         follower.poll()
-        sample = follower.at(utc_ns)
-        return None if sample is None else rank_at(sample)
+        latest, sample = follower.latest(), follower.at(utc_ns)
+        if latest is None:
+            return None
+        now = Prediction() if sample is None else replay_at(sample)
+        return dataclasses.replace(
+            now,
+            fix=None if sample is None else sample.fix,
+            telemetry_age_s=(utc_ns - latest.utc_ns) / 1e9,
+            telemetry_delay_s=follower.delay_s,
+        )
 
     return predict

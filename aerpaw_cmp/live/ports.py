@@ -19,6 +19,7 @@ import select
 import stat
 import termios
 import time
+from collections.abc import Callable, Iterator, Set
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -185,19 +186,33 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
         wanted = path.stat().st_rdev
     except OSError:
         return []
+    # the master of a pseudo-terminal has another device number, so only openers of the port count
+    found = _processes_with(lambda file: stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted)
+    return [holder for holder in found if not others_only or holder.pid != os.getpid()]
+
+
+def holders_of_sockets(inodes: Set[int]) -> list[Holder]:
+    """Processes that have one of these sockets open, as far as we may look."""
+    return _processes_with(lambda file: stat.S_ISSOCK(file.st_mode) and file.st_ino in inodes)
+
+
+def _processes_with(wanted: Callable[[os.stat_result], bool]) -> list[Holder]:
+    """Processes that have an open file of this kind, by their numbers."""
     by_pid: dict[int, Holder] = {}
     for process in Path("/proc").iterdir():
-        if not process.name.isdigit() or (others_only and int(process.name) == os.getpid()):
+        if not process.name.isdigit():
             continue
         with contextlib.suppress(OSError):
-            for fd in (process / "fd").iterdir():
-                with contextlib.suppress(OSError):
-                    target = fd.stat()
-                    # the master of a pseudo-terminal has another device number, so only openers of the port count
-                    if stat.S_ISCHR(target.st_mode) and target.st_rdev == wanted:
-                        name = (process / "comm").read_text().strip()
-                        by_pid[int(process.name)] = Holder(int(process.name), name)
+            if any(map(wanted, _open_files(process))):
+                name = (process / "comm").read_text().strip()
+                by_pid[int(process.name)] = Holder(int(process.name), name)
     return sorted(by_pid.values(), key=lambda h: h.pid)
+
+
+def _open_files(process: Path) -> Iterator[os.stat_result]:
+    for fd in (process / "fd").iterdir():
+        with contextlib.suppress(OSError):
+            yield fd.stat()
 
 
 def modem_manager() -> Holder | None:

@@ -1,19 +1,129 @@
-"""The rank that the replay predicts now, computed beside the polling.
+"""The rank and the level that the replay predicts now, computed beside the polling, with intervals.
 
 The tap passes a time and gets records back; how a time becomes a pose and a pose a rank is the caller's:
-:class:`TelemetryFollower` gives the pose from a telemetry log that still grows.
+:class:`~aerpaw_cmp.live.follow.TelemetryFollower` gives the pose from a telemetry log that still grows.
 """
 
 from __future__ import annotations
 
+import math
 import queue
 import threading
+from bisect import bisect_left, insort
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
 from typing import Any
 
-Predict = Callable[[int], "int | None"]
-"""``predict(utc_ns) -> rank``; None: no pose for that time, or out of coverage."""
+RANKS = (1, 4)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Prediction:
+    """Prediction at the pose of one moment, and what the telemetry said of it.
+
+    Parameters
+    ----------
+    rank : int or None
+        None: no pose, or out of coverage.
+    level_dbm : float or None
+        Before any offset.
+    east_m, north_m, up_m : float or None
+        Position in the site frame; None: no pose for that time.
+    fix : float or None
+        Kind of the GPS fix; below 3 it gives no position.
+    telemetry_age_s : float or None
+        Age of the newest line of the telemetry log; None: no line so far.
+    telemetry_delay_s : float or None
+        Least delay of the lines that came lately: negative where the telemetry's clock is ahead of ours.
+    """
+
+    rank: int | None = None
+    level_dbm: float | None = None
+    east_m: float | None = None
+    north_m: float | None = None
+    up_m: float | None = None
+    fix: float | None = None
+    telemetry_age_s: float | None = None
+    telemetry_delay_s: float | None = None
+
+
+Predict = Callable[[int], "Prediction | None"]
+"""``predict(utc_ns)``; None: nothing is known of that time."""
+
+
+class RunningInterval:
+    """Interval of the next residual, from the residuals before it.
+
+    Parameters
+    ----------
+    share : float
+        Share of residuals that shall lie inside.
+    least : int
+        No interval before so many residuals.
+    keep : int
+        Residuals remembered.
+
+    Notes
+    -----
+    The bounds are order statistics of the last ``keep`` residuals. Neighbours in time are alike, so quantiles alone
+    would hold less than they say: after each residual the tail share ``a`` moves by ``a += step (1 - share - outside)``
+    (Gibbs and Candes 2021, doi 10.48550/arXiv.2106.00170), which makes the long-run share right for any sequence.
+
+    Examples
+    --------
+    >>> interval = RunningInterval(least=3)
+    >>> for residual in (1.0, 2.0, 3.0):
+    ...     interval.add(residual)
+    >>> interval.middle, interval.bounds()
+    (2.0, (1.0, 3.0))
+    """
+
+    STEP = 0.02
+
+    def __init__(self, share: float = 0.9, least: int = 20, keep: int = 1200) -> None:
+        self._share, self._least = share, least
+        self._recent: deque[float] = deque(maxlen=keep)
+        self._sorted: list[float] = []
+        self._tails = 1.0 - share
+        self.given = self.inside = 0
+
+    @property
+    def middle(self) -> float | None:
+        """Median of the residuals so far: the offset between prediction and measurement."""
+        return self._sorted[len(self._sorted) // 2] if self._sorted else None
+
+    def bounds(self) -> tuple[float, float] | None:
+        """Bounds of the next residual; None while too few are known or the interval has no bounds."""
+        n = len(self._sorted)
+        if n < self._least or self._tails <= 0.0:
+            return None
+        beyond = min((n - 1) // 2, max(0, math.floor(0.5 * self._tails * (n + 1)) - 1))
+        return self._sorted[beyond], self._sorted[n - 1 - beyond]
+
+    def add(self, residual: float) -> None:
+        """Take a residual in, after its interval was given."""
+        bounds = self.bounds()
+        outside = bounds is not None and not bounds[0] <= residual <= bounds[1]
+        if bounds is not None:
+            self.given += 1
+            self.inside += not outside
+        if len(self._sorted) >= self._least:
+            self._tails += self.STEP * (1.0 - self._share - outside)
+        if len(self._recent) == self._recent.maxlen:
+            del self._sorted[bisect_left(self._sorted, self._recent[0])]
+        self._recent.append(residual)
+        insort(self._sorted, residual)
+
+
+@dataclass(frozen=True, slots=True)
+class Asked:
+    """One answer of the modem for which a prediction is wanted: its time, its command's time, what it measured."""
+
+    utc_ns: int
+    sent_utc_ns: int
+    rank: int | None
+    rsrp_dbm: float | None = None
 
 
 class PredictionWorker:
@@ -26,21 +136,22 @@ class PredictionWorker:
 
     def __init__(self, predict: Predict) -> None:
         self._predict = predict
-        self._wanted: queue.Queue[tuple[int, int, int | None] | None] = queue.Queue(maxsize=1)
+        self._wanted: queue.Queue[Asked | None] = queue.Queue(maxsize=1)
         self._done: deque[dict[str, Any]] = deque(maxlen=1000)
+        self._rank, self._level = RunningInterval(), RunningInterval()
         self.skipped = 0
         self._thread = threading.Thread(target=self._run, name="tap-prediction", daemon=True)
         self._thread.start()
 
-    def ask(self, utc_ns: int, sent_utc_ns: int, measured: int | None) -> None:
-        """Want the prediction for the answer to the command sent then."""
+    def ask(self, asked: Asked) -> None:
+        """Want the prediction for an answer."""
         try:
-            self._wanted.put_nowait((utc_ns, sent_utc_ns, measured))
+            self._wanted.put_nowait(asked)
         except queue.Full:
             self.skipped += 1
 
     def results(self) -> list[dict[str, Any]]:
-        """Finished predictions, each with measured rank and residual (measured - predicted)."""
+        """Finished predictions, each with measured rank and residual (measured minus predicted)."""
         done = []
         while self._done:
             done.append(self._done.popleft())
@@ -55,19 +166,43 @@ class PredictionWorker:
         self._thread.join(timeout=2.0)
 
     def _run(self) -> None:
-        while (item := self._wanted.get()) is not None:
-            utc_ns, sent_utc_ns, measured = item
+        while (asked := self._wanted.get()) is not None:
             result: dict[str, Any] = {
-                "for_sent_utc_ns": sent_utc_ns,
-                "at_utc_ns": utc_ns,
-                "measured": measured,
+                "for_sent_utc_ns": asked.sent_utc_ns,
+                "at_utc_ns": asked.utc_ns,
+                "measured": asked.rank,
                 "predicted": None,
             }
             try:
-                predicted = self._predict(utc_ns)
-                result["predicted"] = None if predicted is None else int(predicted)
+                prediction = self._predict(asked.utc_ns)
+                if prediction is not None:
+                    result |= self._compared(asked, prediction)
             except Exception as error:  # a fault of the replay must not end the log
                 result["error"] = f"{type(error).__name__}: {error}"[:300]
-            if measured is not None and result["predicted"] is not None:
-                result["residual"] = measured - result["predicted"]
             self._done.append(result)
+
+    def _compared(self, asked: Asked, now: Prediction) -> dict[str, Any]:
+        """Fields of the record: prediction, interval, residual; the measurement counts only for later intervals."""
+        places = ("east_m", "north_m", "up_m", "fix", "telemetry_age_s", "telemetry_delay_s")
+        fields: dict[str, Any] = {"predicted": now.rank}
+        fields |= {name: _rounded(getattr(now, name)) for name in places}
+        if now.rank is not None:
+            if (bounds := self._rank.bounds()) is not None:
+                low, high = (min(max(now.rank + round(bound), RANKS[0]), RANKS[1]) for bound in bounds)
+                fields["rank_interval"] = [low, high]
+            if asked.rank is not None:
+                fields["residual"] = asked.rank - now.rank
+                self._rank.add(fields["residual"])
+        if now.level_dbm is not None and math.isfinite(now.level_dbm):
+            fields |= {"level_dbm": _rounded(now.level_dbm), "rsrp_dbm": asked.rsrp_dbm}
+            fields["offset_db"] = _rounded(self._level.middle)
+            if (bounds := self._level.bounds()) is not None:
+                fields["level_interval_dbm"] = [_rounded(now.level_dbm + bound) for bound in bounds]
+            if asked.rsrp_dbm is not None:
+                self._level.add(asked.rsrp_dbm - now.level_dbm)
+        fields["inside"] = [self._rank.inside, self._rank.given, self._level.inside, self._level.given]
+        return fields
+
+
+def _rounded(value: float | None) -> float | None:
+    return None if value is None or not math.isfinite(value) else round(value, 3)

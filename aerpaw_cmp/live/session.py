@@ -49,8 +49,6 @@ class TapSettings:
         At the start, wait so long for the port to appear [s].
     reconnect_min_s, reconnect_max_s : float
         Back-off after a loss [s].
-    replay : Path, optional
-        Tap a simulated modem that plays this transcript or tap log, instead of a port.
     log : LogSettings
         Durability and rotation.
     roots : Roots
@@ -74,7 +72,6 @@ class TapSettings:
     wait_for_port_s: float = 0.0
     reconnect_min_s: float = 0.1
     reconnect_max_s: float = 2.0
-    replay: Path | None = None
     log: LogSettings = field(default_factory=LogSettings)
     roots: Roots = field(default_factory=Roots)
 
@@ -109,6 +106,8 @@ class TapStatus:
         Answers with status ok over the last 10 s.
     gaps, records, bytes_written : int
     disk_free_bytes : int or None
+    disk_fault : str
+        Why the disk takes no records now; empty while it does.
     missed : int
         Poll slots that passed unused while connected.
     predicted_rank : int or None
@@ -131,6 +130,7 @@ class TapStatus:
     records: int
     bytes_written: int
     disk_free_bytes: int | None
+    disk_fault: str = ""
     missed: int = 0
     predicted_rank: int | None = None
     predicts: bool = False

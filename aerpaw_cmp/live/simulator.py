@@ -111,6 +111,8 @@ class ModemSimSettings:
         Whether CSI reporting is on at the start.
     rank : callable, optional
         ``rank(seconds) -> int``, 0 for no CSI; replaces the built-in flight.
+    rsrp : callable, optional
+        ``rsrp(seconds) -> dBm``; replaces that of the built-in flight.
     """
 
     link: Path | None = None
@@ -119,6 +121,7 @@ class ModemSimSettings:
     faults: Faults = field(default_factory=Faults)
     csi_on: bool = True
     rank: Callable[[float], int] | None = None
+    rsrp: Callable[[float], float] | None = None
 
     def __post_init__(self) -> None:
         if self.kind not in ("modem", "gps", "diag", "silent", "rubbish"):
@@ -149,6 +152,11 @@ def flight_rank(seconds: float) -> int:
     return 1 + round(1.5 + 1.5 * math.sin(seconds / 20.0))
 
 
+def flight_rsrp(seconds: float) -> float:
+    """RSRP of the built-in flight [dBm]."""
+    return -85.0 - 12.0 * (1.0 + math.sin(seconds / 31.0))
+
+
 class FlightModem:
     """An RM502Q-AE in SA mode over a simulated flight.
 
@@ -157,10 +165,17 @@ class FlightModem:
     rank : callable
         ``rank(seconds) -> int``.
     csi_on : bool
+    rsrp : callable
+        ``rsrp(seconds) -> dBm``.
     """
 
-    def __init__(self, rank: Callable[[float], int] = flight_rank, csi_on: bool = True) -> None:
-        self._rank = rank
+    def __init__(
+        self,
+        rank: Callable[[float], int] = flight_rank,
+        csi_on: bool = True,
+        rsrp: Callable[[float], float] = flight_rsrp,
+    ) -> None:
+        self._rank, self._rsrp = rank, rsrp
         self.csi = [int(csi_on), int(csi_on)]
         self._start = time.monotonic()
         self._asked = 0
@@ -169,7 +184,7 @@ class FlightModem:
         """Lines for a command."""
         now = time.monotonic() - self._start
         rank = self._rank(now) if self.csi[1] else 0
-        rsrp = -85 - round(12 * (1 + math.sin(now / 31.0)))
+        rsrp = round(self._rsrp(now))
         sinr = max(-20, min(38, 110 + rsrp + round(3 * math.sin(now / 3.0))))
         self._asked += 1
         write = re.fullmatch(r'AT\+QNWCFG="csi_ctrl",([01]),([01])', command)
@@ -309,13 +324,13 @@ def load_source(path: Path, options: ReadOptions | None = None) -> FlightModem |
     except InputError as error:
         if not path.is_file():
             raise
-        ranks = _ranks_of(path, options or ReadOptions(timezone="UTC", ri_base="one"))
+        ranks = ranks_of(path, options or ReadOptions(timezone="UTC", ri_base="one"))
         if ranks is None:
             raise error from None
         return FlightModem(ranks)
 
 
-def _ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
+def ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None:
     """Rank over time since the start of a log, None if no reader finds ranks in it."""
     data = path.read_bytes()
     try:
@@ -338,11 +353,6 @@ def _ranks_of(path: Path, options: ReadOptions) -> Callable[[float], int] | None
 
 def _final_text(status: str, code: str | None) -> str:
     return f"+{status.upper()} ERROR: {code}" if status in ("cme", "cms") else _FINAL[status]
-
-
-def replay_settings(path: Path) -> ModemSimSettings:
-    """Settings of ``tap --replay FILE``."""
-    return ModemSimSettings(source=path)
 
 
 # the port -----------------------------------------------------------------------------------------------------
@@ -368,7 +378,8 @@ class ModemSimulator:
         if self.settings.source is not None:
             self._modem = load_source(self.settings.source)
         else:
-            self._modem = FlightModem(self.settings.rank or flight_rank, self.settings.csi_on)
+            rank, rsrp = self.settings.rank or flight_rank, self.settings.rsrp or flight_rsrp
+            self._modem = FlightModem(rank, self.settings.csi_on, rsrp)
         self._random = random.Random(self.settings.faults.seed)
         self._master = -1
         self._lock = threading.RLock()
@@ -602,8 +613,21 @@ class ModemSimulator:
         return b"".join(chunks), tuple(lines[:-1]) if lines else ()
 
 
-def run_modem_sim(settings: ModemSimSettings, *, on_ready: Callable[[Path], None] | None = None) -> int:
-    """Serve a simulated modem until a signal comes; ``on_ready`` gets the port's name.
+def run_modem_sim(
+    settings: ModemSimSettings,
+    *,
+    on_ready: Callable[[Path], None] | None = None,
+    meanwhile: Callable[[], None] | None = None,
+) -> int:
+    """Serve a simulated modem until a signal comes.
+
+    Parameters
+    ----------
+    settings : ModemSimSettings
+    on_ready : callable, optional
+        Gets the port's name.
+    meanwhile : callable, optional
+        Called several times a second, e.g. to write the telemetry of the same flight.
 
     Returns
     -------
@@ -616,10 +640,9 @@ def run_modem_sim(settings: ModemSimSettings, *, on_ready: Callable[[Path], None
             modem.keep_journal = False
             if on_ready is not None:
                 on_ready(modem.port)
-            poller = select.poll()
-            poller.register(stop.fileno(), select.POLLIN)
-            while not stop.count:
-                poller.poll(1000)
+            while not stop.wait(0.1 if meanwhile else 1.0):
+                if meanwhile is not None:
+                    meanwhile()
     finally:
         stop.close()
     return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import select
 import signal
 import threading
 from collections.abc import Iterator
@@ -25,6 +26,13 @@ class Stop:
         self.count += 1
         with contextlib.suppress(OSError):
             os.write(self._write, b"x")
+
+    def wait(self, timeout_s: float) -> bool:
+        """Wait until asked, at most so long; whether asked."""
+        poller = select.poll()
+        poller.register(self._read, select.POLLIN)
+        poller.poll(timeout_s * 1e3)
+        return self.count > 0
 
     def fileno(self) -> int:
         """Readable once asked."""

@@ -8,7 +8,6 @@ fill, the clock may step, signals may come: each leaves its own record, and the 
 from __future__ import annotations
 
 import contextlib
-import dataclasses
 import re
 import select
 import time
@@ -24,7 +23,7 @@ from .framing import Answer, Event, Framer, Late, Unsolicited, is_unsolicited
 from .log import SCHEMA, Clock, Record, SegmentLog, boot_id, clock_synchronised
 from .modem import QUERIES, RI_QUERY, Decoded, Redactor, csi_write, decode, encode
 from .ports import PortGoneError, PortInfo, SerialPort, find_candidates, find_port, modem_manager
-from .predict import Predict, PredictionWorker
+from .predict import Asked, Predict, PredictionWorker
 from .schedule import Schedule
 from .session import TapSettings, TapStatus, TapSummary, format_status
 from .status_notifier import StatusNotifier
@@ -35,6 +34,9 @@ __all__ = ["Stop", "Tap", "TapSettings", "TapStatus", "TapSummary", "format_stat
 
 CLOCK_STEP_NS = 50_000_000
 """A jump of the wall clock against the monotonic one beyond this is recorded."""
+Watch = Callable[["Record | TapStatus"], None]
+"""Gets each record once the log has it, and each status, in the polling thread: it must neither wait nor raise."""
+
 RATE_WINDOW_S = 10.0
 NOISE_LINES_PER_S = 50
 
@@ -65,11 +67,13 @@ class Tap:
         settings: TapSettings,
         *,
         on_status: Callable[[TapStatus], None] | None = None,
+        watch: Watch | None = None,
         stop: Stop,
         predict: Predict | None = None,
         clock: Clock | None = None,
     ) -> None:
         self._settings = settings
+        self._watch = watch
         self._notifier = None if on_status is None else StatusNotifier(on_status)
         self._stop = stop
         self._clock = clock or Clock()
@@ -117,8 +121,10 @@ class Tap:
             if not self._stop.count:
                 self._log.open()
                 self._log_open = True
+                if self._watch is not None:
+                    self._watch(self._header())
                 for record in self._early:
-                    self._log.append(record)
+                    self._append(record)
                 self._early.clear()
                 if clock_synchronised() is False:
                     self._say("the clock is not synchronised (NTP or GPS): times may not fit the telemetry")
@@ -212,7 +218,7 @@ class Tap:
             **self._now(),
         }
         if self._log_open:
-            self._log.append(record)
+            self._append(record)
             self._log.close()
             for text in self._log.messages():
                 self._say(text)
@@ -519,7 +525,9 @@ class Tap:
                 self._ri_times.append(record["last_mono_ns"])
                 if self._worker is not None:
                     middle = (record["sent_utc_ns"] + record["last_utc_ns"]) // 2
-                    self._worker.ask(middle, record["sent_utc_ns"], decoded.values.get("rank"))
+                    self._worker.ask(
+                        Asked(middle, record["sent_utc_ns"], decoded.values.get("rank"), self._last["rsrp_dbm"])
+                    )
             elif answer.status in ("error", "cme"):
                 self._say_once(f"the modem answers {answer.status.upper()} to {name}: is it an RM5xxQ?")
         elif name == "servingcell":
@@ -630,7 +638,7 @@ class Tap:
         self._show(self._redactor.clean(text))
 
     def _show(self, message: str) -> None:
-        if self._notifier is None:
+        if self._notifier is None and self._watch is None:
             return
         now = self._clock.mono_ns()
         while self._ri_times and now - self._ri_times[0] > RATE_WINDOW_S * 1e9:
@@ -647,19 +655,28 @@ class Tap:
             records=self._log.records,
             bytes_written=self._log.bytes_written,
             disk_free_bytes=self._log.free_bytes,
+            disk_fault=self._log.fault,
             missed=sum(self._schedule.missed.values()),
             predicted_rank=self._last["predicted"],
             predicts=self._worker is not None,
             alarm=self._alarm,
             message=message,
         )
-        self._notifier.notify(status)
+        if self._notifier is not None:
+            self._notifier.notify(status)
+        if self._watch is not None:
+            self._watch(status)
 
     def _record(self, record: Record) -> None:
         if self._log_open:
-            self._log.append(record)
+            self._append(record)
         elif len(self._early) < 10_000:
             self._early.append(record)
+
+    def _append(self, record: Record) -> None:
+        self._log.append(record)
+        if self._watch is not None:
+            self._watch(record)
 
     def _now(self) -> Record:
         return {"utc_ns": self._clock.utc_ns(), "mono_ns": self._clock.mono_ns()}
@@ -705,6 +722,7 @@ def run_tap(
     settings: TapSettings,
     *,
     on_status: Callable[[TapStatus], None] | None = None,
+    watch: Watch | None = None,
     stop: Stop | None = None,
     predict: Predict | None = None,
     clock: Clock | None = None,
@@ -717,10 +735,12 @@ def run_tap(
     on_status : callable, optional
         Called about once per ``settings.status_s`` and at once when there is a message; :func:`format_status`
         makes a line of it.
+    watch : callable, optional
+        Gets each record once the log has it, and each status; it must neither wait nor raise.
     stop : Stop, optional
         Ends the session when called (from any thread).
     predict : callable, optional
-        ``predict(utc_ns) -> rank or None`` of the replay at the pose of that moment; runs in its own thread.
+        ``predict(utc_ns) -> Prediction or None`` of the replay at the pose of that moment; runs in its own thread.
     clock : Clock, optional
 
     Returns
@@ -736,14 +756,8 @@ def run_tap(
     own = stop is None
     stop = stop or Stop()
     try:
-        with contextlib.ExitStack() as stack:
-            stack.enter_context(stop.on_signals())
-            if settings.replay is not None:
-                from .simulator import ModemSimulator, replay_settings
-
-                simulator = stack.enter_context(ModemSimulator(replay_settings(settings.replay)))
-                settings = dataclasses.replace(settings, port=str(simulator.port), replay=None)
-            return Tap(settings, on_status=on_status, stop=stop, predict=predict, clock=clock).run()
+        with stop.on_signals():
+            return Tap(settings, on_status=on_status, watch=watch, stop=stop, predict=predict, clock=clock).run()
     finally:
         if own:
             stop.close()

@@ -60,6 +60,12 @@ class LogWriter:
         """Space left on the disk, as last seen."""
         return self._free
 
+    @property
+    def fault(self) -> str:
+        """Why the disk takes no records now; empty while it does."""
+        fault = self._log.fault
+        return "" if fault is None else fault.reason
+
     def messages(self) -> list[str]:
         """What happened to the disk since the last call."""
         taken = []

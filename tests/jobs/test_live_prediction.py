@@ -10,13 +10,14 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pytest
 import yaml
 
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.flight.data import choose_site
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.simulate import plan_trajectory, telemetry_frame
-from aerpaw_cmp.jobs.run import live_prediction
+from aerpaw_cmp.jobs.live_twin import LiveTwin
 from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.arrays import Poses
@@ -33,7 +34,7 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
     start = pd.Timestamp("2025-06-01T14:00:00")
     log = tmp_path / "vehicleOut.txt"
     lines = format_vehicle_out(telemetry_frame(trajectory, start, 1.0, site.frame), "America/New_York").splitlines(True)
-    predict = live_prediction(FLIGHT, log)
+    predict = LiveTwin.of(FLIGHT, log).predictor()
     assert predict(start.value) is None, "no log yet"
     link = settings.link.rank.build(["LW1"], FLIGHT.parent)
     for second in (20, 60, 61, 150, 300):
@@ -43,8 +44,13 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
         sigma = np.linalg.svd(expected.h[0, 0], compute_uv=False)
         if np.min(np.abs(sigma / sigma[0] * 100 - 1)) < 0.05:
             continue  # written positions are rounded to a centimetre: a singular value near the threshold may flip
-        assert predict(start.value + second * 10**9) == channel_rank(expected.h[0, 0], 100)
-        assert predict(start.value + (second + 30) * 10**9) is None, "the UAV's position is not known yet"
+        now = predict(start.value + second * 10**9)
+        assert now.rank == channel_rank(expected.h[0, 0], 100)
+        assert now.level_dbm == pytest.approx(float(expected.rss_dbm[0, 0]), abs=0.1)  # positions are rounded to a centimetre
+        assert np.hypot(now.east_m - position[0, 0], now.north_m - position[0, 1]) < 0.02
+        later = predict(start.value + (second + 30) * 10**9)
+        assert (later.rank, later.east_m) == (None, None), "the UAV's position is not known yet"
+        assert later.telemetry_age_s == pytest.approx(30.0)
 
 
 def test_tap_writes_predictions_and_residuals(tmp_path: Path) -> None:

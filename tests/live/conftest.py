@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
+import socket
 import subprocess
 import sys
 import threading
@@ -12,10 +14,14 @@ from pathlib import Path
 
 import pytest
 
+from aerpaw_cmp.live.feed import Feed
 from aerpaw_cmp.live.log import BadLine, read_log
 from aerpaw_cmp.live.modem import QUERIES
 from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.live.tap import Stop, TapSettings, run_tap
+from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+
+PAGE = Page(b"<!doctype html><title>t</title>", "default-src 'none'")
 
 CHILD = """
 import json, sys
@@ -25,15 +31,78 @@ from aerpaw_cmp.live.log import LogSettings
 from aerpaw_cmp.live.tap import TapSettings, run_tap
 values = json.loads(sys.argv[1])
 log = LogSettings(**values.pop("log", {}))
+watch = None
+if web := values.pop("web", None):
+    from aerpaw_cmp.live.feed import Feed
+    from aerpaw_cmp.live.web import Address, Page, WebServer
+    feed = Feed(["modem"])
+    WebServer(feed, Page(b"page", "default-src 'none'"), Address("127.0.0.1", web)).__enter__()
+    watch = lambda item: feed.put(0, item)
 print("ready", flush=True)
 try:
-    summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values))
+    summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values), watch=watch)
 except AerpawCmpError as error:
     print(error, file=sys.stderr)
     sys.exit(error.exit_code)
 print(summary.reason, flush=True)
 sys.exit(summary.exit_code)
 """
+
+
+class Browser:
+    """Reads the events of a page, or takes nothing; comes back when it is dropped."""
+
+    def __init__(self, port, *, reads=True):
+        self.messages, self.connections = [], 0
+        self._port, self._reads, self._stop = port, reads, threading.Event()
+        self._thread = threading.Thread(target=self._run, daemon=True)
+        self._thread.start()
+
+    def _run(self):
+        cursor = ""
+        while not self._stop.is_set():
+            with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 5) as link:
+                link.sendall(f"GET /events?from={cursor} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                self.connections += 1
+                if not self._reads:
+                    self._stop.wait()
+                    return
+                link.settimeout(0.5)
+                for line in link.makefile("r", encoding="ascii"):
+                    if line.startswith("id: "):
+                        cursor = line[4:].strip()
+                    elif line.startswith("data: "):
+                        self.messages.append(json.loads(line[6:]))
+            self._stop.wait(0.05)
+
+    def close(self):
+        self._stop.set()
+        self._thread.join(timeout=5)
+
+
+@pytest.fixture(params=["alone", "web"])
+def web(request):
+    """Whether a page is open meanwhile: one browser that reads it and one that takes nothing."""
+    return request.param == "web"
+
+
+@contextlib.contextmanager
+def page_open(wanted):
+    """A feed with its server and two browsers; None where no page is wanted."""
+    if not wanted:
+        yield None
+        return
+    feed = Feed(["modem"])
+    with WebServer(feed, PAGE, Address("127.0.0.1", 0), limits=Limits(send_s=0.5)) as server:
+        browsers = [Browser(server.address.port), Browser(server.address.port, reads=False)]
+        yield feed
+        feed.digest()
+        until = time.monotonic() + 5
+        while not browsers[0].messages and time.monotonic() < until:
+            time.sleep(0.02)
+        for browser in browsers:
+            browser.close()
+    assert browsers[0].messages
 
 
 class Session:
@@ -109,15 +178,13 @@ def tools():
 
     tools = Tools()
     tools.Session, tools.records_of, tools.exchanges = Session, records_of, exchanges
-    tools.all_kept = all_kept
+    tools.all_kept, tools.Browser, tools.page_open, tools.page = all_kept, Browser, page_open, PAGE
     return tools
 
 
 @pytest.fixture
 def modem(tmp_path):
     """Makes simulators; all end with the test."""
-    import contextlib
-
     with contextlib.ExitStack() as stack:
 
         def make(**settings):
@@ -128,9 +195,11 @@ def modem(tmp_path):
 
 
 @pytest.fixture
-def tap(tmp_path):
+def tap(tmp_path, request):
     """Makes taps with fast settings on a port; what still runs is ended with the test."""
     running = []
+    pages = contextlib.ExitStack()
+    feed = pages.enter_context(page_open("web" in request.fixturenames and request.getfixturevalue("web")))
 
     def make(port, *, options=None, **settings):
         values = {
@@ -141,7 +210,8 @@ def tap(tmp_path):
             "probe_timeout_s": 3.0,
             "folder": tmp_path / "log",
         } | settings
-        session = Session(TapSettings(port=str(port), **values), **(options or {}))
+        watch = {} if feed is None else {"watch": lambda item: feed.put(0, item)}
+        session = Session(TapSettings(port=str(port), **values), **watch, **(options or {}))
         running.append(session)
         return session
 
@@ -151,17 +221,24 @@ def tap(tmp_path):
             session.stop("test over")
             session.stop("test over")
             session._thread.join(timeout=10)
+    pages.close()
 
 
 @pytest.fixture
-def child(tmp_path):
+def child(tmp_path, request):
     """Makes taps in their own processes."""
-    processes = []
+    processes, browsers = [], []
+    watched = "web" in request.fixturenames and request.getfixturevalue("web")
     root = Path(__file__).resolve().parents[2]
 
     def make(port, *, popen=None, **settings):
         values = {"port": str(port), "folder": str(tmp_path / "log"), "ri_hz": 20.0, "other_hz": 2.0, "pause_s": 0.0}
         values |= settings
+        if watched:
+            with socket.socket() as probe:
+                probe.bind(("127.0.0.1", 0))
+                values["web"] = probe.getsockname()[1]
+            browsers.append(Browser(values["web"]))
         environment = os.environ | {"PYTHONPATH": f"{root}{os.pathsep}{root / 'parsers'}"}
         process = subprocess.Popen(
             [sys.executable, "-c", CHILD, json.dumps(values)],
@@ -180,3 +257,6 @@ def child(tmp_path):
         if process.poll() is None:
             process.kill()
         process.communicate()
+    for browser in browsers:
+        browser.close()
+        assert browser.messages

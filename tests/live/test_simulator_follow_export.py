@@ -17,6 +17,7 @@ from aerpaw_cmp.live.export import COLUMNS, export_csv
 from aerpaw_cmp.live.follow import TelemetryFollower, predict_along
 from aerpaw_cmp.live.log import encode_record
 from aerpaw_cmp.live.modem import decode
+from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator, load_recorded, load_source
 from aerpaw_cmp.logs.readers import Reader
 from aerpaw_cmp.logs.records import COLUMNS as RECORD_COLUMNS
@@ -60,10 +61,10 @@ def test_recorded_transcripts_as_modems():
     assert ranks == [2, 2]
 
 
-def test_tap_of_a_transcript(tap, tools, tmp_path):
+def test_tap_of_a_transcript(modem, tap, tools, tmp_path):
     path = tmp_path / "t.txt"
     path.write_bytes(TRANSCRIPT)
-    session = tap(None, replay=path)
+    session = tap(modem(source=path).port)
     session.wait(lambda: len(tools.exchanges(tmp_path / "log", "nr5g_csi")) >= 4)
     session.end()
     ranks = [r["decoded"]["rank"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
@@ -185,9 +186,11 @@ def test_growing_telemetry(tmp_path):
     path.write_text("2026-01-01T00:00:30,4\n")  # a new flight under the old name
     assert follower.poll() == 1
     assert follower.latest().altitude_m == 4.0
-    predict = predict_along(follower, lambda sample: round(sample.altitude_m))
-    assert predict(second(30)) == 4
-    assert predict(second(40)) is None
+    predict = predict_along(follower, lambda sample: Prediction(rank=round(sample.altitude_m)))
+    now = predict(second(30))
+    assert (now.rank, now.telemetry_age_s) == (4, 0.0)
+    late = predict(second(40))
+    assert (late.rank, late.telemetry_age_s) == (None, 10.0)
 
 
 def test_long_telemetry_is_read_from_its_end(tmp_path):

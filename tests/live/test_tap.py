@@ -15,6 +15,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.live.log import Clock, LogSettings
+from aerpaw_cmp.live.predict import Prediction
 from aerpaw_cmp.live.schedule import Schedule
 from aerpaw_cmp.live.simulator import Faults
 from aerpaw_cmp.live.tap import TapSettings, TapStatus, format_status, run_tap
@@ -33,6 +34,7 @@ def served_and_read(modem, query_text):
 CSI = 'AT+QNWCFG="nr5g_csi"'
 
 
+@pytest.mark.usefixtures("web")
 def test_every_answer_is_in_the_log_once(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.005))
     session = tap(sim.port)
@@ -65,6 +67,7 @@ def test_one_command_in_flight(modem, tap, tools, tmp_path):
     assert all(a[1] <= b[0] for a, b in pairwise(spans))
 
 
+@pytest.mark.usefixtures("web")
 @pytest.mark.parametrize(
     "faults",
     [
@@ -87,6 +90,7 @@ def test_faults_cost_no_answer(modem, tap, tools, tmp_path, faults):
     assert all(r["decoded"]["rank"] is not None for r in answered)
 
 
+@pytest.mark.usefixtures("web")
 def test_late_answers_are_kept_and_taken_for_nothing(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, late_every=9, late_s=0.35))
     session = tap(sim.port, answer_timeout_s=0.2, probe_timeout_s=0.5)
@@ -103,6 +107,7 @@ def test_late_answers_are_kept_and_taken_for_nothing(modem, tap, tools, tmp_path
             assert "no_csi_line" not in r["flags"]
 
 
+@pytest.mark.usefixtures("web")
 def test_missing_final_result_times_out_and_keeps_the_lines(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, no_final_every=7))
     session = tap(sim.port, answer_timeout_s=0.1, probe_timeout_s=0.3)
@@ -115,6 +120,7 @@ def test_missing_final_result_times_out_and_keeps_the_lines(modem, tap, tools, t
     assert all(r["lines"] for r in timed_out)
 
 
+@pytest.mark.usefixtures("web")
 def test_unplug_and_back_under_another_number(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.005))
     session = tap(sim.port, reconnect_min_s=0.02, reconnect_max_s=0.05)
@@ -148,6 +154,7 @@ def test_unplug_and_back_under_another_number(modem, tap, tools, tmp_path):
     assert {s.lines for s in sim.journal if s.command == CSI and s.read} <= logged
 
 
+@pytest.mark.usefixtures("web")
 def test_the_end_inside_a_gap(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port)
@@ -224,6 +231,7 @@ def test_alarm_when_no_csi_comes(modem, tap, tools, tmp_path, leave):
     assert kinds(tools.records_of(tmp_path / "log")[0])["alarm"] == 1
 
 
+@pytest.mark.usefixtures("web")
 def test_silent_modem_is_a_gap(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0, silent_after=25))
     session = tap(sim.port, silent_s=0.5, answer_timeout_s=0.1, probe_timeout_s=0.1, reconnect_min_s=0.05)
@@ -234,6 +242,7 @@ def test_silent_modem_is_a_gap(modem, tap, tools, tmp_path):
     assert "answers nothing" in opened["reason"]
 
 
+@pytest.mark.usefixtures("web")
 @pytest.mark.parametrize("name", ["SIGINT", "SIGTERM", "SIGHUP"])
 def test_signals_end_it_cleanly(modem, child, tools, tmp_path, name):
     sim = modem(csi_on=False, faults=Faults(latency_s=0.005))
@@ -252,6 +261,7 @@ def test_signals_end_it_cleanly(modem, child, tools, tmp_path, name):
     assert sim.csi == [0, 0]
 
 
+@pytest.mark.usefixtures("web")
 def test_sigkill_loses_no_answer(modem, child, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     process = child(sim.port, ri_hz=100.0)
@@ -283,6 +293,7 @@ def test_clock_steps_are_recorded(modem, tap, tools, tmp_path):
     assert abs(record["step_ns"] + 3_600_000_000_000) < 1_000_000_000
 
 
+@pytest.mark.usefixtures("web")
 def test_a_disk_fault_does_not_stop_the_polling(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     session = tap(sim.port, log=LogSettings(retry_s=0.05))
@@ -332,7 +343,7 @@ def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):
 
     def predict(utc_ns):
         threads.add(threading.current_thread().name)
-        return None if utc_ns % 3 == 0 else 2
+        return None if utc_ns % 3 == 0 else Prediction(rank=2, level_dbm=-50.0, east_m=1.0, north_m=2.0, up_m=30.0)
 
     sim = modem(rank=lambda _seconds: 3, faults=Faults(latency_s=0.0))
     session = tap(sim.port, options={"predict": predict})
@@ -346,6 +357,8 @@ def test_predictions_stand_beside_the_answers(modem, tap, tools, tmp_path):
     for r in predictions:
         assert answers[r["for_sent_utc_ns"]]["decoded"]["rank"] == r["measured"] == 3
         assert r.get("residual") == (None if r["predicted"] is None else 1)
+        if r["predicted"] is not None:
+            assert (r["east_m"], r["north_m"], r["up_m"], r["level_dbm"]) == (1.0, 2.0, 30.0, -50.0)
     assert "predicted" in format_status(session.statuses[-1])
 
 
@@ -371,6 +384,7 @@ def test_a_broken_terminal_does_not_end_the_log(modem, tmp_path):
     assert run_tap(settings, on_status=broken).reason == "duration"
 
 
+@pytest.mark.usefixtures("web")
 def test_a_hanging_terminal_does_not_hold_the_polling(modem, tap, tools, tmp_path):
     sim = modem(faults=Faults(latency_s=0.0))
     hang = threading.Event()
@@ -379,19 +393,6 @@ def test_a_hanging_terminal_does_not_hold_the_polling(modem, tap, tools, tmp_pat
     hang.set()
     assert summary.reason == "duration"
     assert len(tools.all_kept(sim, tmp_path / "log")) >= 20
-
-
-def test_replay_of_an_earlier_log(modem, tap, tools, tmp_path):
-    sim = modem(faults=Faults(latency_s=0.0))
-    session = tap(sim.port)
-    session.wait(lambda: len(served_and_read(sim, CSI)) >= 6)
-    session.end()
-    first = [r["lines"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
-    again = tap(None, folder=tmp_path / "again", replay=tmp_path / "log")
-    again.wait(lambda: len(tools.exchanges(tmp_path / "again", "nr5g_csi")) >= 6)
-    again.end()
-    second = [r["lines"] for r in tools.exchanges(tmp_path / "again", "nr5g_csi")]
-    assert second[:6] == first[:6]
 
 
 def polled(answer_ns, until_ns):
@@ -459,6 +460,7 @@ def test_schedule_catches_up_after_a_short_stall_and_not_after_a_long_one():
         assert polls + missed == 1 + stall // 500, "every slot is polled or missed, once"
 
 
+@pytest.mark.usefixtures("web")
 def test_an_unfinished_line_between_commands_is_in_the_gap_record(modem, tap, tools, tmp_path):
     """It belonged to no command, and went with the old framer: not a byte of it was in the log."""
     sim = modem(faults=Faults(latency_s=0.0))

@@ -101,6 +101,27 @@ const common = (() => {
     return sorted[low] + (sorted[high] - sorted[low]) * (place - low);
   }
 
+  // a colour of viridis, or between blue and red about the middle
+  function shade(v, low, high, diverging) {
+    const x = Math.min(1, Math.max(0, (v - low) / (high - low)));
+    if (diverging) {
+      const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [208, 208, 198];
+      return `rgb(${to.map((t, i) => Math.round(mid[i] + (t - mid[i]) * Math.sqrt(k))).join(",")})`;
+    }
+    const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], i = Math.min(3, Math.floor(x * 4)), f = x * 4 - i;
+    return `rgb(${stops[i].map((a, j) => Math.round(a + (stops[i + 1][j] - a) * f)).join(",")})`;
+  }
+
+  function polygon(pen, points, fill, stroke) {
+    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])); pen.closePath();
+    if (fill) { pen.fillStyle = fill; pen.fill(); }
+    if (stroke) { pen.strokeStyle = stroke; pen.lineWidth = 0.6; pen.stroke(); }
+  }
+  function polyline(pen, points, colour, width, dash) {
+    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
+    pen.strokeStyle = colour; pen.lineWidth = width; pen.setLineDash(dash || []); pen.stroke(); pen.setLineDash([]);
+  }
+
   let waiting = new Set();
   function later(...jobs) {
     if (!waiting.size) requestAnimationFrame(() => { const now = [...waiting]; waiting = new Set(); for (const job of now) job(); });
@@ -113,5 +134,5 @@ const common = (() => {
     matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => later(job));
   }
 
-  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, later, whenResized, digits };
+  return { at, css, number, unpack, values, cells, fill, frame, names, ticks, axes, ramp, quantile, shade, polygon, polyline, later, whenResized, digits };
 })();

@@ -4,7 +4,7 @@
 (() => {
   const data = JSON.parse(document.getElementById("explorer-data").textContent);
   const root = document.getElementById("explorer");
-  const { at, css, number, cells, fill, ticks, later } = common;
+  const { at, css, number, cells, fill, ticks, later, shade } = common;
 
   const arrays = data.arrays.map(a => {
     const raw = atob(a.data), bytes = new Uint8Array(raw.length);
@@ -286,16 +286,6 @@
     project.scale = scale;
   }
 
-  function shade(v, low, high, diverging) {
-    const x = Math.min(1, Math.max(0, (v - low) / (high - low)));
-    if (diverging) {
-      const d = 2 * x - 1, k = Math.abs(d), to = d < 0 ? [33, 102, 172] : [178, 24, 43], mid = [208, 208, 198];
-      return `rgb(${to.map((t, i) => Math.round(mid[i] + (t - mid[i]) * Math.sqrt(k))).join(",")})`;
-    }
-    const stops = [[68, 1, 84], [59, 82, 139], [33, 145, 140], [94, 201, 98], [253, 231, 37]], i = Math.min(3, Math.floor(x * 4)), f = x * 4 - i;
-    return `rgb(${stops[i].map((a, j) => Math.round(a + (stops[i + 1][j] - a) * f)).join(",")})`;
-  }
-
   const RANKS = ["#9a9a9a", "#440154", "#31688e", "#35b779", "#fde725"];
 
   function colours() {
@@ -313,15 +303,8 @@
     return { source: s, of: i => Number.isFinite(v[i]) ? shade(v[i], -12, 12, true) : "#9a9a9a", key: [-12, -6, 0, 6, 12].map(x => [shade(x, -12, 12, true), number(x, 0)]), words: "residual [dB], measured minus " + s.models[state.model].name };
   }
 
-  function polygon(points, fill, stroke) {
-    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1])); pen.closePath();
-    if (fill) { pen.fillStyle = fill; pen.fill(); }
-    if (stroke) { pen.strokeStyle = stroke; pen.lineWidth = 0.6; pen.stroke(); }
-  }
-  function polyline(points, colour, width, dash) {
-    pen.beginPath(); points.forEach((p, i) => i ? pen.lineTo(p[0], p[1]) : pen.moveTo(p[0], p[1]));
-    pen.strokeStyle = colour; pen.lineWidth = width; pen.setLineDash(dash || []); pen.stroke(); pen.setLineDash([]);
-  }
+  const polygon = (...given) => common.polygon(pen, ...given), polyline = (...given) => common.polyline(pen, ...given);
+
   function drawMap() {
     const ratio = devicePixelRatio || 1, w = canvas.clientWidth, h = canvas.clientHeight;
     canvas.width = Math.round(w * ratio); canvas.height = Math.round(h * ratio);

@@ -1,0 +1,381 @@
+"""The state that the tap's page shows: rows of measurements and predictions, the state of each modem, alarms.
+
+The tap hands a record over with :meth:`Feed.put`, which appends to a bounded queue and returns: it takes no lock that
+a browser could hold. A thread of the server digests the queue; each browser asks for what is newer than its cursor.
+Rows stand in rings of fixed size, so memory does not grow with the flight nor with browsers that do not read.
+"""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import math
+import re
+import secrets
+import threading
+import time
+from array import array
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+from .log import Record
+from .modem import RI_QUERY
+from .session import TapStatus
+
+ROWS = 72_000
+"""Rows that stay: two hours at 10 Hz, ten at 2 Hz."""
+PENDING = 20_000
+CHUNK = 4_000
+"""Rows in one message, so that a slow link refills step by step."""
+ALARMS = 300
+LONGEST_TEXT = 300
+RATE_WINDOW_S = 10.0
+STALE_S = 3.0
+GPS_LOST_S = 5.0
+CLOCK_OFF_S = 2.0
+DISK_LOW_BYTES = 200 * 2**20
+STEP_SHOWN_S = 30.0
+
+MEASURED = ("t", "rank", "rsrp", "sinr")
+PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
+_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+"""Faults that a crafted record of a played log can raise: the record is left out."""
+_CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
+
+
+class Rows:
+    """The last rows of a table of 32-bit floats, in memory taken once; rows count from zero for ever."""
+
+    def __init__(self, columns: int, size: int = ROWS) -> None:
+        self._columns, self._size = columns, size
+        self._values = array("f", bytes(4 * columns * size))
+        self.count = 0
+
+    def add(self, row: Sequence[float | None]) -> None:
+        """Append a row; None becomes NaN."""
+        start = self.count % self._size * self._columns
+        values = (math.nan if value is None else value for value in row)
+        self._values[start : start + self._columns] = array("f", values)
+        self.count += 1
+
+    def after(self, first: int, most: int = CHUNK) -> tuple[int, str]:
+        """Number of the first row given, and the rows from it on as little-endian floats in base64."""
+        first = max(first, self.count - self._size) if first <= self.count else self.count
+        last = min(self.count, first + most)
+        a, b = first % self._size * self._columns, last % self._size * self._columns
+        part = self._values[a:b] if a < b or first == last else self._values[a:] + self._values[:b]
+        return first, base64.b64encode(part.tobytes()).decode("ascii")
+
+
+@dataclass(slots=True)
+class Alarm:
+    """One alarm and its time; ``end_s`` None: it lasts."""
+
+    number: int
+    modem: int
+    kind: str
+    text: str
+    start_s: float
+    end_s: float | None = None
+    version: int = 0
+
+
+@dataclass(slots=True)
+class _Modem:
+    """One modem as the page shows it; times are steady seconds since the feed began."""
+
+    name: str
+    port: str = ""
+    connected: bool = False
+    rank: int | None = None
+    rsrp_dbm: float | None = None
+    sinr_db: float | None = None
+    gaps: int = 0
+    missed: int = 0
+    records: int = 0
+    bytes_written: int | None = None
+    disk_free_bytes: int | None = None
+    disk_fault: str = ""
+    offset_db: float | None = None
+    inside: list[int] | None = None
+    age_s: float | None = None
+    delay_s: float | None = None
+    fix: float | None = None
+    predicts: bool = False
+    ended: bool = False
+    measured: Rows = field(default_factory=lambda: Rows(len(MEASURED)))
+    predicted: Rows = field(default_factory=lambda: Rows(len(PREDICTED)))
+    shift_ns: int = 0
+    rank_s: float = 0.0
+    gps_s: float = 0.0
+    step_s: float | None = None
+    step_text: str = ""
+    gap_text: str = ""
+    unsynchronised: bool = False
+    sent: deque[tuple[int, float]] = field(default_factory=lambda: deque(maxlen=64))
+    times: deque[float] = field(default_factory=lambda: deque(maxlen=1000))
+    open: dict[str, Alarm] = field(default_factory=dict)
+
+    _SHOWN = (
+        "name", "port", "connected", "rank", "rsrp_dbm", "sinr_db", "gaps", "missed", "records", "bytes_written",
+        "disk_free_bytes", "offset_db", "inside", "predicts", "ended",
+    )  # fmt: skip
+
+    def shown(self, now: float) -> dict[str, Any]:
+        """What the page shows of the moment."""
+        while self.times and now - self.times[0] > RATE_WINDOW_S:
+            self.times.popleft()
+        return {name: getattr(self, name) for name in self._SHOWN} | {
+            "rate_hz": round(len(self.times) / min(RATE_WINDOW_S, max(1.0, now)), 2)
+        }
+
+
+class Feed:
+    """State of the page; see the head of this module.
+
+    Parameters
+    ----------
+    names : sequence of str
+        One per modem.
+    steady_ns : callable, optional
+        Steady time of now, in UTC at the start [ns]; None: by this machine's clocks, which then also time the records.
+        The player of a log gives its own, and records are timed by the headers of their log.
+    """
+
+    def __init__(self, names: Sequence[str], steady_ns: Callable[[], int] | None = None) -> None:
+        shift = time.time_ns() - time.monotonic_ns()
+        self._live = steady_ns is None
+        self._steady_ns = steady_ns or (lambda: time.monotonic_ns() + shift)
+        self.epoch = secrets.token_hex(4)
+        self.start_ns = self._steady_ns()
+        self._modems = [_Modem(name, shift_ns=shift, predicted=Rows(len(PREDICTED))) for name in names]
+        self._pending: deque[tuple[int, Record | TapStatus]] = deque(maxlen=PENDING)
+        self._changed = threading.Condition()
+        self._version = 0
+        self._alarms: deque[Alarm] = deque(maxlen=ALARMS)
+        self._alarm_count = 0
+        self._ended: Mapping[str, Any] | None = None
+
+    def put(self, modem: int, item: Record | TapStatus) -> None:
+        """Hand over a record or a status; returns at once, and the oldest goes where too many wait."""
+        self._pending.append((modem, item))
+
+    def end(self, ended: Mapping[str, Any]) -> None:
+        """The session is over; ``ended`` is shown by the page."""
+        self.digest()
+        with self._changed:
+            self._ended = ended
+            self._bump()
+
+    def now(self) -> float:
+        """Steady seconds since the feed began."""
+        return (self._steady_ns() - self.start_ns) / 1e9
+
+    # the server's thread ----------------------------------------------------------------------------------
+
+    def digest(self) -> None:
+        """Take in what waits, look at the alarms, wake the browsers' threads if anything is new."""
+        items = [self._pending.popleft() for _ in range(len(self._pending))]
+        with self._changed:
+            for number, item in items:
+                if isinstance(item, TapStatus):
+                    self._status(self._modems[number], item)
+                else:
+                    with contextlib.suppress(*_MALFORMED):
+                        self._record(self._modems[number], item)
+            if self._look() or items or not self._version:
+                self._bump()
+
+    def after(self, cursor: str, wait_s: float = 0.0) -> tuple[dict[str, Any] | None, str]:
+        """Everything newer than the cursor, and the next cursor; None if nothing came within the time.
+
+        A cursor of another session, or none, begins from the start.
+        """
+        epoch, version, rows = self._parsed(cursor)
+        with self._changed:
+            if not self._changed.wait_for(lambda: version < self._version, wait_s):
+                return None, cursor
+            now, modems, complete, following = self.now(), [], True, []
+            for index, modem in enumerate(self._modems):
+                content = modem.shown(now)
+                for place, (key, table) in enumerate((("rows", modem.measured), ("predictions", modem.predicted))):
+                    first, data = table.after(rows[2 * index + place])
+                    content[key] = [first, data]
+                    reached = min(table.count, first + CHUNK)
+                    complete = complete and reached == table.count
+                    following.append(reached)
+                modems.append(content)
+            message = {
+                "epoch": self.epoch,
+                "continues": epoch == self.epoch,
+                "start_ms": self.start_ns // 1_000_000,
+                "now_s": round(now, 3),
+                "clock_ms": time.time_ns() // 1_000_000 if self._live else None,
+                "modems": modems,
+                "alarms": [asdict(alarm) for alarm in self._alarms if alarm.version > version],
+                "ended": self._ended,
+            }
+            reached_version = self._version if complete else version
+            return message, "-".join(map(str, [self.epoch, reached_version, *following]))
+
+    # inside -----------------------------------------------------------------------------------------------
+
+    def _bump(self) -> None:
+        self._version += 1
+        for alarm in self._alarms:
+            if alarm.version == -1:
+                alarm.version = self._version
+        self._changed.notify_all()
+
+    def _parsed(self, cursor: str) -> tuple[str, int, list[int]]:
+        zeros = [0] * (2 * len(self._modems))
+        match = _CURSOR.fullmatch(cursor)
+        numbers = [int(text) for text in match[2][1:].split("-")] if match else []
+        if match is None or match[1] != self.epoch or len(numbers) != 1 + len(zeros):
+            return "", 0, zeros
+        return self.epoch, numbers[0], numbers[1:]
+
+    def _seconds(self, modem: _Modem, mono_ns: int) -> float:
+        return (mono_ns + modem.shift_ns - self.start_ns) / 1e9
+
+    def _status(self, modem: _Modem, status: TapStatus) -> None:
+        modem.connected = status.connected
+        modem.records, modem.bytes_written = status.records, status.bytes_written
+        modem.disk_free_bytes, modem.disk_fault = status.disk_free_bytes, status.disk_fault
+        modem.gaps, modem.missed, modem.predicts = status.gaps, status.missed, status.predicts
+        if status.message and status.message not in _alarms_of(modem, self.now()).values():
+            self._note(modem, "message", status.message)
+
+    def _record(self, modem: _Modem, record: Record) -> None:
+        if not self._live:
+            modem.records += 1
+        takers = {
+            "header": self._take_header,
+            "exchange": self._take_exchange,
+            "prediction": self._take_prediction,
+            "gap": self._take_gap,
+            "clock": self._take_clock,
+            "end": self._take_end,
+        }
+        if (take := takers.get(record["kind"])) is not None:
+            take(modem, record)
+
+    def _take_header(self, modem: _Modem, record: Record) -> None:
+        if not self._live:
+            modem.shift_ns = record["utc_ns"] - record["mono_ns"]
+        modem.port = str(record.get("port", {}).get("device", ""))
+        modem.connected, modem.ended = True, False
+        modem.unsynchronised = record.get("clock_synchronised") is False
+        modem.rank_s = self._seconds(modem, record["mono_ns"])
+
+    def _take_exchange(self, modem: _Modem, record: Record) -> None:
+        decoded = record.get("decoded") or {}
+        if record["query"] == "servingcell":
+            cell = decoded.get("nr") or {}
+            modem.rsrp_dbm, modem.sinr_db = cell.get("rsrp_dbm"), cell.get("sinr_db")
+        elif record["query"] == RI_QUERY:
+            t = self._seconds(modem, (record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
+            modem.rank = decoded.get("rank")
+            if modem.rank is not None:
+                modem.rank_s = t
+            if record["status"] == "ok":
+                modem.times.append(t)
+            modem.measured.add((t, modem.rank, modem.rsrp_dbm, modem.sinr_db))
+            modem.sent.append((record["sent_utc_ns"], t))
+
+    def _take_prediction(self, modem: _Modem, record: Record) -> None:
+        modem.predicts = True
+        t = next((t for sent, t in modem.sent if sent == record["for_sent_utc_ns"]), None)
+        if t is None:
+            return
+        modem.age_s, modem.delay_s = record.get("telemetry_age_s"), record.get("telemetry_delay_s")
+        modem.fix, modem.inside = record.get("fix"), record.get("inside")
+        modem.offset_db = record.get("offset_db")
+        if record.get("east_m") is not None and not (modem.fix is not None and 0 <= modem.fix < 3):
+            modem.gps_s = t
+        low, high = record.get("rank_interval") or (None, None)
+        level_low, level_high = record.get("level_interval_dbm") or (None, None)
+        level, offset = record.get("level_dbm"), modem.offset_db
+        level = None if level is None or offset is None else level + offset
+        modem.predicted.add(
+            (
+                *(t, record.get("measured"), record.get("predicted"), low, high),
+                *(record.get("rsrp_dbm"), level, level_low, level_high),
+                *(record.get("east_m"), record.get("north_m"), record.get("up_m")),
+            )
+        )
+
+    def _take_gap(self, modem: _Modem, record: Record) -> None:
+        modem.connected = record["state"] == "closed"
+        modem.gap_text = "" if modem.connected else f"no modem: {record['reason']}"
+        if modem.connected:
+            modem.rank_s = self._seconds(modem, record["mono_ns"])
+        elif not self._live:
+            modem.gaps += 1
+        if not modem.connected:
+            modem.rank = None
+
+    def _take_clock(self, modem: _Modem, record: Record) -> None:
+        modem.step_s = self._seconds(modem, record["mono_ns"])
+        modem.step_text = f"the wall clock stepped by {record['step_ns'] / 1e9:+.3f} s"
+
+    def _take_end(self, modem: _Modem, record: Record) -> None:
+        modem.connected, modem.ended, modem.gap_text = False, True, ""
+        if not self._live:
+            self._note(modem, "message", f"end of the session: {record.get('reason', '')}")
+
+    # alarms -----------------------------------------------------------------------------------------------
+
+    def _note(self, modem: _Modem, kind: str, text: str) -> None:
+        """Put a line without duration into the history."""
+        now = self.now()
+        self._raise(modem, kind, text).end_s = now
+
+    def _raise(self, modem: _Modem, kind: str, text: str) -> Alarm:
+        alarm = Alarm(self._alarm_count, self._modems.index(modem), kind, text[:LONGEST_TEXT], self.now(), version=-1)
+        self._alarm_count += 1
+        self._alarms.append(alarm)
+        return alarm
+
+    def _look(self) -> bool:
+        """Open and close alarms by the present state; True if one changed."""
+        changed = False
+        for modem in self._modems:
+            wanted = {} if modem.ended or self._ended else _alarms_of(modem, self.now())
+            for kind in [kind for kind in modem.open if kind not in wanted]:
+                alarm = modem.open.pop(kind)
+                alarm.end_s, alarm.version, changed = self.now(), -1, True
+            for kind, text in wanted.items():
+                if kind not in modem.open:
+                    modem.open[kind], changed = self._raise(modem, kind, text), True
+        return changed
+
+
+def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
+    """Alarms that hold at this moment, by kind."""
+    found: dict[str, str] = {}
+    if modem.gap_text:
+        found["gap"] = modem.gap_text
+    elif modem.connected and now - modem.rank_s > STALE_S:
+        found["stale"] = f"no rank for more than {STALE_S:g} s: is data flowing, and CSI reporting on?"
+    if modem.predicts and now - modem.gps_s > GPS_LOST_S:
+        if modem.fix is not None and 0 <= modem.fix < 3:
+            found["gps"] = "GPS lost: the telemetry states no 3-D fix"
+        elif modem.age_s is None:
+            found["gps"] = "no position: the telemetry log holds no line so far"
+        else:
+            found["gps"] = f"no position for more than {GPS_LOST_S:g} s: the telemetry log does not reach the present"
+    if modem.disk_fault:
+        found["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
+    elif modem.disk_free_bytes is not None and modem.disk_free_bytes < DISK_LOW_BYTES:
+        found["disk"] = f"less than {DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
+    if modem.step_s is not None and now - modem.step_s < STEP_SHOWN_S:
+        found["step"] = modem.step_text
+    if modem.delay_s is not None and (modem.delay_s < -CLOCK_OFF_S / 4 or modem.delay_s > CLOCK_OFF_S):
+        ahead = "ahead of" if modem.delay_s < 0 else "behind"
+        found["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"
+    elif modem.unsynchronised:
+        found["clock"] = "the clock is not synchronised (NTP or GPS): times may not fit the telemetry"
+    return found

@@ -1,0 +1,434 @@
+"""The tap's page for browsers: one page and one stream of events, by the standard library.
+
+It answers GET of ``/`` and ``/events`` and nothing else, reads no file, and refuses what other sites ask for (Host,
+Origin, Sec-Fetch-Site), so that a page on the Internet cannot read it by DNS rebinding. Beyond the loopback it wants
+a token. Each browser has a thread that only reads the :class:`~aerpaw_cmp.live.feed.Feed`: one that takes nothing for
+some seconds is dropped and refills when it comes back; the tap never waits for it.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import hashlib
+import hmac
+import ipaddress
+import json
+import re
+import secrets
+import socket
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from http import HTTPStatus
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, quote, urlsplit
+
+from ..common.errors import UsageError
+from .feed import Feed
+from .ports import holders_of_sockets
+
+DEFAULT = "127.0.0.1:8765"
+_ADDRESS = re.compile(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]*):([0-9]{1,5})")
+PIECE = 16_384
+"""Bytes handed to a browser's socket at once: each piece has its own time limit, so a slow link is no dead one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Page:
+    """The page that is served: its bytes and its Content-Security-Policy."""
+
+    body: bytes
+    policy: str
+
+    @property
+    def digest(self) -> str:
+        """Identity of the page: a browser that shows another one loads it anew."""
+        return hashlib.sha256(self.body).hexdigest()[:16]
+
+
+@dataclass(frozen=True, slots=True)
+class Limits:
+    """Bounds on what browsers may take.
+
+    Parameters
+    ----------
+    connections : int
+        Open at once.
+    per_second, burst : float
+        New connections, on average and at once; more are closed unanswered.
+    request_s : float
+        Longest time between a connection and the end of its request [s].
+    send_s : float
+        A browser that takes nothing for so long is dropped [s].
+    tick_s : float
+        Interval between looks at the tap's queue, and between messages to one browser [s].
+    """
+
+    connections: int = 24
+    per_second: float = 10.0
+    burst: float = 40.0
+    request_s: float = 5.0
+    send_s: float = 5.0
+    tick_s: float = 0.1
+
+
+@dataclass(frozen=True, slots=True)
+class Address:
+    """Where the page is served."""
+
+    host: str
+    port: int
+
+    @classmethod
+    def parse(cls, text: str) -> Address:
+        """Address of ``HOST:PORT``; no host is the loopback.
+
+        Raises
+        ------
+        UsageError
+            If it is none.
+
+        Examples
+        --------
+        >>> Address.parse("0.0.0.0:8765").loopback, Address.parse("[::1]:80").loopback
+        (False, True)
+        """
+        match = _ADDRESS.fullmatch(text)
+        if match is None or not 0 <= int(match[2]) < 65_536:
+            raise UsageError(f"--web {text!r}", expected=f"HOST:PORT, e.g. {DEFAULT} or 0.0.0.0:8765")
+        return cls(match[1].strip("[]") or "127.0.0.1", int(match[2]))
+
+    @property
+    def loopback(self) -> bool:
+        """Whether only this computer can reach it."""
+        return _is_loopback(self.host)
+
+    def __str__(self) -> str:
+        return f"[{self.host}]:{self.port}" if ":" in self.host else f"{self.host}:{self.port}"
+
+
+class WebServer:
+    """Serves the page of one feed until closed.
+
+    Parameters
+    ----------
+    feed : Feed
+    page : Page
+    address : Address
+    token : str, optional
+        Asked for in the URL; None: none on the loopback, a random one elsewhere.
+    limits : Limits
+
+    Raises
+    ------
+    UsageError
+        If the address cannot be had; names who holds the port and the next free one.
+    """
+
+    def __init__(
+        self, feed: Feed, page: Page, address: Address, *, token: str | None = None, limits: Limits | None = None
+    ) -> None:
+        self.feed, self.page, self.address = feed, page, address
+        self.limits = limits or Limits()
+        self.token = token or ("" if address.loopback else secrets.token_urlsafe(12))
+        self.closing = False
+        try:
+            self._server = _Server(self)
+        except OSError as error:
+            raise _refused(address, error) from None
+        self.address = Address(address.host, self._server.server_address[1])
+        self._threads = [
+            threading.Thread(target=self._server.serve_forever, args=(0.5,), name="tap-web", daemon=True),
+            threading.Thread(target=self._digest, name="tap-web-feed", daemon=True),
+        ]
+
+    def __enter__(self) -> WebServer:
+        for thread in self._threads:
+            thread.start()
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self.close()
+
+    @property
+    def urls(self) -> list[str]:
+        """Addresses for a browser; of a server on all interfaces, this computer's as other computers see it first."""
+        query = f"/?token={quote(self.token)}" if self.token else "/"
+        hosts = [self.address.host]
+        if self.address.host in ("0.0.0.0", "::"):
+            hosts = [*_outward(), "127.0.0.1"]
+        return [f"http://{Address(host, self.address.port)}{query}" for host in hosts]
+
+    def close(self, wait_s: float = 1.5) -> None:
+        """Let browsers take what is new, for a moment, and close."""
+        self.feed.digest()
+        self.closing = True
+        until = time.monotonic() + wait_s
+        while self._server.streams and time.monotonic() < until:
+            time.sleep(0.02)
+        self._server.shutdown()
+        self._server.server_close()
+        self._server.close_all()
+
+    def _digest(self) -> None:
+        while not self.closing:
+            self.feed.digest()
+            self._server.end_late_requests()
+            time.sleep(self.limits.tick_s)
+
+
+class _Server(ThreadingHTTPServer):
+    """Threads for connections, their number and their rate bounded."""
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 32
+
+    def __init__(self, web: WebServer) -> None:
+        self.web = web
+        self.streams = 0
+        self._lock = threading.Lock()
+        self._open: dict[socket.socket, float] = {}
+        self._allowance, self._counted = web.limits.burst, time.monotonic()
+        self.address_family = socket.AF_INET6 if ":" in web.address.host else socket.AF_INET
+        super().__init__((web.address.host, web.address.port), _Handler)
+
+    def server_bind(self) -> None:
+        """Bind without the look-up of this computer's name, which may ask the network."""
+        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        self.socket.bind(self.server_address)
+        self.server_address = self.socket.getsockname()
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:  # noqa: ARG002
+        """Whether the connection is within the limits; one beyond them is closed unanswered."""
+        now, limits = time.monotonic(), self.web.limits
+        self._allowance = min(limits.burst, self._allowance + (now - self._counted) * limits.per_second)
+        self._counted = now
+        with self._lock:
+            if self._allowance < 1.0 or len(self._open) >= limits.connections:
+                return False
+            self._allowance -= 1.0
+            self._open[request] = now
+        return True
+
+    def shutdown_request(self, request: Any) -> None:
+        """Forget the connection, then close it."""
+        with self._lock:
+            self._open.pop(request, None)
+        super().shutdown_request(request)
+
+    @contextlib.contextmanager
+    def streaming(self) -> Iterator[None]:
+        """Count a stream of events while it runs."""
+        with self._lock:
+            self.streams += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self.streams -= 1
+
+    def request_is_in(self, request: Any) -> None:
+        """The request was read to its end: its time limit no longer counts."""
+        with self._lock:
+            self._open[request] = float("inf")
+
+    def end_late_requests(self) -> None:
+        """End connections whose request does not come to an end, a byte at a time or not at all."""
+        limit = time.monotonic() - self.web.limits.request_s
+        self._end([request for request, since in list(self._open.items()) if since < limit])
+
+    def close_all(self) -> None:
+        """End every connection."""
+        self._end(list(self._open))
+
+    def _end(self, requests: list[socket.socket]) -> None:
+        for request in requests:
+            with contextlib.suppress(OSError):
+                request.shutdown(socket.SHUT_RDWR)
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        """Say nothing: a browser that went away is no fault, and the terminal belongs to the tap."""
+
+
+class _Handler(BaseHTTPRequestHandler):
+    """One request; HTTP/1.0, so that each connection ends with its answer."""
+
+    server: _Server
+    server_version = "aerpaw-cmp"
+    sys_version = ""
+
+    def setup(self) -> None:
+        super().setup()
+        self.connection.settimeout(self.server.web.limits.send_s)
+        self.connection.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 8 * PIECE)
+
+    def do_GET(self) -> None:
+        """Answer with the page or the events."""
+        self.server.request_is_in(self.request)
+        try:
+            parts = urlsplit(self.path)
+            query = {name: values[0] for name, values in parse_qs(parts.query, max_num_fields=8).items()}
+        except ValueError:
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return
+        refusal = self._refusal(parts.path, query)
+        if refusal is not None:
+            self._text(*refusal)
+        elif parts.path == "/":
+            body = self.server.web.page.body
+            self._head("text/html; charset=utf-8", len(body))
+            self._pieces(body)
+        else:
+            self._head("text/event-stream", None)
+            with self.server.streaming():
+                self._events(self.headers.get("Last-Event-ID") or query.get("from", ""))
+
+    def _refusal(self, path: str, query: dict[str, str]) -> tuple[HTTPStatus, str] | None:
+        """Why the request is not answered, None if it is."""
+        web, headers = self.server.web, self.headers
+        hosts, origins = headers.get_all("Host", []), headers.get_all("Origin", [])
+        if len(hosts) != 1 or not _own_host(hosts[0], web.address.loopback):
+            return HTTPStatus.FORBIDDEN, "the Host is no name of this computer"
+        if any(origin.lower() != f"http://{hosts[0]}".lower() for origin in origins):
+            return HTTPStatus.FORBIDDEN, "the request comes from another site"
+        opened = path == "/" and headers.get("Sec-Fetch-Dest", "document") == "document"
+        if headers.get("Sec-Fetch-Site", "none") not in ("none", "same-origin") and not opened:
+            return HTTPStatus.FORBIDDEN, "the request comes from another site"
+        given = query.get("token", "")
+        if web.token and not hmac.compare_digest(given.encode(), web.token.encode()):
+            return HTTPStatus.FORBIDDEN, "the token is missing or wrong: use the address that the tap printed"
+        if path not in ("/", "/events"):
+            return HTTPStatus.NOT_FOUND, "there is one page here: /"
+        return None
+
+    def _events(self, cursor: str) -> None:
+        """Send what is new until the browser goes, takes nothing, or the session ends."""
+        web, page = self.server.web, self.server.web.page.digest
+        self._pieces(b"retry: 1000\n\n")
+        while True:
+            message, cursor = web.feed.after(cursor, 0.0 if web.closing else 1.0)
+            if message is None and web.closing:
+                return
+            text = ":\n\n"
+            if message is not None:
+                content = json.dumps({**message, "page": page}, separators=(",", ":"), allow_nan=False)
+                text = f"id: {cursor}\ndata: {content}\n\n"
+            self._pieces(text.encode("ascii"))
+            time.sleep(0.0 if web.closing else web.limits.tick_s)
+
+    def _head(self, kind: str, length: int | None) -> None:
+        self.send_response(HTTPStatus.OK)
+        self.send_header("Content-Type", kind)
+        if length is not None:
+            self.send_header("Content-Length", str(length))
+        self.end_headers()
+
+    def end_headers(self) -> None:
+        """Close the head with what every answer carries."""
+        for name, value in (
+            ("Content-Security-Policy", self.server.web.page.policy),
+            ("X-Content-Type-Options", "nosniff"),
+            ("Referrer-Policy", "no-referrer"),
+            ("Cross-Origin-Resource-Policy", "same-origin"),
+            ("Cross-Origin-Opener-Policy", "same-origin"),
+            ("Cache-Control", "no-store"),
+            ("Connection", "close"),
+        ):
+            self.send_header(name, value)
+        super().end_headers()
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:  # noqa: ARG002
+        """Answer what http.server refuses; nothing of the request stands in the answer."""
+        self._text(HTTPStatus(code), HTTPStatus(code).phrase)
+
+    def _text(self, status: HTTPStatus, text: str) -> None:
+        body = f"{text}\n".encode()
+        self.send_response(status)
+        self.send_header("Content-Type", "text/plain; charset=utf-8")
+        self.send_header("Content-Length", str(len(body)))
+        self.end_headers()
+        self._pieces(body)
+
+    def _pieces(self, data: bytes) -> None:
+        for start in range(0, len(data), PIECE):
+            self.wfile.write(data[start : start + PIECE])
+
+    def log_message(self, format: str, *args: Any) -> None:
+        """Print nothing: the terminal belongs to the tap."""
+
+
+def _is_loopback(host: str) -> bool:
+    if host.lower() == "localhost":
+        return True
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return False
+
+
+def _own_host(text: str, loopback: bool) -> bool:
+    """Whether a Host header names this computer by an address or its own name; the port may be a tunnel's."""
+    match = re.fullmatch(r"(\[[0-9A-Fa-f:.]+\]|[A-Za-z0-9.-]+)(:[0-9]{1,5})?", text)
+    if match is None:
+        return False
+    host = match[1].strip("[]").lower()
+    if loopback or _is_loopback(host):
+        return _is_loopback(host)
+    own = socket.gethostname().lower()
+    try:
+        ipaddress.ip_address(host)
+    except ValueError:
+        return host in (own, f"{own.split('.')[0]}.local")
+    return True  # an address cannot be rebound: whoever uses it means this computer
+
+
+def _outward() -> list[str]:
+    """Address of this computer as other computers see it; nothing is sent to find it."""
+    with contextlib.suppress(OSError), socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
+        probe.connect(("192.0.2.1", 9))  # TEST-NET-1: a route is looked up, no packet goes out
+        return [str(probe.getsockname()[0])]
+    return []
+
+
+def _refused(address: Address, error: OSError) -> UsageError:
+    """The error for an address that cannot be had."""
+    if error.errno != errno.EADDRINUSE:
+        cause = {
+            errno.EACCES: "ports below 1024 belong to the administrator",
+            errno.EADDRNOTAVAIL: "this computer has no such address",
+        }.get(error.errno or 0, "the name of another computer")
+        return UsageError(
+            f"--web {address}: {error.strerror}", expected=f"an address of this computer, e.g. {DEFAULT}", cause=cause
+        )
+    who = ", ".join(f"{h.name} (process {h.pid})" for h in holders_of_sockets(_listeners(address.port))[:4])
+    free = next((port for port in range(address.port + 1, 65_536) if _is_free(address.host, port)), None)
+    return UsageError(
+        f"--web {address}: port {address.port} is taken by {who or 'a process that we may not look at'}",
+        expected="a free port" if free is None else f"a free port, e.g. '--web {Address(address.host, free)}'",
+        cause="another tap or another server runs",
+    )
+
+
+def _is_free(host: str, port: int) -> bool:
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    with contextlib.suppress(OSError), socket.socket(family, socket.SOCK_STREAM) as probe:
+        probe.bind((host, port))
+        return True
+    return False
+
+
+def _listeners(port: int) -> set[int]:
+    """Inodes of the sockets that listen on a port, by ``/proc/net``."""
+    inodes = set()
+    for name in ("tcp", "tcp6"):
+        with contextlib.suppress(OSError):
+            for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
+                cells = line.split()
+                if cells[3] == "0A" and int(cells[1].rpartition(":")[2], 16) == port:
+                    inodes.add(int(cells[9]))
+    return inodes

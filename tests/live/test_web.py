@@ -1,0 +1,569 @@
+"""The tap's page without a browser: what the server answers and refuses, what the feed keeps, how a log is played."""
+
+from __future__ import annotations
+
+import base64
+import contextlib
+import http.client
+import math
+import random
+import socket
+import struct
+import subprocess
+import sys
+import threading
+import time
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.common.errors import InputError, UsageError
+from aerpaw_cmp.live.feed import CHUNK, MEASURED, STALE_S, Feed, Rows
+from aerpaw_cmp.live.log import encode_record
+from aerpaw_cmp.live.play import Player
+from aerpaw_cmp.live.predict import RunningInterval
+from aerpaw_cmp.live.session import TapStatus
+from aerpaw_cmp.live.stop import Stop
+from aerpaw_cmp.live.web import Address, Limits, WebServer
+
+SECOND = 1_000_000_000
+QUIET = Limits(per_second=1e6, burst=1e6, connections=200)
+
+
+class Hand:
+    """A feed whose clock is turned by hand, and records for it."""
+
+    def __init__(self, names=("modem",), rate_ns=SECOND // 2):
+        self.now_ns, self.step = 1_000 * SECOND, rate_ns
+        self.feed = Feed(list(names), lambda: self.now_ns)
+        for modem in range(len(names)):
+            self.put({"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {}}, modem)
+        self.start_ns = self.now_ns
+
+    @property
+    def mono_ns(self):
+        return self.now_ns - self.start_ns if hasattr(self, "start_ns") else 0
+
+    def put(self, record, modem=0):
+        self.feed.put(modem, record)
+        self.feed.digest()
+
+    def answer(self, rank=2, modem=0, query="nr5g_csi", utc_ns=0, **decoded):
+        self.now_ns += self.step
+        times = {f"{end}_{clock}_ns": self.mono_ns for end in ("sent", "last") for clock in ("mono",)}
+        sent = utc_ns or self.now_ns
+        record = {"kind": "exchange", "query": query, "status": "ok", "decoded": {"rank": rank} | decoded}
+        self.put(record | times | {"sent_utc_ns": sent, "last_utc_ns": sent}, modem)
+        return sent
+
+    def predict(self, sent, **fields):
+        self.put({"kind": "prediction", "for_sent_utc_ns": sent, "measured": 2, "predicted": 3} | fields)
+
+    def status(self, **values):
+        usual = dict.fromkeys(("rank", "rsrp_dbm", "sinr_db"))
+        usual |= {"elapsed_s": 1.0, "connected": True, "ri_rate_hz": 2.0, "gaps": 0, "records": 5, "bytes_written": 9}
+        self.put(TapStatus(**(usual | {"disk_free_bytes": 2**40} | values)))
+
+    def open(self):
+        return sorted(a["kind"] for a in self.feed.after("")[0]["alarms"] if a["end_s"] is None)
+
+
+def rows_of(message, modem=0, key="rows"):
+    raw = base64.b64decode(message["modems"][modem][key][1])
+    return np.frombuffer(raw, "<f4").reshape(-1, len(MEASURED) if key == "rows" else 12)
+
+
+@pytest.fixture
+def server(tools):
+    with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=QUIET) as web:
+        yield web
+
+
+def ask(web, path="/", method="GET", host="127.0.0.1", **headers):
+    link = http.client.HTTPConnection("127.0.0.1", web.address.port, timeout=5)
+    link.putrequest(method, path, skip_host=True, skip_accept_encoding=True)
+    for name, value in {"Host": host, **{k.replace("_", "-"): v for k, v in headers.items()}}.items():
+        if value is not None:
+            link.putheader(name, value)
+    link.endheaders()
+    answer = link.getresponse()
+    body = b"" if answer.status == 200 and path.startswith("/events") else answer.read()
+    found = answer.status, dict(answer.getheaders()), body
+    link.close()
+    return found
+
+
+# the server ----------------------------------------------------------------------------------------------------
+
+
+def test_one_page_with_a_strict_policy(server, tools):
+    status, headers, body = ask(server)
+    assert (status, body) == (200, tools.page.body)
+    assert headers["Content-Security-Policy"] == tools.page.policy
+    assert (headers["X-Content-Type-Options"], headers["Cache-Control"]) == ("nosniff", "no-store")
+    status, headers, _ = ask(server, "/events")
+    assert (status, headers["Content-Type"]) == (200, "text/event-stream")
+
+
+@pytest.mark.parametrize(
+    "path",
+    ["/etc/passwd", "/../../etc/passwd", "/%2e%2e/%2e%2e/etc/passwd", "/live.js", "/index.html", "/events/", "/favicon.ico", "//etc/passwd", "/./"],
+)  # fmt: skip
+def test_no_other_file(server, path):
+    status, _, body = ask(server, path)
+    assert (status, body) == (404, b"there is one page here: /\n")
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "OPTIONS", "HEAD", "TRACE", "<b>"])
+def test_no_other_method(server, method):
+    status, headers, body = ask(server, method=method)
+    assert status in (400, 501)
+    assert method.encode() not in body
+    assert "Access-Control-Allow-Origin" not in headers
+
+
+@pytest.mark.parametrize(
+    ("host", "headers", "status"),
+    [
+        ("localhost:9000", {}, 200),  # a tunnel's port
+        ("[::1]:8765", {}, 200),
+        ("evil.example", {}, 403),  # DNS rebinding: the name leads here, the site is another
+        ("evil.example:8765", {}, 403),
+        ("192.168.7.9", {}, 403),  # not an address of the loopback
+        ("127.0.0.1.evil.example", {}, 403),
+        ("", {}, 403),
+        (None, {}, 403),
+        ("127.0.0.1", {"Origin": "http://evil.example"}, 403),
+        ("127.0.0.1", {"Origin": "null"}, 403),
+        ("127.0.0.1:80", {"Origin": "http://127.0.0.1:81"}, 403),
+        ("127.0.0.1:80", {"Origin": "http://127.0.0.1:80"}, 200),
+        ("127.0.0.1", {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Dest": "iframe"}, 403),
+        ("127.0.0.1", {"Sec_Fetch_Site": "cross-site", "Sec_Fetch_Dest": "document"}, 200),  # a link was followed
+        ("127.0.0.1", {"Sec_Fetch_Site": "same-origin", "Sec_Fetch_Dest": "empty"}, 200),
+    ],
+)
+def test_host_and_origin(server, host, headers, status):
+    assert ask(server, host=host, **headers)[0] == status
+    dest = headers.get("Sec_Fetch_Dest") == "document"
+    assert ask(server, "/events", host=host, **headers)[0] == (403 if dest else status)
+
+
+def test_two_hosts_are_none(server):
+    with socket.create_connection(("127.0.0.1", server.address.port), 5) as link:
+        link.sendall(b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nHost: evil.example\r\n\r\n")
+        assert b" 403 " in link.makefile("rb").readline()
+
+
+def test_beyond_the_loopback_a_token_is_wanted(tools):
+    with WebServer(Feed(["modem"]), tools.page, Address("0.0.0.0", 0), limits=QUIET) as web:
+        (query,) = {url.partition("?")[2] for url in web.urls}
+        assert len(query) > len("token=") + 15
+        for path in ("/", "/events", "/other"):
+            for wrong in ("", "?token=", "?token=wrong", f"?{query}x", f"?{query.upper()}", "?token=%ff%00"):
+                assert ask(web, path + wrong)[0] == 403
+        for path, status in (("/", 200), ("/events", 200), ("/other", 404)):
+            assert ask(web, f"{path}?{query}")[0] == status
+        # a name that is not ours may have been rebound; an address cannot be
+        assert ask(web, f"/?{query}", host="evil.example")[0] == 403
+        assert ask(web, f"/?{query}", host="192.168.7.9:1")[0] == 200
+        assert ask(web, f"/?{query}", host=socket.gethostname())[0] == 200
+    with WebServer(Feed(["modem"]), tools.page, Address("0.0.0.0", 0), token="of the unit") as web:
+        assert ask(web, "/?token=of%20the%20unit")[0] == 200
+
+
+def test_a_taken_port_is_named_with_a_free_one(tools):
+    child = "import socket, sys; s = socket.create_server(('127.0.0.1', 0)); print(s.getsockname()[1], flush=True); sys.stdin.read()"
+    with subprocess.Popen([sys.executable, "-c", child], stdin=subprocess.PIPE, stdout=subprocess.PIPE, text=True) as holder:
+        port = int(holder.stdout.readline())
+        with pytest.raises(UsageError, match=rf"port {port} is taken by .*\(process {holder.pid}\)") as caught:
+            WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", port))
+        holder.stdin.close()
+    free = int(str(caught.value).rpartition("--web 127.0.0.1:")[2].split("'")[0])
+    assert free > port
+    with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", free)):
+        pass
+
+
+@pytest.mark.parametrize("text", ["", "8765", "localhost", "a b:1", "127.0.0.1:70000", "http://127.0.0.1:80", "::1:80"])
+def test_addresses_that_are_none(text):
+    with pytest.raises(UsageError, match="expected HOST:PORT"):
+        Address.parse(text)
+
+
+def test_an_address_of_another_computer(tools):
+    with pytest.raises(UsageError, match="this computer has no such address"):
+        WebServer(Feed(["modem"]), tools.page, Address("192.0.2.77", 8765))
+
+
+def fuzzed(random):
+    """A request that is damaged in one of many ways."""
+    lines = [b"GET /events?from=00000000-1-2-3 HTTP/1.1", b"Host: 127.0.0.1", b"Last-Event-ID: 00000000-1-2-3", b"", b""]
+    data = bytearray(b"\r\n".join(lines))
+    kind = random.randrange(6)
+    if kind == 0:
+        return bytes(random.randrange(256) for _ in range(random.randrange(400))) + b"\r\n\r\n"
+    if kind == 1:
+        return bytes(data[: random.randrange(len(data))]) + b"\r\n\r\n"
+    if kind == 2:
+        return b"GET /" + b"a" * random.choice([10, 70_000]) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    if kind == 3:
+        return b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * random.choice([90, 3000]) + b"\r\n"
+    if kind == 4:
+        path = b"".join(random.choice([b"/", b"..", b"%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\"]) for _ in range(12))
+        return b"GET " + path + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
+    for _ in range(random.randrange(1, 20)):
+        data[random.randrange(len(data))] = random.randrange(256)
+    return bytes(data) + b"\r\n\r\n"
+
+
+def test_damaged_requests_get_the_page_or_nothing(server, tools):
+    chance, threads = random.Random(3), threading.active_count()
+    kinds = set()
+    for _ in range(300):
+        head = body = b""
+        with socket.create_connection(("127.0.0.1", server.address.port), 5) as link, contextlib.suppress(OSError):
+            link.sendall(fuzzed(chance))
+            link.shutdown(socket.SHUT_WR)
+            head, _, body = link.makefile("rb").read(500).partition(b"\r\n\r\n")
+        kinds.add(head[9:12])
+        assert body in (b"", tools.page.body) or body.startswith((b"retry: 1000", b"there is one page", b"the ")) or len(body) < 60
+    assert {b"404", b"400"} <= kinds
+    until = time.monotonic() + 10
+    while threading.active_count() > threads + 2 and time.monotonic() < until:
+        time.sleep(0.05)
+    assert threading.active_count() <= threads + 2
+    assert ask(server)[0] == 200
+
+
+def test_a_browser_that_takes_nothing_is_dropped_and_others_miss_nothing(tools):
+    feed, sent = Feed(["modem"]), 0
+    record = {"kind": "exchange", "query": "nr5g_csi", "status": "ok", "decoded": {"rank": 1}, "sent_utc_ns": 0}
+    with WebServer(feed, tools.page, Address("127.0.0.1", 0), limits=Limits(send_s=0.3, tick_s=0.01)) as web:
+        stuck, good = tools.Browser(web.address.port, reads=False), tools.Browser(web.address.port)
+        until = time.monotonic() + 30
+
+        def streams(wanted):
+            assert time.monotonic() < until
+            time.sleep(0.01)
+            return web._server.streams == wanted
+
+        while not streams(2):
+            pass
+        while not streams(1):  # until the buffers between here and there are full
+            for _ in range(500):
+                feed.put(0, record | {"sent_mono_ns": sent, "last_mono_ns": sent})
+                sent += 1
+        while good.messages[-1]["modems"][0]["rows"][0] + len(rows_of(good.messages[-1])) < sent:
+            assert streams(1)
+        assert sum(len(rows_of(message)) for message in good.messages) == sent
+        assert good.connections == 1
+        for browser in (stuck, good):
+            browser.close()
+
+
+def test_a_flood_of_connections_is_bounded(tools):
+    limits = Limits(connections=8, per_second=1.0, burst=20.0, request_s=0.5)
+    with WebServer(Feed(["modem"]), tools.page, Address("127.0.0.1", 0), limits=limits) as web:
+        threads = threading.active_count()
+        links = [socket.create_connection(("127.0.0.1", web.address.port), 5) for _ in range(100)]
+        time.sleep(0.2)
+        assert threading.active_count() <= threads + limits.connections
+        for link in links[:20]:  # a byte now and then does not hold a place beyond the time for a request
+            try:
+                link.sendall(b"G")
+            except OSError:
+                continue
+        until = time.monotonic() + 10
+        while threading.active_count() > threads:
+            assert time.monotonic() < until
+            time.sleep(0.05)
+        for link in links:
+            link.close()
+        time.sleep(2.0)
+        assert ask(web)[0] == 200  # and others are served again
+
+
+def test_the_tap_never_waits_for_the_page():
+    feed = Feed(["modem"])
+    with feed._changed:  # as if a browser's thread stood still while it holds what it reads
+        start = time.monotonic()
+        for number in range(50_000):
+            feed.put(0, {"kind": "late", "n": number})
+        assert time.monotonic() - start < 10.0  # it returned at all: a lock would wait for ever
+    assert len(feed._pending) == feed._pending.maxlen
+
+
+# the feed ------------------------------------------------------------------------------------------------------
+
+
+def test_rows_are_counted_and_the_oldest_go():
+    rows = Rows(2, size=5)
+    for number in range(8):
+        rows.add((number, None if number == 6 else -number))
+    first, data = rows.after(0)
+    values = np.frombuffer(base64.b64decode(data), "<f4").reshape(-1, 2)
+    assert (first, values[:, 0].tolist()) == (3, [3, 4, 5, 6, 7])
+    assert math.isnan(values[3, 1])
+    assert rows.after(6)[0] == 6
+    assert rows.after(8) == (8, "")
+    assert rows.after(99) == (8, "")
+    assert len(base64.b64decode(rows.after(0, most=2)[1])) == 2 * 2 * 4
+
+
+def test_a_browser_that_comes_back_gets_what_it_missed_once():
+    hand = Hand()
+    for _ in range(5):
+        hand.answer()
+    message, cursor = hand.feed.after("")
+    assert (len(rows_of(message)), message["continues"]) == (5, False)
+    assert hand.feed.after(cursor)[0] is None
+    for _ in range(3):
+        hand.answer(rank=4)
+    message, after = hand.feed.after(cursor)
+    assert message["continues"]
+    assert (message["modems"][0]["rows"][0], rows_of(message)[:, 1].tolist()) == (5, [4, 4, 4])
+    for wrong in ("rubbish", cursor.replace("-", "_"), "0" * 8 + cursor[8:], cursor + "-1", "\n", cursor + "9" * 40):
+        assert len(rows_of(hand.feed.after(wrong)[0])) == 8
+    assert hand.feed.after(after)[0] is None
+
+
+def test_a_long_flight_comes_in_pieces():
+    hand = Hand()
+    for _ in range(2 * CHUNK + 10):
+        hand.feed.put(0, {"kind": "exchange", "query": "nr5g_csi", "status": "ok", "decoded": {"rank": 1},
+                          "sent_mono_ns": 0, "last_mono_ns": 0, "sent_utc_ns": 0})  # fmt: skip
+    hand.feed.digest()
+    cursor, sizes = "", []
+    while (found := hand.feed.after(cursor))[0] is not None:
+        sizes.append(len(rows_of(found[0])))
+        cursor = found[1]
+    assert sizes == [CHUNK, CHUNK, 10]
+
+
+def test_measurements_and_predictions_stand_in_rows():
+    hand = Hand()
+    hand.answer(query="servingcell", nr={"rsrp_dbm": -91, "sinr_db": 14})
+    sent = hand.answer(rank=2)
+    hand.predict(sent, east_m=10.0, north_m=20.0, up_m=40.0, level_dbm=-50.0, offset_db=-40.0, rsrp_dbm=-91,
+                 rank_interval=[2, 4], level_interval_dbm=[-95.0, -85.0], inside=[1, 1, 0, 0])  # fmt: skip
+    hand.predict(sent + 1)  # of an answer that is not known
+    message, _ = hand.feed.after("")
+    assert rows_of(message).tolist() == [[1.0, 2.0, -91.0, 14.0]]
+    assert rows_of(message, key="predictions").tolist() == [[1.0, 2, 3, 2, 4, -91, -90, -95, -85, 10, 20, 40]]
+    shown = message["modems"][0]
+    assert (shown["rank"], shown["offset_db"], shown["inside"], shown["predicts"]) == (2, -40.0, [1, 1, 0, 0], True)
+
+
+def test_two_modems_stand_side_by_side():
+    hand = Hand(("left", "right"))
+    hand.answer(rank=1, modem=0)
+    hand.answer(rank=4, modem=1)
+    message, cursor = hand.feed.after("")
+    assert [m["name"] for m in message["modems"]] == ["left", "right"]
+    assert [rows_of(message, i)[0, 1] for i in (0, 1)] == [1, 4]
+    hand.answer(rank=2, modem=1)
+    message, _ = hand.feed.after(cursor)
+    assert [len(rows_of(message, i)) for i in (0, 1)] == [0, 1]
+
+
+def test_a_wall_clock_that_jumps_leaves_the_rows_in_order():
+    hand = Hand()
+    for utc_ns in (5_000 * SECOND, 5_001 * SECOND, 3 * SECOND, 9_000 * SECOND):
+        sent = hand.answer(utc_ns=utc_ns)
+        hand.predict(sent, east_m=0.0, north_m=0.0, up_m=1.0)
+    hand.put({"kind": "clock", "step_ns": -4_998 * SECOND, "mono_ns": hand.mono_ns})
+    message, _ = hand.feed.after("")
+    for key in ("rows", "predictions"):
+        times = rows_of(message, key=key)[:, 0]
+        assert times.tolist() == [0.5, 1.0, 1.5, 2.0]
+    assert hand.open() == ["step"]
+    assert any("-4998.000 s" in alarm["text"] for alarm in message["alarms"])
+
+
+def test_each_alarm_opens_and_closes():
+    hand = Hand()
+    hand.answer()
+    assert hand.open() == []
+    for _ in range(9):
+        hand.answer(rank=None)
+    assert hand.open() == ["stale"]
+    hand.answer(rank=1)
+    assert hand.open() == []
+    hand.put({"kind": "gap", "state": "open", "reason": "pulled", "mono_ns": hand.mono_ns})
+    hand.now_ns += int(2 * STALE_S * SECOND)
+    hand.feed.digest()
+    assert hand.open() == ["gap"]  # and not that the rank is old, too
+    hand.put({"kind": "gap", "state": "closed", "reason": "pulled", "mono_ns": hand.mono_ns})
+    hand.status(disk_free_bytes=10 * 2**20)
+    assert hand.open() == ["disk"]
+    hand.status(disk_fault="No space left on device")
+    hand.status()
+    assert hand.open() == []
+    hand.put({"kind": "header", "utc_ns": hand.now_ns, "mono_ns": hand.mono_ns, "clock_synchronised": False})
+    hand.answer()
+    assert hand.open() == ["clock"]
+    message, _ = hand.feed.after("")
+    kinds = [(alarm["kind"], alarm["end_s"] is None) for alarm in message["alarms"]]
+    assert kinds == [("stale", False), ("gap", False), ("disk", False), ("clock", True)]
+
+
+@pytest.mark.parametrize(
+    ("fields", "words"),
+    [
+        ({"east_m": None, "telemetry_age_s": 9.0}, "the telemetry log does not reach the present"),
+        ({"east_m": 5.0, "telemetry_age_s": 0.1, "fix": 1.0}, "no 3-D fix"),
+        ({"east_m": None, "fix": None}, "holds no line so far"),
+    ],
+)
+def test_gps_lost(fields, words):
+    hand = Hand()
+    for number in range(30):
+        sent = hand.answer()
+        hand.predict(sent, **({"east_m": 1.0, "telemetry_age_s": 0.2, "fix": 3.0} if number < 10 else fields))
+        assert hand.open() == (["gps"] if number >= 20 else [])
+    assert words in hand.feed.after("")[0]["alarms"][-1]["text"]
+
+
+@pytest.mark.parametrize(("delay_s", "words"), [(3.2, "3.2 s behind"), (-1.4, "1.4 s ahead of"), (0.4, None)])
+def test_a_telemetry_clock_that_is_off(delay_s, words):
+    hand = Hand()
+    hand.predict(hand.answer(), east_m=1.0, telemetry_delay_s=delay_s)
+    texts = [alarm["text"] for alarm in hand.feed.after("")[0]["alarms"]]
+    assert [words in text for text in texts] == ([True] if words else [])
+
+
+def test_crafted_records_of_a_log_are_left_out():
+    hand = Hand()
+    for record in (
+        {"kind": "exchange"},
+        {"kind": "exchange", "query": "nr5g_csi", "decoded": 7, "sent_mono_ns": 1, "last_mono_ns": 1},
+        {"kind": "exchange", "query": "nr5g_csi", "decoded": {"rank": "<b>"}, "sent_mono_ns": 1, "last_mono_ns": 1, "status": "ok", "sent_utc_ns": 1},
+        {"kind": "gap"},
+        {"kind": "clock", "mono_ns": "x"},
+        {"kind": "prediction", "for_sent_utc_ns": []},
+        {"kind": ["header"]},
+        {},
+    ):  # fmt: skip
+        hand.put(record)
+    hand.answer(rank=3)
+    assert rows_of(hand.feed.after("")[0])[-1, 1] == 3
+
+
+def test_the_end_is_said_to_all():
+    hand = Hand()
+    hand.answer()
+    _, cursor = hand.feed.after("")
+    hand.feed.end({"text": "over", "commands": ["a"], "replay": False})
+    assert hand.feed.after(cursor)[0]["ended"]["text"] == "over"
+
+
+# intervals -----------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("phi", [0.0, 0.9, 0.98])
+def test_the_running_interval_holds_what_it_says(phi):
+    """Residuals that remember each other, about an unknown offset: nine of ten lie inside, in the long run."""
+    shares = []
+    for seed in range(20):
+        noise, interval, value = np.random.default_rng(seed), RunningInterval(), 0.0
+        for _ in range(3000):
+            value = phi * value + 4.0 * math.sqrt(1 - phi**2) * noise.standard_normal()
+            interval.add(-40.0 + value)
+        assert interval.given > 2000
+        shares.append(interval.inside / interval.given)
+    assert 0.88 < np.mean(shares) < 0.92
+    assert 0.85 < min(shares)
+    assert max(shares) < 0.95
+
+
+def test_no_interval_before_there_is_anything_to_judge_by():
+    interval = RunningInterval()
+    for number in range(20):
+        assert interval.bounds() is None
+        interval.add(float(number))
+    assert interval.bounds() is not None
+
+
+# a log that is played ------------------------------------------------------------------------------------------
+
+
+def write_log(folder, ranks, start_ns, period_ns=SECOND):
+    folder.mkdir()
+    lines = [{"kind": "header", "utc_ns": start_ns, "mono_ns": 77, "port": {"device": "/dev/x"}}]
+    for number, rank in enumerate(ranks):
+        at = number * period_ns
+        lines.append({"kind": "exchange", "query": "nr5g_csi", "status": "ok", "decoded": {"rank": rank}, "lines": [],
+                      "sent_mono_ns": 77 + at, "last_mono_ns": 77 + at, "sent_utc_ns": start_ns + at, "last_utc_ns": start_ns + at})  # fmt: skip
+    (folder / "tap_a_0001.jsonl").write_bytes(b"".join(map(encode_record, lines)) + b"torn")
+
+
+def test_two_logs_are_played_side_by_side_at_their_pace(tmp_path):
+    write_log(tmp_path / "a", [1, 2, 3, 4], 100 * SECOND)
+    write_log(tmp_path / "b", [4, 4], 101 * SECOND + SECOND // 2)
+    player, stop = Player([tmp_path / "a", tmp_path / "b"], speed=10.0), Stop()
+    feed = Feed(["a", "b"], player.steady_ns)
+    start = time.monotonic()
+    bad = player.play(feed, stop)
+    assert time.monotonic() - start > 0.25  # three seconds of the log
+    assert bad == 2
+    feed.digest()
+    message, _ = feed.after("")
+    assert rows_of(message, 0).round(3)[:, :2].tolist() == [[0, 1], [1, 2], [2, 3], [3, 4]]
+    assert rows_of(message, 1).round(3)[:, :2].tolist() == [[1.5, 4], [2.5, 4]]
+    assert message["clock_ms"] is None
+    assert message["start_ms"] == 100_000
+    stop.close()
+
+
+def test_nothing_to_play(tmp_path):
+    (tmp_path / "tap_x.jsonl").write_bytes(b"torn")
+    with pytest.raises(InputError, match="no record with a time"):
+        Player([tmp_path])
+    with pytest.raises(UsageError, match="--speed"):
+        Player([tmp_path], speed=0.0)
+
+
+# the tap with a page -------------------------------------------------------------------------------------------
+
+
+def test_the_log_is_as_without_the_page(modem, tap, tools, tmp_path):
+    logs = []
+    for name in ("with", "without"):
+        sim = modem(link=tmp_path / name)
+        with tools.page_open(name == "with") as feed:
+            options = {} if feed is None else {"watch": lambda item, feed=feed: feed.put(0, item)}
+            session = tap(sim.port, folder=tmp_path / f"log-{name}", options=options)
+            session.wait(lambda sim=sim: len(sim.journal) > 60)
+            session.end()
+        records, bad = tools.records_of(tmp_path / f"log-{name}")
+        assert not bad
+        assert [record["n"] for record in records] == list(range(len(records)))
+        logs.append({(record["kind"], tuple(record)) for record in records})
+        (file,) = (tmp_path / f"log-{name}").iterdir()
+        assert file.name.startswith("tap_")
+    assert logs[0] == logs[1]
+
+
+def test_the_page_gets_every_answer_of_the_log(modem, tap, tools, tmp_path):
+    sim, feed = modem(), Feed(["modem"])
+    with WebServer(feed, tools.page, Address("127.0.0.1", 0)) as web:
+        browser = tools.Browser(web.address.port)
+        session = tap(sim.port, options={"watch": lambda item: feed.put(0, item)})
+        session.wait(lambda: len(sim.journal) > 80)
+        session.end()
+    browser.close()
+    logged = [r["decoded"]["rank"] for r in tools.exchanges(tmp_path / "log", "nr5g_csi")]
+    shown, count = [], 0
+    for message in browser.messages:
+        first = message["modems"][0]["rows"][0]
+        assert first == count
+        rows = rows_of(message)
+        count += len(rows)
+        shown += rows[:, 1].tolist()
+    assert shown == logged
+
+
+def test_struct_of_rows_is_little_endian():
+    rows = Rows(1, 2)
+    rows.add((1.5,))
+    assert base64.b64decode(rows.after(0)[1]) == struct.pack("<f", 1.5)

@@ -1,0 +1,368 @@
+"""The tap's page in a real browser, on a simulated modem and on logs that are played."""
+
+from __future__ import annotations
+
+import math
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.live.feed import Feed
+from aerpaw_cmp.live.session import TapStatus
+from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+from aerpaw_cmp.report.live_page import LiveMap, live_page
+from tests.report.browsing import complaints, extents, frame, needs_browser, serious_findings, set_scheme, start
+from tests.report.conftest import make_site
+
+pytest.importorskip("selenium", reason="selenium is not installed")
+pytestmark = needs_browser
+
+ROOT = Path(__file__).resolve().parents[2]
+SECOND = 1_000_000_000
+
+
+def made_map():
+    site = make_site()
+    east, north = np.arange(-300.0, 301.0, 30.0), np.arange(-300.0, 301.0, 30.0)
+    grid = np.broadcast_to(np.hypot(*np.meshgrid(east, north)), (2, len(north), len(east)))
+    rank = np.clip(4 - grid // 100, 0, 4).astype(int)
+    level = np.where(rank > 0, -40.0 - grid / 10, np.nan)
+    tower = next(iter(site.towers))
+    return LiveMap(title="<b>made up</b>", site=site, tower=tower, k=100.0, heights_m=(30.0, 90.0), east_m=east,
+                   north_m=north, rank=rank, level_dbm=level)  # fmt: skip
+
+
+class Flight:
+    """A page fed by hand: a flight that goes east, a row at a time."""
+
+    def __init__(self, names=("modem",), background=None, port=0):
+        self.now_ns, self.count = 1_800_000_000 * SECOND, 0
+        self.feed = Feed(list(names), lambda: self.now_ns)
+        self.names = names
+        self.server = WebServer(self.feed, Page(*live_page(background, "<b>made up</b>")), Address("127.0.0.1", port),
+                                limits=Limits(burst=1000.0, tick_s=0.02))  # fmt: skip
+        self.start_ns = self.now_ns
+        for modem in range(len(names)):
+            self.feed.put(modem, {"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {"device": "/dev/pts/9"}})
+
+    def fly(self, n=1, *, modem=0, rank=2, predicted=3, rsrp=-90.0, **fields):
+        for _ in range(n):
+            self.now_ns += SECOND // 2
+            self.count += 1
+            mono = self.now_ns - self.start_ns
+            common = {"sent_mono_ns": mono, "last_mono_ns": mono, "sent_utc_ns": self.now_ns, "status": "ok"}
+            cell = {"rsrp_dbm": rsrp, "sinr_db": 12}
+            self.feed.put(modem, {"kind": "exchange", "query": "servingcell", "decoded": {"nr": cell}} | common)
+            self.feed.put(modem, {"kind": "exchange", "query": "nr5g_csi", "decoded": {"rank": rank}} | common)
+            if predicted is not None:
+                record = {"kind": "prediction", "for_sent_utc_ns": self.now_ns, "measured": rank, "predicted": predicted,
+                          "rank_interval": [2, 4], "level_dbm": -50.0, "offset_db": -42.0, "rsrp_dbm": rsrp,
+                          "level_interval_dbm": [-96.0, -88.0], "inside": [9, 10, 17, 20], "fix": 3.0, "telemetry_age_s": 0.2,
+                          "east_m": float(self.count) * 4, "north_m": 20.0, "up_m": 80.0}  # fmt: skip
+                self.feed.put(modem, record | fields)
+
+    def status(self, modem=0, **values):
+        usual = {"elapsed_s": 1.0, "connected": True, "rank": 2, "rsrp_dbm": -90, "sinr_db": 12, "ri_rate_hz": 2.0, "gaps": 0,
+                 "records": 5, "bytes_written": 9, "disk_free_bytes": 50 * 2**30, "predicts": True}  # fmt: skip
+        self.feed.put(modem, TapStatus(**(usual | values)))
+
+    def record(self, modem=0, **record):
+        self.feed.put(modem, {"mono_ns": self.now_ns - self.start_ns} | record)
+
+
+@pytest.fixture(scope="module")
+def driver():
+    found = start("--window-size=1440,1000", "--autoplay-policy=no-user-gesture-required")
+    yield found
+    found.quit()
+
+
+@pytest.fixture
+def fly(driver):
+    """Makes a flight and opens its page."""
+    running = []
+
+    def make(*arguments, **options):
+        flight = Flight(*arguments, **options)
+        flight.server.__enter__()
+        running.append(flight)
+        driver.get(flight.server.urls[0])
+        until(driver, "window.live && live.state.modems.length > 0")
+        return flight
+
+    yield make
+    said = [entry for entry in complaints(driver) if "ERR_" not in entry["message"]]  # a server that ends is no fault
+    driver.get("about:blank")
+    for flight in running:
+        flight.server.close(wait_s=0.1)
+    assert not said
+
+
+def until(driver, expression, timeout=15):
+    from selenium.webdriver.support.ui import WebDriverWait
+
+    WebDriverWait(driver, timeout, 0.05).until(lambda d: d.execute_script(f"return Boolean({expression})"), expression)
+
+
+def text(driver, element):
+    return driver.execute_script(f"return document.getElementById('{element}').textContent")
+
+
+def rows(driver, modem=0):
+    return driver.execute_script(f"return live.state.modems[{modem}].rows.columns.t.length")
+
+
+def pixel(driver, element, x, y):
+    frame(driver)
+    script = """const c = document.getElementById(arguments[0]), k = devicePixelRatio || 1;
+    return Array.from(c.getContext('2d').getImageData(arguments[1] * k, arguments[2] * k, 1, 1).data)"""
+    return driver.execute_script(script, element, x, y)
+
+
+def test_measured_and_predicted_stand_beside_each_other(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(30)
+    flight.fly(1, rank=1, rsrp=-99.0)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 31")
+    frame(driver)
+    card = text(driver, "modems")
+    for words in ("Predicted rank3 (2–4)outside 90 %", "−7.0 dBoutside 90 %", "RSRP−99 dBm", "SINR12 dB"):
+        assert words in card
+    assert text(driver, "rank-words").endswith("90 % interval holds 90 % of 10")
+    assert text(driver, "rsrp-words").endswith("90 % interval holds 85 % of 20")
+    assert driver.execute_script("return document.querySelector('#modems .big').textContent") == "1"
+    assert "<b>made up</b>" in text(driver, "modems") + driver.find_element("tag name", "h1").text
+    flight.fly(1, rank=2, rsrp=-91.0)
+    until(driver, "document.getElementById('modems').textContent.includes('+') || live.state.modems[0].rows.columns.t.length === 32")
+    frame(driver)
+    assert text(driver, "modems").count("inside 90 %") == 2
+
+
+def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(20)
+    until(driver, "live.poses().length === 20")
+    x, y, t = driver.execute_script("return live.poses()[5]")
+    assert pixel(driver, "map", x, y)[:3] == [31, 111, 168] or driver.execute_script("return document.documentElement.dataset.theme") == "dark"
+    below = pixel(driver, "map", x, y + 40)
+    driver.execute_script("document.getElementById('layer').value = 'none'; document.getElementById('layer').dispatchEvent(new Event('change'))")
+    assert pixel(driver, "map", x, y + 40) != below  # what was under it came from the prediction
+    assert "at 90 m" not in text(driver, "map-words")
+    driver.execute_script("document.getElementById('layer').value = 'level'; document.getElementById('layer').dispatchEvent(new Event('change'))")
+    frame(driver)
+    assert "level predicted for tower" in text(driver, "map-words")
+    assert "at 90 m" in text(driver, "map-words")  # of 30 and 90 m the nearer to the UAV at 80 m
+    # a pose under the pointer is marked in the charts, and named
+    driver.execute_script("""const c = document.getElementById('map'), r = c.getBoundingClientRect();
+        c.dispatchEvent(new PointerEvent('pointermove', {clientX: r.left + arguments[0], clientY: r.top + arguments[1], pointerId: 9, bubbles: true}))""", x, y)  # fmt: skip
+    frame(driver)
+    assert driver.execute_script("return live.state.pose") == t
+    assert "24, 20, 80 m" in text(driver, "pose")
+    before = pixel(driver, "map", x, y)
+    driver.execute_script("document.getElementById('colour').value = 'residual-rsrp'; document.getElementById('colour').dispatchEvent(new Event('change'))")
+    assert pixel(driver, "map", x, y) != before
+    driver.execute_script("document.getElementById('closer').click()")
+    frame(driver)
+    assert driver.execute_script("return live.view.zoom") > 1
+
+
+def test_without_predictions_the_page_shows_what_was_measured(driver, fly):
+    flight = fly()
+    flight.fly(12, predicted=None)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 12")
+    frame(driver)
+    assert driver.find_elements("id", "map") == []
+    assert "RSRP−90 dBm" in text(driver, "modems")
+    assert "Predicted" not in text(driver, "modems")
+    assert text(driver, "rank-words") == "dots measured"
+
+
+def test_two_modems_at_once(driver, fly):
+    flight = fly(("left", "right"), background=made_map())
+    flight.fly(5, modem=0, rank=1)
+    flight.fly(8, modem=1, rank=4)
+    until(driver, "live.state.modems[1]?.rows.columns.t.length === 8")
+    frame(driver)
+    cards = driver.find_elements("css selector", "#modems .card")
+    assert [card.find_element("css selector", ".big").text for card in cards] == ["1", "4"]
+    assert rows(driver, 0) == 5
+    until(driver, "live.poses().length === 5")
+    cards[1].click()
+    until(driver, "live.poses().length === 8")
+    assert cards[1].get_attribute("aria-pressed") == "true"
+
+
+def test_alarms_are_shown_kept_and_heard(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(3)
+    flight.status()
+    until(driver, "live.state.modems[0].now.disk_free_bytes")
+    assert text(driver, "alarms") == ""
+    flight.record(kind="gap", state="open", reason="hung up")
+    until(driver, "document.getElementById('alarms').textContent.includes('no modem: hung up')")
+    assert driver.execute_script("return live.state.beeps") == 0  # nobody asked for sound
+    assert text(driver, "state") == "no modem"
+    driver.find_element("id", "sound").click()
+    assert text(driver, "sound") == "Sound on"
+    beeps = driver.execute_script("return live.state.beeps")
+    flight.record(kind="gap", state="closed", reason="hung up")
+    until(driver, "document.getElementById('alarms').textContent === ''")
+    flight.status(disk_free_bytes=2**20, message="the disk fills")
+    until(driver, "document.getElementById('alarms').textContent.includes('200 MiB')")
+    until(driver, f"live.state.beeps === {beeps + 1}")
+    flight.status(disk_free_bytes=50 * 2**30)
+    flight.fly(1)
+    flight.record(kind="clock", step_ns=2 * SECOND)
+    until(driver, "document.getElementById('alarms').textContent.includes('stepped by +2.000 s')")
+    flight.fly(1)
+    flight.now_ns += 12 * SECOND
+    until(driver, "document.getElementById('alarms').textContent.includes('no rank for more than 3 s')")
+    until(driver, "document.getElementById('alarms').textContent.includes('no position for more than 5 s')")
+    history = [row.text for row in driver.find_elements("css selector", "#history tr")]
+    for words in ("hung up", "200 MiB", "the disk fills", "stepped", "no rank", "no position"):
+        assert sum(words in line for line in history) == 1, history
+    driver.refresh()  # the history is the tap's, not the browser's
+    until(driver, "window.live && document.querySelectorAll('#history tr').length === 6")
+
+
+def test_it_comes_back_by_itself_and_refills(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(6)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    driver.execute_script("live.drop()")  # the connection is gone
+    flight.fly(7)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 13")
+    times = driver.execute_script("return live.state.modems[0].rows.columns.t")
+    assert np.allclose(np.diff(times), 500.0, atol=1.0)  # none missing, none twice
+    until(driver, "live.poses().length === 13")
+
+
+def test_a_tap_that_is_started_anew_goes_on_in_the_same_page(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(6)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    port = flight.server.address.port
+    driver.execute_script("window.same = true")
+    flight.server.close(wait_s=0.1)
+    until(driver, "document.getElementById('state').textContent === 'no connection to the tap'")
+    again = Flight(background=made_map(), port=port)
+    again.now_ns = again.start_ns = again.feed.start_ns = flight.now_ns + 20 * SECOND
+    with again.server:
+        again.fly(4)
+        until(driver, "live.state.modems[0].rows.columns.rank.filter(Number.isFinite).length === 10")
+        assert driver.execute_script("return window.same")
+        driver.get("about:blank")
+
+
+def test_the_end_is_said_and_the_report_offered(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(5)
+    flight.record(kind="end", reason="SIGINT")
+    flight.feed.end({"text": "The tap ended at 10:00:00 UTC (SIGINT).", "replay": False,
+                     "commands": ["aerpaw-cmp ingest log --draft flight.yaml", "aerpaw-cmp report flight.yaml"]})  # fmt: skip
+    until(driver, "!document.getElementById('ended').hidden")
+    assert text(driver, "state") == "ended"
+    assert not driver.find_element("id", "commands").is_displayed()
+    driver.find_element("id", "show-report").click()
+    assert driver.find_element("id", "commands").text.endswith("aerpaw-cmp report flight.yaml")
+    assert text(driver, "alarms") == ""
+
+
+def test_themes_widths_and_keyboard(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(30)
+    flight.status(message="a message")
+    until(driver, "live.poses().length === 30")
+    papers = []
+    for _ in range(2):
+        driver.execute_script("document.getElementById('theme').click()")
+        papers.append(pixel(driver, "chart-rank", 1, 1)[:3])
+        assert serious_findings(driver) == {}
+    assert sorted(map(sum, papers))[0] < 100 < 700 < sorted(map(sum, papers))[1]
+    chosen = driver.execute_script("return document.documentElement.dataset.theme")
+    driver.refresh()
+    until(driver, "window.live")
+    assert driver.execute_script("return document.documentElement.dataset.theme") == chosen
+    for width in (1440, 768, 390):
+        page, rights = extents(driver, width, "canvas, button, select, section")
+        assert page <= width
+        assert max(rights) <= width
+    set_scheme(driver)
+
+
+def test_nothing_is_asked_of_another_place(driver, fly):
+    import json
+
+    driver.get_log("performance")
+    flight = fly(background=made_map())
+    flight.fly(3)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 3")
+    messages = [json.loads(entry["message"])["message"] for entry in driver.get_log("performance")]
+    asked = {m["params"]["request"]["url"].partition("?")[0] for m in messages if m["method"] == "Network.requestWillBeSent"}
+    own = flight.server.urls[0]
+    assert {url for url in asked if not url.startswith(("data:", "about:", "chrome:"))} == {own, own + "events"}
+
+
+def test_from_the_answer_to_the_screen(driver, modem, tap):
+    """The whole way with a real tap: rows on the screen are those of the log, and fresh."""
+    sim, feed = modem(), Feed(["modem"])
+    with WebServer(feed, Page(*live_page(None, "t")), Address("127.0.0.1", 0)) as server:
+        driver.get(server.urls[0])
+        session = tap(sim.port, options={"watch": lambda item: feed.put(0, item)}, ri_hz=10.0)
+        until(driver, "live.state.modems[0]?.rows.columns.t.length > 30")
+        delays = []
+        for _ in range(20):
+            delays.append(driver.execute_script("return live.state.delay"))
+            time.sleep(0.1)
+        session.end()
+        driver.get("about:blank")
+    assert math.isfinite(max(delays))
+
+
+def test_the_demo_of_the_readme(driver, tmp_path):
+    """The commands a reader types: modem-sim, tap --web, Ctrl-C; then the log played to the page."""
+    environment = os.environ | {"PYTHONPATH": f"{ROOT}{os.pathsep}{ROOT / 'parsers'}"}
+
+    def run(*arguments):
+        command = [sys.executable, "-m", "aerpaw_cmp", *map(str, arguments)]
+        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT)
+
+    def page_of(process):
+        line = ""
+        while "the page: " not in line:
+            line = process.stderr.readline()
+            assert line, process.communicate()
+        return line.split()[2]
+
+    flight, telemetry, log = "sample_logs/flight.yaml", tmp_path / "vehicleOut.txt", tmp_path / "taplog"
+    sim = run("modem-sim", "--link", tmp_path / "modem", "--flight", flight, "--telemetry", telemetry)
+    try:
+        sim.stdout.readline()
+        tapped = run("tap", tmp_path / "modem", "-o", log, "--flight", flight, "--telemetry", telemetry, "--web", "127.0.0.1:0", "--no-status")
+        driver.get(page_of(tapped))
+        until(driver, "live.poses().length > 8 && live.state.modems[0].predictions.columns.predicted.some(v => v > 0)", 40)
+        assert not driver.find_element("id", "ended").is_displayed()
+        tapped.send_signal(signal.SIGINT)
+        out, err = tapped.communicate(timeout=20)
+        assert tapped.returncode == 0, err
+        until(driver, "!document.getElementById('ended').hidden")
+        assert "SIGINT" in text(driver, "ended-text")
+        assert f"aerpaw-cmp ingest {log} {telemetry} --timezone America/New_York --draft flight.yaml" in text(driver, "commands")
+        assert [path.suffix for path in log.iterdir()] == [".jsonl"]
+        shown = run("tap", "--play", log, "--speed", "50", "--web", "127.0.0.1:0", "--flight", flight)
+        driver.get(page_of(shown))
+        until(driver, "document.getElementById('state').textContent === 'log at its end'", 40)
+        assert driver.execute_script("return live.poses().length") > 8
+        shown.send_signal(signal.SIGINT)
+        shown.communicate(timeout=20)
+        assert shown.returncode == 0
+    finally:
+        sim.send_signal(signal.SIGINT)
+        sim.communicate(timeout=20)
+        driver.get("about:blank")

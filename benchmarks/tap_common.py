@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import platform
+import socket
 import subprocess
 import sys
 from collections.abc import Iterable
@@ -40,9 +41,18 @@ if capture := values.pop("capture", None):  # a copy of what the kernel gives, a
         return data
 
     SerialPort.__init__, SerialPort.read = begin, copied
+watch = None
+if web := values.pop("web", None):  # a page at this port; no limit on new connections, which a fuzz run would meet
+    from aerpaw_cmp.live.feed import Feed
+    from aerpaw_cmp.live.web import Address, Limits, Page, WebServer
+    from aerpaw_cmp.report.live_page import live_page
+    feed = Feed(["modem"])
+    WebServer(feed, Page(*live_page(None, "benchmark")), Address("127.0.0.1", web),
+              limits=Limits(per_second=1e6, burst=1e6)).__enter__()
+    watch = lambda item: feed.put(0, item)
 try:
     summary = run_tap(TapSettings(folder=Path(values.pop("folder")), log=log, **values),
-                      on_status=(lambda status: None) if show else None)
+                      on_status=(lambda status: None) if show else None, watch=watch)
 except AerpawCmpError as error:
     print(error, file=sys.stderr)
     sys.exit(error.exit_code)
@@ -64,6 +74,56 @@ def start_tap(port: Path, folder: Path, **settings: Any) -> subprocess.Popen[str
         text=True,
         env=environment,
     )
+
+
+BROWSER = """
+import base64, json, signal, socket, struct, sys, time
+port, rows, holes, delays, connections, cursor, ended = int(sys.argv[1]), 0, 0, [], 0, "", []
+signal.signal(signal.SIGTERM, lambda *_: ended.append(1))
+while not ended:
+    try:
+        with socket.create_connection(("127.0.0.1", port), 2) as link:
+            link.settimeout(1.5)
+            link.sendall(f"GET /events?from={cursor} HTTP/1.1\\r\\nHost: 127.0.0.1\\r\\n\\r\\n".encode())
+            connections += 1
+            for line in link.makefile("r"):
+                if line.startswith("id: "):
+                    cursor = line[4:].strip()
+                elif line.startswith("data: "):
+                    message = json.loads(line[6:])
+                    first, data = message["modems"][0]["rows"]
+                    values = struct.iter_unpack("<4f", base64.b64decode(data))
+                    times = [message["start_ms"] / 1e3 + value[0] for value in values]
+                    holes += first != rows
+                    rows = first + len(times)
+                    delays += [time.time() - times[-1]] if len(times) else []
+                if ended:
+                    break
+    except OSError:
+        time.sleep(0.2)
+delays.sort()
+print(json.dumps({"rows": rows, "holes": holes, "connections": connections,
+                  "median_s": delays[len(delays) // 2] if delays else None,
+                  "p99_s": delays[int(0.99 * (len(delays) - 1))] if delays else None}))
+"""
+
+
+def start_browser(port: int) -> subprocess.Popen[str]:
+    """A reader of the page's events in its own process; SIGTERM makes it print what it got."""
+    return subprocess.Popen([sys.executable, "-c", BROWSER, str(port)], stdout=subprocess.PIPE, text=True)
+
+
+def free_port() -> int:
+    """A port that nobody has."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def cpu_s(pid: int) -> float:
+    """User and system time of a process and its threads so far [s]."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def read_lines(journal: Iterable[Any]) -> list[tuple[str, tuple[str, ...]]]:

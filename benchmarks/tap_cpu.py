@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import signal
 import sys
 import tempfile
@@ -12,15 +11,9 @@ import time
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from tap_common import conditions, show, start_tap
+from tap_common import conditions, cpu_s, show, start_tap
 
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
-
-
-def cpu_s(pid: int) -> float:
-    """User and system time of a process and its threads so far [s]."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
-    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
 def measure(seconds: float, folder: Path) -> dict[str, object]:

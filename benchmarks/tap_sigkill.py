@@ -7,6 +7,7 @@ than "acknowledged more than one second before".
 from __future__ import annotations
 
 import argparse
+import json
 import random
 import sys
 import tempfile
@@ -15,19 +16,21 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parent))
-from tap_common import conditions, read_lines, show, start_tap
+from tap_common import conditions, free_port, read_lines, show, start_browser, start_tap
 
 from aerpaw_cmp.live.log import BadLine, read_log
 from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 
 
-def one_kill(number: int, seed: int, folder: Path) -> dict[str, int]:
+def one_kill(number: int, seed: int, folder: Path, web: bool = False) -> dict[str, int]:
     """One tap, killed; what it had acknowledged against what is on disk."""
     chance = random.Random(f"{seed}/{number}")
     link, log = folder / f"modem{number}", folder / f"log{number}"
     settings = ModemSimSettings(link=link, faults=Faults(latency_s=0.001, jitter_s=0.01, seed=number))
     with ModemSimulator(settings) as modem:
-        process = start_tap(link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, log={"segment_bytes": 20_000})
+        port = free_port() if web else None
+        browser = start_browser(port) if port else None
+        process = start_tap(link, log, ri_hz=40.0, other_hz=10.0, pause_s=0.0, log={"segment_bytes": 20_000}, web=port)
         until = time.monotonic() + 60
         while not modem.journal:  # the moment counts from the first answer, so that each kill hits a running tap
             if process.poll() is not None or time.monotonic() > until:
@@ -36,6 +39,10 @@ def one_kill(number: int, seed: int, folder: Path) -> dict[str, int]:
         time.sleep(chance.uniform(0.0, 2.0))
         process.kill()
         process.communicate()
+        shown = 0
+        if browser is not None:
+            browser.terminate()
+            shown = json.loads(browser.communicate()[0])["rows"]
         read = read_lines(modem.journal)
     bad: list[BadLine] = []
     logged = []
@@ -52,6 +59,7 @@ def one_kill(number: int, seed: int, folder: Path) -> dict[str, int]:
         "torn_tails": sum(line.torn_tail for line in bad),
         "corrupt": sum(not line.torn_tail for line in bad),
         "worst_torn": len(bad),
+        "answers_shown": shown,
     }
 
 
@@ -61,13 +69,14 @@ def main() -> None:
     parser.add_argument("--kills", type=int, default=1000)
     parser.add_argument("--parallel", type=int, default=8)
     parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--web", action="store_true", help="with the page open in a browser's stead")
     parser.add_argument("--quick", action="store_true", help="20 kills")
     parser.add_argument("--json", action="store_true")
     arguments = parser.parse_args()
     kills = 20 if arguments.quick else arguments.kills
     start = time.monotonic()
     with tempfile.TemporaryDirectory() as folder, ThreadPoolExecutor(arguments.parallel) as pool:
-        results = list(pool.map(lambda i: one_kill(i, arguments.seed, Path(folder)), range(kills)))
+        results = list(pool.map(lambda i: one_kill(i, arguments.seed, Path(folder), arguments.web), range(kills)))
     total = {key: sum(result[key] for result in results) for key in results[0]}
     total["worst_torn"] = max(result["worst_torn"] for result in results)
     show({"kills": kills, **total, "seconds": round(time.monotonic() - start, 1), **conditions()}, arguments.json)

@@ -73,9 +73,7 @@ def tap(
         Optional[Literal["csv"]],  # noqa: UP045
         typer.Option(help="Write the log below OUT as a table and end."),
     ] = None,
-    flight: Annotated[
-        Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")
-    ] = None,
+    flight: Annotated[Path | None, typer.Option(help="flight.yaml: also predict rank and level by the replay.")] = None,
     telemetry: Annotated[Path | None, typer.Option(help="The growing vehicleOut file that --flight follows.")] = None,
     force: Force = False,
     as_json: Json = False,

@@ -34,12 +34,11 @@ DEMO_OFFSET_DB = -38.0
 DEMO_FADING_DB = 2.5
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True, slots=True, kw_only=True)
 class LiveTwin:
     """A flight file ready to predict: where each pose leads, and at which of its K."""
 
     settings: FlightFile
-    folder: Path
     site: Site
     link: Link
     telemetry: Path
@@ -60,7 +59,13 @@ class LiveTwin:
         site = choose_site(settings.site, flight.parent)
         link = settings.link.rank.build([settings.rank.tower], flight.parent)
         k = sorted(settings.rank.k)[len(settings.rank.k) // 2]
-        return cls(settings, flight.parent, site, link, telemetry or flight.parent / _telemetry_log(settings).path, k)
+        return cls(
+            settings=settings,
+            site=site,
+            link=link,
+            telemetry=telemetry or flight.parent / _telemetry_log(settings).path,
+            k=k,
+        )
 
     def predictor(self) -> Predict:
         """``predict`` for one modem; it reads the telemetry log on its own."""

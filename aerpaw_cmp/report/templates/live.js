@@ -110,7 +110,7 @@
   function share([inside, given]) { return given ? `${number(100 * inside / given, 0)} % of ${given}` : "none yet"; }
   function mark(element, value, low, high) {
     const judged = Number.isFinite(value) && Number.isFinite(low);
-    if (judged) element.append(make("small", value >= low && value <= high ? "inside" : "outside", value >= low && value <= high ? "inside 90 %" : "outside 90 %"));
+    if (judged) element.append(make("small", value >= low && value <= high ? "inside" : "outside", value >= low && value <= high ? "inside" : "outside"));
   }
 
   function make(tag, className, text = "") { const e = document.createElement(tag); e.className = className; e.textContent = text; return e; }
@@ -131,7 +131,7 @@
       big.setAttribute("aria-label", now.rank ? `measured rank ${now.rank}` : "no rank");
       const rows = [["RSRP", number(now.rsrp_dbm ?? NaN, 0, "dBm")], ["SINR", number(now.sinr_db ?? NaN, 0, "dB")], ["Answers", `${number(now.rate_hz, 1)} Hz`], ["Gaps", String(now.gaps)], ["Records", String(now.records)]];
       if (now.disk_free_bytes !== null) rows.push(["Disk left", now.disk_free_bytes > 2 ** 30 ? number(now.disk_free_bytes / 2 ** 30, 1, "GiB") : number(now.disk_free_bytes / 2 ** 20, 0, "MiB")]);
-      if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : whole(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}–${c.high[k]})` : "")],
+      if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : whole(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],
         ["Residual, RSRP", k < 0 ? "–" : number(c.rsrp[k] - c.level[k], 1, "dB")]);
       cells(facts, rows);
       if (now.predicts && k >= 0) { mark(facts.children[0].lastChild, c.rank[k], c.low[k], c.high[k]); mark(facts.children[1].lastChild, c.rsrp[k], c.levelLow[k], c.levelHigh[k]); }
@@ -211,7 +211,7 @@
     if (!canvas || !canvas.clientWidth) return;
     const [low, high] = range(), [pen, w, h] = common.frame(canvas);
     const seconds = (high - low) / 1000, step = [1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200].find(s => seconds / s <= Math.max(2, w / 110)) ?? 14400, marks = [];
-    for (let t = Math.ceil(low / 1000 / step) * step * 1000; t <= high; t += step * 1000) marks.push(t);
+    for (let t = Math.ceil(low / 1000 / step) * step * 1000; t <= high - 0.04 * (high - low); t += step * 1000) marks.push(t); // no label is cut at the edge
     const g = common.axes(pen, w, h + 16, { low, high, label: "", marks, words: t => clock(t) }, y, 52);
     scales.set(id, { g, low, high });
     pen.save(); pen.beginPath(); pen.rect(g.left, g.top - 4, g.right - g.left, g.bottom - g.top + 8); pen.clip();

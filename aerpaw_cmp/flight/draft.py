@@ -6,6 +6,7 @@ import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from math import ceil, floor
 from pathlib import Path
 from typing import Any
 
@@ -16,10 +17,19 @@ from ..common.errors import UsageError, one_line
 from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream, has_wall_clock
+from ..site.siteyaml import load_site
 from .data import is_ratio
 from .grouping import flights
 from .heights import height_in_name, lacks_height
-from .settings import FlightFile, LogSettings
+from .node import (
+    CARRIER_HZ,
+    LOCK_FLOOR_DB,
+    POWER_DBM,
+    Placer,
+    listed_places,
+    may_lose_lock,
+)
+from .settings import FlightFile, LogSettings, RssSettings
 from .time_origin import Origin, origin_of
 
 _TOWER = re.compile(r"(?<![a-z0-9])lw[-_ ]?([1-5])(?![0-9])", re.IGNORECASE)
@@ -28,10 +38,10 @@ _RADIO = re.compile(r"usrp-?([0-9]+)", re.IGNORECASE)
 HEAD = """\
 # A first draft for these logs, made by 'aerpaw-cmp ingest --draft'. Check every line with a question mark.
 """
-LINK = """\
-link:
-  rss: {carrier_hz: 3.3e9, transmit_power_dbm: 40, uav_transmits: true}  # as in your experiment?
-"""
+LINK = (
+    f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true}}"
+    "  # as in your experiment?\n"
+)
 NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
 LATER = "report: {audit: later}  # 'aerpaw-cmp audit' then fills in what costs more than so short a report\n"
@@ -39,6 +49,8 @@ LATER = "report: {audit: later}  # 'aerpaw-cmp audit' then fills in what costs m
 AUDIT_NOW_FROM = 50_000
 """With so many samples a report costs more than its audit, which does not grow with the flight."""
 
+
+SITE = "lake_wheeler"
 
 Span = tuple[np.datetime64, np.datetime64]
 
@@ -75,7 +87,10 @@ def draft(
         If no log has what a flight needs.
     """
     flown = _flown(files)
-    entries = _Entries(folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}))
+    entries = _Entries(
+        folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}),
+        placer=_placer(files, flown), locks=may_lose_lock(s for file in files for s in file.result.streams),
+    )  # fmt: skip
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
         entries.enter(file)
     entries.sort(files)
@@ -84,7 +99,12 @@ def draft(
             "no log of RSS or rank for a flight" + "".join(f"; {remark}" for remark in entries.out),
             expected="telemetry and levels or ranks of one flight",
         )
-    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", "site: lake_wheeler  # or your own site.yaml?\n"]
+    parts = [HEAD, f"flight: {_name(entries.flown, files)}\n", f"site: {SITE}  # or your own site.yaml?\n"]
+    if entries.towers:
+        parts += [
+            "towers:\n",
+            *(f"  {name}: {_plain(tower)}  # {about}\n" for name, (tower, about) in entries.towers.items()),
+        ]
     if timezone:
         parts.append(f"timezone: {timezone}\n")
     parts += ["logs:\n", *entries.lines.values()]
@@ -166,7 +186,7 @@ def drafts(
     return made
 
 
-MINIMUM_HEIGHT_M = 5.0
+MINIMUM_HEIGHT_M = 5
 """Samples below it are take-off, landing and waiting: at 2 m an airframe, its pilot and the grass decide the level."""
 
 FLOWN_ABOVE_M = 15.0
@@ -184,12 +204,40 @@ def _settings(entries: _Entries) -> list[str]:
         lines.append("rt: {attitude: logged}\n")
     else:
         lines.append("rt: {attitude: level}  # no attitude in the telemetry: the nose points along the track?\n")
+    low: dict[str, Any] = {}
     if float(np.nanmax(frame["altitude_m"].to_numpy(np.float64), initial=-np.inf)) > FLOWN_ABOVE_M:
-        low = f"{{minimum_height_m: {MINIMUM_HEIGHT_M:g}}}"
-        lines += [
-            f"{kind}: {low}  # without take-off and landing\n" for kind in ("rss", "rank") if kind in entries.kinds
-        ]
+        low = {"minimum_height_m": MINIMUM_HEIGHT_M}
+    for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
+        span = _span_of_offsets(entries.offsets_db) if kind == "rss" else {}
+        reasons = ["without take-off and landing"] if low else []
+        reasons += ["the levels lie outside the usual span of offsets"] if span else []
+        if low or span:
+            lines.append(f"{kind}: {_plain(low | span)}  # {'; '.join(reasons)}\n")
     return lines
+
+
+_MARGIN_DB = 20.0
+"""Of the searched offsets about those that free space expects."""
+
+
+def _span_of_offsets(offsets_db: Sequence[float]) -> dict[str, Any]:
+    """``span_db`` where the usual one would end near an expected offset."""
+    usual = RssSettings().span_db
+    if not offsets_db:
+        return {}
+    low, high = min(offsets_db) - _MARGIN_DB, max(offsets_db) + _MARGIN_DB
+    if usual[0] <= low and high <= usual[1]:
+        return {}
+    return {"span_db": [10 * floor(low / 10.0), 10 * ceil(high / 10.0)]}
+
+
+def _placer(files: Sequence[IngestedFile], flown: tuple[Stream, Span] | None) -> Placer | None:
+    """Proposals for nodes, where there is a track at the site."""
+    if flown is None or lacks_height(flown[0]):
+        return None
+    listed = listed_places(Path(file.path).resolve().parent for file in files)
+    placer = Placer(load_site(SITE), flown[0], listed)
+    return placer if placer.at_site else None
 
 
 def _has_attitude(frame: Any) -> bool:
@@ -238,6 +286,13 @@ class _Entries:
     """Path by SHA-256."""
     samples: int = 0
     """Of RSS and rank, in all logs."""
+    placer: Placer | None = None
+    locks: bool = False
+    """The receiver is a sounder that loses its lock."""
+    towers: dict[str, tuple[Mapping[str, Any], str]] = field(default_factory=dict)
+    """Nodes that the site does not have, and the question about each."""
+    offsets_db: list[float] = field(default_factory=list)
+    """Expected of each level."""
 
     @property
     def _track(self) -> Stream | None:
@@ -268,6 +323,8 @@ class _Entries:
         streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
         entry, asked = _entry(file, path)
         origin = None if self.time_origin else self._origin(streams)
+        if asked and self.placer is not None:
+            asked = self._place(entry, asked, [s for s in streams if s.kind == "rss" and not is_ratio(s)], self.placer)
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
@@ -304,9 +361,42 @@ class _Entries:
         if any(is_ratio(s) for s in kept):
             asked = _also(asked, "a ratio to the noise as a level?")
         self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
+        if self.placer is not None:
+            self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
         self.kinds |= {s.kind for s in kept}
         self.samples += sum(len(s.frame) for s in kept if s.kind in ("rss", "rank"))
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
+
+    def _place(self, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer) -> str:
+        """Fill in the nodes that the levels fit; gives what is left to ask."""
+        places = {}
+        for pci in entry.get("cells", [None]):
+            level = next((s for s in levels if s.attributes.get("pci") == pci), None)
+            if level is not None:
+                places[pci] = placer.propose(placer.levels(level, self._floor_db(level)))
+        for pci, place in places.items():
+            if place is None:
+                continue
+            if place.tower is not None:
+                self.towers[place.node] = place.tower, place.question
+            if pci is None:
+                entry["node"] = place.node
+                return f"  # {place.question}" if place.tower is None and place.question else ""
+            entry["cells"][pci] = place.node
+        return asked
+
+    def _floor_db(self, level: Stream) -> float:
+        if self.locks and level.attributes.get("unit") == "dB re full scale":
+            return LOCK_FLOOR_DB
+        floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
+        return -np.inf if floor is None else floor
+
+    def _offset_db(self, level: Stream, entry: Mapping[str, Any], placer: Placer) -> float | None:
+        if level.kind != "rss" or is_ratio(level):
+            return None
+        home = entry.get("cells", {}).get(level.attributes.get("pci"))
+        node = home or entry.get("node") or level.attributes.get("node")
+        return placer.offset_db(placer.levels(level, self._floor_db(level)), str(node))
 
     def _origin(self, streams: Sequence[Stream]) -> Origin | None:
         """Origin of relative times whose positions lie on the track of the flight."""
@@ -323,10 +413,13 @@ class _Entries:
         ``dated`` says that relative times have an origin now.
         """
         refused = {}
+        leading = _leading(streams)
         for stream in sorted(streams, key=_missing):
             span = _span(stream)
             if span is None:
                 refused[stream.name] = "no samples"
+            elif stream.name in leading:
+                refused[stream.name] = f"of the same receiver and cell as {leading[stream.name]}, which is compared"
             elif reason := self._reason(stream, span, dated=dated):
                 refused[stream.name] = reason
             elif stream.kind != "telemetry":
@@ -366,6 +459,21 @@ def _late(span: Span, flown: Span) -> str:
 def _missing(stream: Stream) -> int:
     """Of two ranks of one modem, the one that was reported more often is taken: NR or LTE."""
     return int(stream.frame["rank"].isna().sum()) if stream.kind == "rank" else 0
+
+
+def _leading(streams: Sequence[Stream]) -> dict[str, str]:
+    """Streams that tell again what the RSRP of their receiver and cell tells, and the name of that RSRP."""
+    leaders: dict[object, str] = {}
+    same = {}
+    for stream in sorted(streams, key=lambda s: s.attributes.get("quantity") != "RSRP"):
+        if stream.kind != "rss" or "quantity" not in stream.attributes:
+            continue
+        cell = tuple(stream.attributes.get(key) for key in ("node", "rat", "pci", "arfcn"))
+        if stream.attributes["quantity"] == "RSRP" and cell not in leaders:
+            leaders[cell] = stream.name
+        elif cell in leaders and not is_ratio(stream):
+            same[stream.name] = leaders[cell]
+    return same
 
 
 def _key(stream: Stream, entry: Mapping[str, Any]) -> tuple[str, ...]:
@@ -459,6 +567,11 @@ def _entry(file: IngestedFile, path: str) -> tuple[dict[str, Any], str]:
 def _also(asked: str, question: str) -> str:
     """The comment behind a line of ``logs:`` with one more question."""
     return f"{asked} {question}" if asked else f"  # {question}"
+
+
+def _plain(entry: Mapping[str, Any]) -> str:
+    """A mapping of plain names on one line."""
+    return str(yaml.safe_dump(dict(entry), default_flow_style=True, sort_keys=False, width=10_000)).strip()
 
 
 def _flow(entry: dict[str, Any]) -> str:

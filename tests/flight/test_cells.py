@@ -10,9 +10,10 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.draft import draft
-from aerpaw_cmp.flight.settings import load_flight
+from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs.compare_flight import serving_of
 from aerpaw_cmp.jobs.flight_run import run_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -20,6 +21,7 @@ from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.report import figures
 from aerpaw_cmp.report.build import report_data
 from aerpaw_cmp.report.serving_figures import shown_confusion
+from aerpaw_cmp.site.siteyaml import load_site
 
 SAMPLE = Path(__file__).parents[2] / "sample_logs"
 ZONE = "America/New_York"
@@ -72,7 +74,10 @@ def test_cells_go_to_the_towers_that_the_flight_file_names(phone: Path) -> None:
 def test_a_draft_asks_which_tower_has_which_cell(phone: Path) -> None:
     files = ingest(phone, options=ReadOptions(timezone=ZONE))
     text, remarks = draft(files, phone, timezone=ZONE)
-    assert "cells: {1: LW1, 2: LW1, 7: LW1}}  # which tower has which PCI?" in text
+    settings = parse_yaml(text, FlightFile)
+    (cells,) = (log.cells for log in settings.logs if log.cells)
+    assert set(cells) == {1, 2, 7}
+    assert set(cells.values()) <= {*load_site("lake_wheeler").towers, *settings.towers}
     assert any("which PCI?" in remark for remark in remarks)
 
 

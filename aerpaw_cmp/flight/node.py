@@ -1,0 +1,184 @@
+"""Which tower, or which place, the levels of a log fit: proposals for a draft."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..compare.locate import FEWEST, LevelTrack, level_track, locate
+from ..logs.records import Stream
+from ..propagation.baselines import free_space_dbm
+from ..site.site import Site
+from .scored import unscored
+from .track import Track
+
+TOWER_ODDS = 2.0
+"""Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0."""
+
+UNDECIDED = 3.0
+"""Places of a list whose log odds differ by less are both named."""
+
+CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
+"""Of the link that a draft proposes."""
+
+LOCK_QUALITY_DB, LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
+"""Quality [dB] of AERPAW's sounder at perfect lock (the peak of its 4095 chips), and below which it has lost it."""
+
+LOCK_FLOOR_DB = -15.0
+"""Level [dB re full scale] below which that receiver has lost its lock."""
+
+LOW_M = 5.0
+"""Below it an airframe on the ground decides the level."""
+
+NEAR_M = 5000.0
+"""A place of a list that is farther from the track is not of this flight."""
+
+
+def may_lose_lock(streams: Iterable[Stream]) -> bool:
+    """Whether one of the streams is the lock quality of AERPAW's sounder: where locked, it stays near its peak."""
+    for stream in streams:
+        if stream.kind == "rss" and stream.name == "quality":
+            quality = stream.frame["rss_db"].to_numpy(np.float64)
+            locked = quality[quality > LOST_QUALITY_DB]
+            if len(locked) and abs(float(np.median(locked)) - LOCK_QUALITY_DB) < 3.0:
+                return True
+    return False
+
+
+@dataclass(frozen=True, slots=True)
+class ListedPlace:
+    """A place of a position list: file name, line, latitude and longitude [deg]."""
+
+    file: str
+    line: int
+    latitude_deg: float
+    longitude_deg: float
+
+
+_PAIR = re.compile(r"\s*(-?\d{1,3}\.\d{3,})\s*[,;\s]\s*(-?\d{1,3}\.\d{3,})\s*")
+_MOST_BYTES = 20_000
+
+
+def listed_places(folders: Iterable[Path]) -> list[ListedPlace]:
+    """Places that position lists in some folders name: text files with ``position`` in the name, a pair a line."""
+    places = []
+    for folder in sorted(set(folders)):
+        for path in sorted(folder.glob("*[Pp]osition*")):
+            if path.suffix not in (".txt", ".csv", "") or not path.is_file() or path.stat().st_size > _MOST_BYTES:
+                continue
+            for number, line in enumerate(path.read_text(encoding="utf-8", errors="replace").splitlines(), 1):
+                if (pair := _PAIR.fullmatch(line)) is not None:
+                    places.append(ListedPlace(path.name, number, float(pair[1]), float(pair[2])))
+    return places
+
+
+@dataclass(frozen=True, slots=True)
+class Placement:
+    """A proposal for ``node`` of a log.
+
+    Parameters
+    ----------
+    node : str
+    tower : mapping or None
+        Entry of ``towers`` in flight.yaml, where the site has no such tower.
+    question : str
+        About the proposal.
+    """
+
+    node: str
+    tower: Mapping[str, Any] | None
+    question: str
+
+
+@dataclass
+class Placer:
+    """Proposals for the logs of one flight."""
+
+    site: Site
+    telemetry: Stream
+    listed: Sequence[ListedPlace] = ()
+    nodes: dict[str, FloatArray] = field(default_factory=dict)
+    """Proposed so far: east and north."""
+
+    def __post_init__(self) -> None:
+        frame = self.telemetry.frame[~unscored(self.telemetry.frame)]
+        self.track = Track(frame, self.site.frame, ground_m=self.site.datum.takeoff_ground_m)
+
+    @property
+    def at_site(self) -> bool:
+        """Whether the flight was flown near a tower of the site."""
+        return any(self._near(tower.latitude_deg, tower.longitude_deg) for tower in self.site.towers.values())
+
+    def levels(self, stream: Stream, floor_db: float = -np.inf) -> LevelTrack:
+        """Levels of a log where the UAV flew."""
+        frame = stream.frame[~unscored(stream.frame)]
+        poses = self.track.pose_at(frame["time"])
+        place = np.where((poses.position_m[:, 2] > self.track.ground_m + LOW_M)[:, None], poses.position_m, np.nan)
+        time = frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9
+        level = frame["rss_db"].to_numpy(np.float64)
+        heard = frame["flag"].astype(str).str.contains("out_of_coverage").to_numpy()
+        level = np.where(np.isnan(level) & heard & np.isfinite(floor_db), floor_db, level)
+        return level_track(time, place, level, floor_db=floor_db)
+
+    def propose(self, track: LevelTrack) -> Placement | None:
+        """Tower, listed place or estimated place that the levels fit; None where they are too few."""
+        if len(track.level_db) < FEWEST:
+            return None
+        towers = list(self.site.towers.values())
+        listed = [place for place in self.listed if self._near(place.latitude_deg, place.longitude_deg)]
+        at = [np.asarray(tower.position_m) for tower in towers] + [self._local(place) for place in listed]
+        estimate = locate(track, np.array(at))
+        odds_tower, odds_listed = estimate.log_odds[: len(towers)], estimate.log_odds[len(towers) :]
+        if len(listed) and odds_listed.max() >= max(TOWER_ODDS, odds_tower.max()):
+            order = np.argsort(-odds_listed)
+            place, least = listed[order[0]], odds_listed[order[0]] - UNDECIDED
+            others = [listed[i] for i in order[1:] if odds_listed[i] > least]
+            also = "".join(f" or line {other.line}" for other in others)
+            about = f"line {place.line} of {place.file}{also}: is the node there?"
+            return self._node(self._local(place), place.latitude_deg, place.longitude_deg, 1.5, about)
+        best = int(odds_tower.argmax())
+        if odds_tower[best] >= TOWER_ODDS:
+            return Placement(towers[best].name, None, f"the levels fit {towers[best].name} best: is it this tower?")
+        latitude, longitude = self.site.frame.to_geographic(estimate.place_m[:1], estimate.place_m[1:2])
+        about = (
+            f"no tower fits the levels. They fit this place best, 90 % within {estimate.radius90_m:.0f} m, "
+            f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
+        )
+        return self._node(estimate.place_m, float(latitude[0]), float(longitude[0]), float(estimate.place_m[2]), about)
+
+    def offset_db(self, track: LevelTrack, node: str) -> float | None:
+        """Median of free space over the draft's link minus the level [dB]; None for an unknown node."""
+        place = self.nodes.get(node)
+        if node in self.site.towers:
+            place = self.site.towers[node].position_m
+        if place is None or not len(track.level_db):
+            return None
+        free = free_space_dbm(place[None, :], track.position_m, CARRIER_HZ, POWER_DBM)[:, 0]
+        return float(np.median(free - track.level_db))
+
+    def _node(self, place: FloatArray, latitude: float, longitude: float, height: float, about: str) -> Placement:
+        same = [name for name, other in self.nodes.items() if np.hypot(*(other[:2] - place[:2])) < 100.0]
+        name = same[0] if same else "NODE" + (str(len(self.nodes) + 1) if self.nodes else "")
+        tower = {"latitude_deg": round(latitude, 7), "longitude_deg": round(longitude, 7), "antenna_height_m": height}
+        if same:
+            return Placement(name, None, "")
+        self.nodes[name] = place
+        return Placement(name, tower, about)
+
+    def _local(self, place: ListedPlace) -> FloatArray:
+        east, north = self.site.frame.to_local(np.array([place.latitude_deg]), np.array([place.longitude_deg]))
+        return np.array([east[0], north[0], 1.5])
+
+    def _near(self, latitude_deg: float, longitude_deg: float) -> bool:
+        if not len(self.track):
+            return False
+        start = self.track.pose_at(np.array([self.track.start_ns], dtype="datetime64[ns]")).position_m[0]
+        with np.errstate(invalid="ignore"):
+            east, north = self.site.frame.to_local(np.array([latitude_deg]), np.array([longitude_deg]))
+        return bool(np.hypot(east[0] - start[0], north[0] - start[1]) < NEAR_M)

@@ -1,0 +1,48 @@
+"""The surveyed rover of real flights, by their levels alone."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.locate import locate
+from aerpaw_cmp.flight.node import LOCK_FLOOR_DB, ListedPlace, Placer, listed_places
+from aerpaw_cmp.logs.ingest import ingest
+from aerpaw_cmp.logs.readers import ReadOptions
+from aerpaw_cmp.site.siteyaml import load_site
+
+ROOT = Path(os.environ.get("AERPAW_CMP_FIELD_DATA", "/nowhere"))
+pytestmark = [pytest.mark.field, pytest.mark.skipif(not ROOT.is_dir(), reason="AERPAW_CMP_FIELD_DATA is not set")]
+FLIGHTS = ("sounder/*_288_loc_1.mat", "afar/*_300_loc_1.mat", "afar/*_300_loc_2.mat", "afar/*_309_loc_2.mat",
+           "afar/*_328_loc_1.mat", "afar/*_328_loc_3.mat")  # fmt: skip
+
+
+def test_the_rover_is_found_within_its_region() -> None:
+    site = load_site("lake_wheeler")
+    listed = listed_places([ROOT / "sounder"])
+    assert [place.line for place in listed[:3]] == [1, 2, 3]
+    errors, inside, right = [], 0, 0
+    for name in FLIGHTS:
+        (path,) = ROOT.glob(name)
+        (file,) = ingest([path], options=ReadOptions(timezone="America/New_York"))
+        vehicle, power = (next(s for s in file.result.streams if s.name == n) for n in ("vehicle", "power"))
+        placer = Placer(site, vehicle, listed[:3])
+        track = placer.levels(power, LOCK_FLOOR_DB)
+        rover: ListedPlace = listed[int(path.stem[-1]) - 1]
+        east, north = site.frame.to_local(np.array([rover.latitude_deg]), np.array([rover.longitude_deg]))
+        estimate = locate(track)
+        errors.append(float(np.hypot(estimate.place_m[0] - east[0], estimate.place_m[1] - north[0])))
+        inside += np.array([east[0], north[0]]) in estimate
+        proposal = placer.propose(track)
+        assert proposal is not None
+        assert f"line {rover.line}" in proposal.question
+        right += f"line {rover.line} of" in proposal.question
+        proposal = Placer(site, vehicle).propose(track)
+        assert proposal is not None
+        assert proposal.node == "NODE"  # and no tower
+    assert sum(error <= 50.0 for error in errors) >= 5, errors
+    assert inside >= 5
+    assert right >= 5  # the sixth is said to be line 2 or line 3

@@ -202,8 +202,8 @@ def _material(name: str, carrier_hz: float, own_table: bool, scattering: float =
 def _points(values: FloatArray) -> Any:
     import mitsuba as mi
 
-    columns = np.ascontiguousarray(values.T, dtype=np.float32)
-    return mi.Point3f(*(mi.Float(column) for column in columns))
+    # lists: Dr.Jit would use NumPy's memory as it lies, and compile anew for each alignment of it
+    return mi.Point3f(*(mi.Float(column) for column in values.T.astype(np.float32).tolist()))
 
 
 @dataclass(frozen=True, slots=True)

@@ -293,3 +293,26 @@ def test_coefficients_of_links_without_a_path(sionna, scenes):
         usable=scene.usable, excluded=scene.excluded, samples=1000, batch=BATCH,
     )  # fmt: skip
     assert (len(found.paths), found.gain.shape) == (0, (0, 2, 2))
+
+
+def test_a_second_search_compiles_nothing(sionna, scenes, lone):
+    """Dr.Jit bakes the alignment of NumPy's memory into a kernel: positions must not be used as they lie."""
+    import drjit as dr
+
+    site, poses = lone
+    link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
+
+    def compiled():
+        return [
+            kernel
+            for kernel in dr.kernel_history((dr.KernelType.JIT,))
+            if not kernel["cache_hit"] and not kernel["cache_disk"]
+        ]
+
+    with dr.scoped_set_flag(dr.JitFlag.KernelHistory):
+        for shift in range(4):
+            compiled()
+            few = type(poses)(poses.position_m[shift : shift + 5], poses.rotation[shift : shift + 5])
+            replay(site, link, few, "sionna", samples=1000, batch=5, cache_dir="", max_depth=1)
+            big = [kernel for kernel in compiled() if kernel["operation_count"] > 1000]
+            assert not (shift and big), "a search like the one before was compiled anew"

@@ -38,18 +38,19 @@ SPLITS = ("flight_left_out", "altitude_left_out", "heading_left_out", "sector_le
 class Observed:
     """Samples with what a score needs besides: level of free space (n,) [dB], heading of the nose (n,) [deg].
 
-    ``tower_m`` (n, 3): places of a tower that moves [m].
+    ``tower_m`` (n, 3): places of a tower that moves [m]. ``start``: the instant of ``time_s`` 0 (UTC), where known.
     """
 
     samples: LinkSamples
     free_space_db: FloatArray
     heading_deg: FloatArray
     tower_m: FloatArray | None = None
+    start: np.datetime64 | None = None
 
     def part(self, keep: BoolArray | IntArray) -> Observed:
         """Some of the samples."""
         tower = None if self.tower_m is None else self.tower_m[keep]
-        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep], tower)
+        return Observed(self.samples.part(keep), self.free_space_db[keep], self.heading_deg[keep], tower, self.start)
 
 
 @dataclass(frozen=True, slots=True)

@@ -292,7 +292,8 @@ def _observe(data: FlightData, series: RssSeries) -> tuple[Observed, float]:
         residual_db=series.measured_db[keep] - free,
     )
     guessed = float(np.mean(~pose.attitude_known[keep])) if keep.any() else 0.0
-    observed = Observed(samples, free, pose.heading_deg[keep], place if series.tower in data.nodes else None)
+    moving = place if series.tower in data.nodes else None
+    observed = Observed(samples, free, pose.heading_deg[keep], moving, time.min() if len(time) else None)
     return observed.part(order), guessed
 
 

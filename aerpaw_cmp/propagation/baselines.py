@@ -100,3 +100,34 @@ def specular_factor(roughness_m: float, sine_grazing: FloatArray, wavelength_m: 
     """
     phase = 2.0 * np.pi / wavelength_m * roughness_m * np.asarray(sine_grazing, dtype=np.float64)
     return np.asarray(np.exp(-2.0 * phase**2))
+
+
+def tr36777_loss_db(scenario: str, distance_m: FloatArray, height_m: FloatArray, carrier_hz: float) -> FloatArray:
+    """Median path loss (n,) to an aerial terminal in sight of the base station [dB].
+
+    Source: 3GPP TR 36.777 V15.0.0 table B-2.
+
+    Parameters
+    ----------
+    scenario : {"RMa-AV", "UMa-AV"}
+        Rural or urban macro cell.
+    distance_m : (n,)
+        Between the antennas.
+    height_m : (n,)
+        Of the terminal above ground; lower ones count as 10 m (RMa-AV) or 22.5 m (UMa-AV), where the formulas begin.
+    carrier_hz : float
+
+    Returns
+    -------
+    (n,)
+
+    Examples
+    --------
+    >>> tr36777_loss_db("UMa-AV", np.array([100.0, 1000.0]), np.array([50.0, 50.0]), 2e9).round(1).tolist()
+    [78.0, 100.0]
+    """
+    ghz = carrier_hz / 1e9
+    if scenario == "UMa-AV":
+        return np.asarray(28.0 + 22.0 * np.log10(distance_m) + 20.0 * np.log10(ghz))
+    slope = np.maximum(23.9 - 1.8 * np.log10(np.maximum(height_m, 10.0)), 20.0)
+    return np.asarray(slope * np.log10(distance_m) + 20.0 * np.log10(40.0 * np.pi * ghz / 3.0))

@@ -1,0 +1,144 @@
+"""Scores of predictions that somebody hands in, for the public benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.stats import norm
+
+from ..common.units import FloatArray
+from .rss import local_mean_db
+from .statistics import bootstrap_means
+
+BLOCK_S = 20.0
+"""Length of the blocks that are resampled [s]."""
+
+WINDOW_S = 4.0
+"""Averaging window of the second error [s]."""
+
+COVERAGE = 0.9
+"""Nominal share of the interval whose coverage is told."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class LevelSeries:
+    """Measured and predicted levels of one flight, tower and channel, in time order.
+
+    Parameters
+    ----------
+    name : str
+        ``flight tower.channel``.
+    time_s : (n,)
+    measured_db, level_db : (n,)
+        Measured and predicted median [dB].
+    sd_db : (n,), optional
+        Standard deviation of the prediction [dB]; without it nothing of a distribution is scored.
+    own_offset : bool
+        Score after the mean error of the series is removed.
+    """
+
+    name: str
+    time_s: FloatArray
+    measured_db: FloatArray
+    level_db: FloatArray
+    sd_db: FloatArray | None = None
+    own_offset: bool = True
+
+    @property
+    def bias_db(self) -> float:
+        """Mean of measured minus predicted [dB]."""
+        return float(np.mean(self.measured_db - self.level_db))
+
+    @property
+    def error_db(self) -> FloatArray:
+        """Measured minus predicted (n,), less the bias where the series has an offset of its own [dB]."""
+        error = self.measured_db - self.level_db
+        return np.asarray(error - error.mean() if self.own_offset else error)
+
+    @property
+    def block(self) -> int:
+        """Samples in :data:`BLOCK_S`, at least one."""
+        span = float(np.ptp(self.time_s))
+        return max(1, min(len(self.time_s), round(BLOCK_S * (len(self.time_s) - 1) / span))) if span > 0.0 else 1
+
+
+def crps_normal(error_db: FloatArray, sd_db: FloatArray) -> FloatArray:
+    """Continuous ranked probability score (n,) of normal forecasts [dB].
+
+    Source: Gneiting and Raftery (2007), doi:10.1198/016214506000001437, eq. 21.
+
+    Examples
+    --------
+    >>> crps_normal(np.array([0.0]), np.array([1.0])).round(4).tolist()
+    [0.2337]
+    """
+    z = error_db / sd_db
+    return np.asarray(sd_db * (z * (2.0 * norm.cdf(z) - 1.0) + 2.0 * norm.pdf(z) - 1.0 / np.sqrt(np.pi)))
+
+
+def level_scores(series: Sequence[LevelSeries]) -> dict[str, float]:
+    """Scores of one task: the mean over its series, so that a long flight counts no more than a short one.
+
+    Parameters
+    ----------
+    series : sequence of LevelSeries
+        At least one.
+
+    Returns
+    -------
+    dict of str to float
+        ``rmse_db, rmse_4s_db, bias_db`` (mean size of the offsets), ``crps_db, log_score, coverage_90`` (NaN without
+        ``sd_db``), ``n``.
+    """
+    rows = [_series_scores(one) for one in series]
+    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0] if key != "n"} | {
+        "n": float(sum(row["n"] for row in rows))
+    }
+
+
+def _series_scores(one: LevelSeries) -> dict[str, float]:
+    error = one.error_db
+    slow = local_mean_db(one.time_s, one.measured_db, WINDOW_S) - local_mean_db(one.time_s, one.level_db, WINDOW_S)
+    slow = slow - slow.mean() if one.own_offset else slow
+    scores = {
+        "rmse_db": float(np.sqrt(np.mean(error**2))),
+        "rmse_4s_db": float(np.sqrt(np.mean(slow**2))),
+        "bias_db": abs(one.bias_db),
+        "crps_db": np.nan,
+        "log_score": np.nan,
+        "coverage_90": np.nan,
+        "n": float(len(error)),
+    }
+    if one.sd_db is not None:
+        scores["crps_db"] = float(crps_normal(error, one.sd_db).mean())
+        scores["log_score"] = float(-norm.logpdf(error, scale=one.sd_db).mean())
+        scores["coverage_90"] = float(np.mean(np.abs(error) <= norm.ppf(0.5 + COVERAGE / 2) * one.sd_db))
+    return scores
+
+
+def rmse_replicates(series: Sequence[LevelSeries], replicates: int = 2000, seed: int = 20240715) -> FloatArray:
+    """Mean RMSE (replicates,) over series whose blocks of :data:`BLOCK_S` are drawn anew [dB].
+
+    Blocks of one series are the same for every entrant, so differences of replicates are paired.
+    """
+    total = np.zeros(replicates)
+    for number, one in enumerate(series):
+        error = one.error_db
+        drawn = bootstrap_means(
+            np.column_stack([error**2, error]), one.block, replicates=replicates, seed=seed + number
+        )
+        offset = drawn[:, 1] ** 2 if one.own_offset else 0.0
+        total += np.sqrt(np.maximum(drawn[:, 0] - offset, 0.0))
+    return total / len(series)
+
+
+def intervals(
+    series: Sequence[LevelSeries], baselines: Mapping[str, Sequence[LevelSeries]]
+) -> dict[str, tuple[float, float]]:
+    """95 % intervals of the mean RMSE, and of its difference from each baseline [dB]."""
+    own = rmse_replicates(series)
+    spread = {"rmse_ci95_db": own}
+    spread |= {f"difference_to_{name}_ci95_db": own - rmse_replicates(other) for name, other in baselines.items()}
+    return {key: (float(np.quantile(v, 0.025)), float(np.quantile(v, 0.975))) for key, v in spread.items()}

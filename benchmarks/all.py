@@ -110,6 +110,7 @@ SMALLEST: dict[str, list[str]] = {
     "tap_replug": ["--quick"],
     "tap_sigkill": ["--quick"],
     "tap_soak": ["--quick"],
+    "tap_web_soak": ["--quick"],
     "whole_comparison": ["--quick"],
 }
 """How each file of this folder is run by ``--check``; ``{folder}`` is one that is removed afterwards."""

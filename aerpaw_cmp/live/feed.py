@@ -180,11 +180,8 @@ class Feed:
         items = [self._pending.popleft() for _ in range(len(self._pending))]
         with self._changed:
             for number, item in items:
-                if isinstance(item, TapStatus):
-                    self._status(self._modems[number], item)
-                else:
-                    with contextlib.suppress(*_MALFORMED):
-                        self._record(self._modems[number], item)
+                with contextlib.suppress(*_MALFORMED):
+                    self._take(self._modems[number], item)
             if self._look() or items or not self._version:
                 self._bump()
 
@@ -247,6 +244,12 @@ class Feed:
         modem.gaps, modem.missed, modem.predicts = status.gaps, status.missed, status.predicts
         if status.message and status.message not in _alarms_of(modem, self.now()).values():
             self._note(modem, "message", status.message)
+
+    def _take(self, modem: _Modem, item: Record | TapStatus) -> None:
+        if isinstance(item, TapStatus):
+            self._status(modem, item)
+        else:
+            self._record(modem, item)
 
     def _record(self, modem: _Modem, record: Record) -> None:
         if not self._live:
@@ -315,7 +318,7 @@ class Feed:
         elif not self._live:
             modem.gaps += 1
         if not modem.connected:
-            modem.rank = None
+            modem.rank = modem.rsrp_dbm = modem.sinr_db = None  # what was last measured is not what is now
 
     def _take_clock(self, modem: _Modem, record: Record) -> None:
         modem.step_s = self._seconds(modem, record["mono_ns"])

@@ -11,6 +11,7 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
 from ..common.errors import InputError
 from ..logs.readers import Reader, ReadOptions, identify
@@ -134,14 +135,7 @@ class TelemetryFollower:
         """Complete lines since the last call."""
         try:
             with self.path.open("rb") as file:
-                state = os.fstat(file.fileno())
-                identity = (state.st_dev, state.st_ino)
-                if identity != self._identity or state.st_size < self._position:
-                    self._identity = identity
-                    self._position = max(0, state.st_size - TAIL_BYTES)
-                    if self._position:
-                        file.seek(self._position)
-                        self._position += len(file.readline())
+                self._find_place(file)
                 file.seek(self._position)
                 data = file.read(16 * 2**20)
         except FileNotFoundError:
@@ -151,6 +145,17 @@ class TelemetryFollower:
         end = data.rfind(b"\n") + 1
         self._position += end
         return data[:end]
+
+    def _find_place(self, file: BinaryIO) -> None:
+        """Begin anew in a file that was replaced or cut."""
+        state = os.fstat(file.fileno())
+        identity = (state.st_dev, state.st_ino)
+        if identity == self._identity and state.st_size >= self._position:
+            return
+        self._identity, self._position = identity, max(0, state.st_size - TAIL_BYTES)
+        if self._position:
+            file.seek(self._position)
+            self._position += len(file.readline())
 
 
 def predict_along(follower: TelemetryFollower, replay_at: Callable[[TelemetrySample], Prediction]) -> Predict:

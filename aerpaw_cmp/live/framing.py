@@ -330,16 +330,20 @@ class Framer:
         if any(text == owed.command for owed in self._owed):
             return
         if now is not None and _matches(text, now.prefixes):
-            if line.dropped:
-                self._flag(f"overlong:{line.dropped}")
-            if len(now.lines) < self._max_lines:
-                now.lines.append(text)
-            else:
-                now.too_many += 1
+            self._own(line, now)
         elif any(_matches(text, owed.prefixes) for owed in self._owed) and len(self._stray) < self._max_lines:
             self._stray.append(text)
         else:
             events.append(Unsolicited(text, line.dropped))
+
+    def _own(self, line: Line, now: _Open) -> None:
+        """Take a line of the answer in flight."""
+        if line.dropped:
+            self._flag(f"overlong:{line.dropped}")
+        if len(now.lines) < self._max_lines:
+            now.lines.append(line.text)
+        else:
+            now.too_many += 1
 
     def _is_echo(self, text: str, now: _Open) -> bool:
         # rubbish from before may stand in front of the echo on the same line
@@ -427,16 +431,19 @@ class TranscriptFramer:
         if len(pieces) > 1:
             self._flags.append("glued")
         for text in pieces:
-            final = final_result(text)
-            if final is not None:
-                self._end(final[0], final[1], events, even_empty=True)
-            elif _ECHO.match(text):
-                self._end("cut", None, events)
-                self._command = text
-            elif self._command is None and is_unsolicited(text):
-                events.append(Unsolicited(text))
-            elif len(self._lines) < self._max_lines:
-                self._lines.append(text)
+            self._piece(text, events)
+
+    def _piece(self, text: str, events: list[Event]) -> None:
+        final = final_result(text)
+        if final is not None:
+            self._end(final[0], final[1], events, even_empty=True)
+        elif _ECHO.match(text):
+            self._end("cut", None, events)
+            self._command = text
+        elif self._command is None and is_unsolicited(text):
+            events.append(Unsolicited(text))
+        elif len(self._lines) < self._max_lines:
+            self._lines.append(text)
 
     def _end(self, status: Status, code: str | None, events: list[Event], *, even_empty: bool = False) -> None:
         if even_empty or self._command is not None or self._lines:

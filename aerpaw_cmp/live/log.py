@@ -120,13 +120,16 @@ class _Syncer(threading.Thread):
             self._wanted.clear()
             if self._ended:
                 return
-            with self._fd_lock:  # held while syncing: the descriptor must not be closed under it
-                fd, self._fd = self._fd, -1
-                if fd >= 0:
-                    try:
-                        os.fdatasync(fd)
-                    except OSError as error:
-                        self._on_error(error)
+            try:
+                self._sync()
+            except OSError as error:
+                self._on_error(error)
+
+    def _sync(self) -> None:
+        with self._fd_lock:  # held while syncing: the descriptor must not be closed under it
+            fd, self._fd = self._fd, -1
+            if fd >= 0:
+                os.fdatasync(fd)
 
     @contextlib.contextmanager
     def quiet(self) -> Iterator[None]:
@@ -478,6 +481,7 @@ def segments(source: Path) -> list[Path]:
 
 def read_log(source: Path, bad: list[BadLine] | None = None) -> Iterator[Record]:
     """Records of a log, file or folder, in order; bad lines go to ``bad``."""
+    bad = [] if bad is None else bad
     for path in segments(source):
         try:
             lines = path.read_bytes().split(b"\n")
@@ -485,10 +489,8 @@ def read_log(source: Path, bad: list[BadLine] | None = None) -> Iterator[Record]
             raise InputError(f"cannot be read ({error.strerror})", expected="a tap log", path=path) from None
         tail = len(lines)
         for number, line in enumerate(lines, 1):
-            if not line.strip():
-                continue
             try:
-                yield decode_record(line)
+                if line.strip():
+                    yield decode_record(line)
             except ValueError as error:
-                if bad is not None:
-                    bad.append(BadLine(path, number, str(error), number == tail))
+                bad.append(BadLine(path, number, str(error), number == tail))

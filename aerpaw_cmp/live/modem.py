@@ -13,7 +13,7 @@ outside its physical range becomes None with a flag; the row and the raw line st
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -117,6 +117,7 @@ RANGES: Mapping[str, Range] = {
     "srxlev_db": Range(-200, 200),
     "scs_code": Range(0, 4),
     "bandwidth_code": Range(0, 16),
+    "uplink_bandwidth_code": Range(0, 16),
     "tx_power_tenth_dbm": Range(-600, 300),
 }
 """TS 38.214 table 5.1.3.1 (mcs), TS 38.133 10.1.6-10.1.16 (rsrp, rsrq, sinr), TS 38.104 5.4.2.1 (arfcn)."""
@@ -178,6 +179,16 @@ def _named(names: Sequence[str], fields: Sequence[str | None], flags: list[str],
     return values
 
 
+def _fields_of(lines: Sequence[str], prefix: str, flags: list[str]) -> Iterator[list[str | None]]:
+    """Fields of the lines that start with a prefix; a flag for each that does not."""
+    for line in lines:
+        payload = payload_of(line, prefix)
+        if payload is None:
+            flags.append("foreign_line")
+        else:
+            yield split_fields(payload)
+
+
 # answers ------------------------------------------------------------------------------------------------------
 
 
@@ -212,6 +223,7 @@ _SA = (
     *("rsrp_dbm", "rsrq_db", "sinr_db", "scs_code", "srxlev_db"),
 )
 _NSA = ("mcc", "mnc", "pcid", "rsrp_dbm", "sinr_db", "rsrq_db", "arfcn", "band", "bandwidth_code", "scs_code")
+_NR: Mapping[str | None, Sequence[str]] = {"NR5G-SA": _SA, "NR5G-NSA": _NSA}
 _LTE = (
     *("duplex", "mcc", "mnc", "cell_id", "pcid", "arfcn", "band", "uplink_bandwidth_code", "bandwidth_code", "tac"),
     *("rsrp_dbm", "rsrq_db", "rssi_dbm", "sinr_raw", "cqi", "tx_power_tenth_dbm", "srxlev_db"),
@@ -231,13 +243,7 @@ def _nr(names: Sequence[str], fields: Sequence[str | None], flags: list[str]) ->
 
 def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
     # 'sinr_raw': dB or 5 X - 20 by firmware, the manual does not decide; so no unit
-    renamed = ["bandwidth_code" if name == "uplink_bandwidth_code" else name for name in _LTE]
-    values: Values = {}
-    for index, (key, name) in enumerate(zip(_LTE, renamed, strict=True)):
-        text = fields[index] if index < len(fields) else None
-        values[key] = text if name in _WORDS else number(name, text, flags, prefix="lte.")
-    if len(fields) > len(_LTE):
-        values["extra"] = list(fields[len(_LTE) :])
+    values = _named(_LTE, fields, flags, "lte.")
     code = values["bandwidth_code"]
     values["bandwidth_mhz"] = LTE_BANDWIDTH_MHZ[code] if code is not None and code < len(LTE_BANDWIDTH_MHZ) else None
     return values
@@ -246,22 +252,15 @@ def _lte(fields: Sequence[str | None], flags: list[str]) -> Values:
 def decode_servingcell(lines: Sequence[str], flags: list[str]) -> Values:
     """``+QENG`` of SA, EN-DC (three lines) and LTE, told apart by the token of each line."""
     values: Values = {"state": None, "rat": None}
-    for line in lines:
-        payload = payload_of(line, "+QENG")
-        if payload is None:
-            flags.append("foreign_line")
-            continue
-        fields = split_fields(payload)
+    for fields in _fields_of(lines, "+QENG", flags):
         if fields[0] == "servingcell":
             values["state"] = fields[1] if len(fields) > 1 else None
             fields = fields[2:]
             if not fields:
                 continue
         rat, rest = fields[0], fields[1:]
-        if rat == "NR5G-SA":
-            values["nr"] = _nr(_SA, rest, flags)
-        elif rat == "NR5G-NSA":
-            values["nr"] = _nr(_NSA, rest, flags)
+        if rat in _NR:
+            values["nr"] = _nr(_NR[rat], rest, flags)
         elif rat == "LTE":
             values["lte"] = _lte(rest, flags)
         else:
@@ -290,12 +289,7 @@ def decode_antennas(lines: Sequence[str], flags: list[str], command: str, kind: 
         ``extra`` fields.
     """
     values: Values = {}
-    for line in lines:
-        payload = payload_of(line, command)
-        if payload is None:
-            flags.append("foreign_line")
-            continue
-        fields = split_fields(payload)
+    for fields in _fields_of(lines, command, flags):
         tag = "untagged"
         if fields and fields[-1] is not None and not re.fullmatch(r"[+-]?\d+", fields[-1]):
             tag = str(fields.pop())[:16]
@@ -328,12 +322,7 @@ def decode_rows(lines: Sequence[str], flags: list[str], command: str, names: Seq
         ``{"rows": [{name: text or None}, ...]}``.
     """
     rows: list[Values] = []
-    for line in lines:
-        payload = payload_of(line, command)
-        if payload is None:
-            flags.append("foreign_line")
-            continue
-        fields = split_fields(payload)
+    for fields in _fields_of(lines, command, flags):
         row: Values = dict(zip(names, fields, strict=False))
         if len(fields) > len(names):
             row["extra"] = fields[len(names) :]

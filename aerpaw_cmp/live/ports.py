@@ -198,15 +198,20 @@ def holders_of_sockets(inodes: Set[int]) -> list[Holder]:
 
 def _processes_with(wanted: Callable[[os.stat_result], bool]) -> list[Holder]:
     """Processes that have an open file of this kind, by their numbers."""
-    by_pid: dict[int, Holder] = {}
-    for process in Path("/proc").iterdir():
-        if not process.name.isdigit():
-            continue
+    found = []
+    for process in _processes():
         with contextlib.suppress(OSError):
             if any(map(wanted, _open_files(process))):
-                name = (process / "comm").read_text().strip()
-                by_pid[int(process.name)] = Holder(int(process.name), name)
-    return sorted(by_pid.values(), key=lambda h: h.pid)
+                found.append(_holder(process))
+    return sorted(found, key=lambda h: h.pid)
+
+
+def _processes() -> Iterator[Path]:
+    return (folder for folder in Path("/proc").iterdir() if folder.name.isdigit())
+
+
+def _holder(process: Path) -> Holder:
+    return Holder(int(process.name), (process / "comm").read_text().strip())
 
 
 def _open_files(process: Path) -> Iterator[os.stat_result]:
@@ -217,11 +222,10 @@ def _open_files(process: Path) -> Iterator[os.stat_result]:
 
 def modem_manager() -> Holder | None:
     """ModemManager if it runs; its name can be seen even where its open files cannot."""
-    for process in Path("/proc").iterdir():
-        if process.name.isdigit():
-            with contextlib.suppress(OSError):
-                if (process / "comm").read_text().strip() == "ModemManager":
-                    return Holder(int(process.name), "ModemManager")
+    for process in _processes():
+        with contextlib.suppress(OSError):
+            if (holder := _holder(process)).name == "ModemManager":
+                return holder
     return None
 
 

@@ -522,18 +522,16 @@ class ModemSimulator:
 
     def _write_out(self, data: bytes) -> bool:
         while data and not self._stop.is_set():
-            with self._lock:
-                if self._master < 0:
-                    return False
-                try:
-                    count = os.write(self._master, data[:4096])
+            try:
+                with self._lock:
+                    count = os.write(self._master, data[:4096])  # EBADF while the cable is pulled: the number is -1
                     self.sent_bytes += count
-                    data = data[count:]
-                    continue
-                except OSError as error:
-                    if error.errno not in (errno.EAGAIN, errno.EINTR):
-                        return False
-            self._stop.wait(0.002)
+            except OSError as error:
+                if error.errno not in (errno.EAGAIN, errno.EINTR):
+                    return False
+                self._stop.wait(0.002)
+                continue
+            data = data[count:]
         return not data
 
     def _babble(self) -> None:
@@ -640,9 +638,9 @@ def run_modem_sim(
             modem.keep_journal = False
             if on_ready is not None:
                 on_ready(modem.port)
+            beat = meanwhile or (lambda: None)
             while not stop.wait(0.1 if meanwhile else 1.0):
-                if meanwhile is not None:
-                    meanwhile()
+                beat()
     finally:
         stop.close()
     return 0

@@ -59,6 +59,14 @@ def not_a_modem(path: Path, received: bytes) -> InputError:
     return InputError(found, expected=expected, cause=cause, path=path)
 
 
+def _no_port(gone: PortGoneError) -> InputError:
+    return InputError(
+        str(gone),
+        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
+        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
+    )
+
+
 class Tap:
     """One session of the tap; see :func:`run_tap`."""
 
@@ -144,18 +152,16 @@ class Tap:
     def _first_connection(self) -> None:
         deadline = self._clock.mono_ns() + int(self._settings.wait_for_port_s * 1e9)
         while not self._stop.count:
+            last = self._clock.mono_ns() >= deadline
             try:
                 self._connect()
                 return
-            except (PortGoneError, InputError) as error:
-                if self._clock.mono_ns() >= deadline:
-                    if isinstance(error, InputError):
-                        raise
-                    raise InputError(
-                        str(error),
-                        expected="the modem's AT port, e.g. /dev/serial/by-id/usb-Quectel*-if02-port0",
-                        cause="the modem is not plugged in or still starts; see 'aerpaw-cmp doctor'",
-                    ) from None
+            except PortGoneError as error:
+                if last:
+                    raise _no_port(error) from None
+            except InputError:
+                if last:
+                    raise
             self._wait(0.2)
 
     def _poll_until_stopped(self) -> None:
@@ -176,7 +182,7 @@ class Tap:
         if now - self._last_final_ns > self._settings.silent_s * 1e9:
             raise PortGoneError(f"the modem answers nothing for {self._settings.silent_s:g} s")
         if not self._in_step:
-            self._resynchronise()
+            self._probe()
             return
         if self._initialise_again:
             self._initialise()
@@ -296,18 +302,23 @@ class Tap:
         self._port = SerialPort.open(info.path)
         self._heard = bytearray()
         try:
-            for _ in range(2):
-                answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
-                if answer.status not in ("timeout", "lost"):
-                    for event in self._framer.settle():
-                        self._other(event)
-                    self._in_step = True
-                    self._info = info
-                    self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
-                    return
-            raise not_a_modem(info.path, bytes(self._heard))
+            # the second probe only where the first gets no answer
+            if not any(self._probe() for _ in range(2)):
+                raise not_a_modem(info.path, bytes(self._heard))
         finally:
             self._heard = None
+        self._info = info
+        self._last_final_ns = self._last_csi_ns = self._clock.mono_ns()
+
+    def _probe(self) -> bool:
+        """Ask a bare ``AT``; an answer brings the modem in step, so that a late one is not taken for the next."""
+        answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
+        if answer.status in ("timeout", "lost"):
+            return False
+        self._in_step = True
+        for event in self._framer.settle():
+            self._other(event)
+        return True
 
     def _close_port(self) -> None:
         if self._port is not None:
@@ -406,14 +417,6 @@ class Tap:
                 self._say("CSI reporting was switched on; its old state is unknown and will not be restored")
         elif state[1] == 0:
             self._say("CSI reporting is off, so no rank will come: run with --enable-csi")
-
-    def _resynchronise(self) -> None:
-        """After a time-out: a bare ``AT``, so that a late answer is not taken for the next one."""
-        answer, _ = self._exchange("sync", timeout_s=self._settings.probe_timeout_s)
-        if answer.status != "timeout":
-            self._in_step = True
-            for event in self._framer.settle():
-                self._other(event)
 
     def _advise(self, decoded: Decoded) -> None:
         if decoded.values.get("rank") is not None:

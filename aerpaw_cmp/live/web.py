@@ -424,11 +424,10 @@ def _is_free(host: str, port: int) -> bool:
 
 def _listeners(port: int) -> set[int]:
     """Inodes of the sockets that listen on a port, by ``/proc/net``."""
-    inodes = set()
+    lines: list[str] = []
     for name in ("tcp", "tcp6"):
         with contextlib.suppress(OSError):
-            for line in Path(f"/proc/net/{name}").read_text().splitlines()[1:]:
-                cells = line.split()
-                if cells[3] == "0A" and int(cells[1].rpartition(":")[2], 16) == port:
-                    inodes.add(int(cells[9]))
-    return inodes
+            lines += Path(f"/proc/net/{name}").read_text().splitlines()[1:]
+    rows = [line.split() for line in lines]
+    listening = "0A"  # TCP_LISTEN
+    return {int(row[9]) for row in rows if row[3] == listening and int(row[1].rpartition(":")[2], 16) == port}

@@ -19,11 +19,20 @@ def run(name, *arguments):
     return done.returncode, json.loads(done.stdout)
 
 
-def test_sigkill():
-    code, result = run("tap_sigkill.py", "--kills", "3", "--parallel", "3")
+@pytest.mark.parametrize("web", [False, True])
+def test_sigkill(web):
+    code, result = run("tap_sigkill.py", "--kills", "3", "--parallel", "3", *(["--web"] if web else []))
     assert code == 0
     assert result["kills"] == 3
     assert (result["lost"], result["corrupt"], result["out_of_order"]) == (0, 0, 0)
+    assert (result["answers_shown"] > 0) == web
+
+
+def test_the_page_while_the_tap_runs():
+    _, result = run("tap_web_soak.py", "--simulated-s", "60", "--pace-s", "1", "--requests", "40")
+    faults = ("web_lost", "web_out_of_order", "web_bad_lines", "web_holes", "other_content", "fuzz_lost")
+    assert {key: result[key] for key in faults} == dict.fromkeys(faults, 0)
+    assert min(result["web_rows_shown"]) > 0
 
 
 def test_replug():

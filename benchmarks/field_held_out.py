@@ -132,7 +132,7 @@ def folders(root: Path) -> dict[str, Any]:
             "files": len(files),
             "readers": dict(Counter(f.result.reader for f in files)),
             "lines": sum(f.result.lines for f in files),
-            "rejected": sum(len(f.result.rejected) for f in files),
+            "rejected": sum(f.result.rejected_count for f in files),
             "not_read": sum(p.is_file() for p in folder.rglob("*")) - len({f.path for f in files}),
             "compared": COMPARED.get(folder.name) or NOT_COMPARED.get(folder.name, "new here: not compared yet"),
         }

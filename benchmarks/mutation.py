@@ -64,7 +64,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "aerpaw_cmp/maps/kriging.py": ("tests/maps/test_kriging.py", "tests/maps/test_kriging_by_hand.py"),
     "parsers/aerpaw_parsers/_lines.py": (
-        "tests/parsers/test_law.py", "tests/parsers/test_formats.py", "tests/parsers/test_two_ways.py",
+        "tests/parsers/test_law.py", "tests/parsers/test_formats.py",
         "tests/parsers/test_rows.py", "tests/parsers/test_lines.py", "parsers/aerpaw_parsers/_lines.py",
     ),
     "parsers/aerpaw_parsers/_rows.py": (
@@ -73,8 +73,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
     ),
     "parsers/aerpaw_parsers/_time.py": ("tests/parsers/test_time.py", "tests/parsers/test_formats.py"),
     "parsers/aerpaw_parsers/vehicle_out.py": (
-        "tests/parsers/test_formats.py", "tests/parsers/test_law.py", "tests/parsers/test_two_ways.py",
-        "tests/logs/test_blocks.py",
+        "tests/parsers/test_formats.py", "tests/parsers/test_law.py",
     ),
     "parsers/aerpaw_parsers/sounder_log.py": (
         "tests/parsers/test_formats.py", "tests/parsers/test_sounder.py", "tests/parsers/test_law.py"

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 
 from ..common.errors import UsageError
-from ..logs.blocks import with_warnings
 from ..logs.ingest import IngestedFile
 from ..logs.records import Stream
 from .settings import LogSettings
@@ -55,8 +54,8 @@ def at_height(log: LogSettings, file: IngestedFile) -> IngestedFile:
             cause="the log has altitudes of its own, or no positions",
         )
     said = f"no altitude in the log: {log.height_m:g} m above take-off in all of it, as height_m says"
-    result = replace(file.result, streams=tuple(streams))
-    return replace(file, result=with_warnings(result, without="^the log has no altitude", more=(said,)))
+    warnings = [text for text in file.result.warnings if not text.startswith("the log has no altitude")]
+    return replace(file, result=replace(file.result, streams=tuple(streams), warnings=(*warnings, said)))
 
 
 def height_in_name(path: str) -> float | None:

@@ -91,7 +91,7 @@ class TelemetryFollower:
             return 0
         reader = self._reader = self._reader or identify(data, path=str(self.path))
         result = limits.check(reader.read(data, self._options))
-        self.rejected += len(result.rejected)
+        self.rejected += result.rejected_count
         streams = [stream for stream in result.streams if stream.kind == "telemetry"]
         if not streams:
             if result.streams:

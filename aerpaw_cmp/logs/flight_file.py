@@ -3,7 +3,8 @@
 Layout (root attributes ``format`` = ``aerpaw-cmp flight``, ``version`` = 1)::
 
     /files/00000/meta                     JSON: path, sha256, reader, lines, accepted, blank, warnings
-    /files/00000/rejected                 JSON: list of [number, reason, text]
+    /files/00000/rejected                 JSON: list of [number, reason, text], the first thousand
+    /files/00000/reasons                  JSON: list of [reason, count, first line, last line]
     /files/00000/streams/00000/meta       JSON: kind, name, columns [{name, type}], attributes
     /files/00000/streams/00000/C00000     values of the first column, and so on
     /files/00000/streams/00000/C00000.words   JSON: the texts that a text column's codes stand for
@@ -28,7 +29,7 @@ from typing import TYPE_CHECKING, Any, BinaryIO
 
 from ..common.errors import InputError
 from ..common.outputs import OutputFile
-from .records import ReadResult, RejectedLine, Stream
+from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -141,6 +142,7 @@ def _write_file(group: Any, file: IngestedFile) -> None:
         },
     )
     _write_json(group, "rejected", [[line.number, line.reason, line.text] for line in result.rejected])
+    _write_json(group, "reasons", [[one.reason, one.count, one.first, one.last] for one in result.reasons])
     shelf = group.create_group("streams")
     for i, stream in enumerate(result.streams):
         _write_stream(shelf.create_group(f"{i:05d}"), stream)
@@ -233,6 +235,8 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
 def _read_file(group: Any) -> IngestedFile:
     meta = _read_json(group, "meta")
     rejected = tuple(RejectedLine(*entry) for entry in _read_json(group, "rejected"))
+    # files of version 0.3 hold every rejected line, and no reasons
+    reasons = tuple(RejectedReason(*entry) for entry in _read_json(group, "reasons")) if "reasons" in group else ()
     shelf = group["streams"]
     streams = tuple(_read_stream(shelf[name]) for name in sorted(shelf))
     result = ReadResult(
@@ -242,6 +246,7 @@ def _read_file(group: Any) -> IngestedFile:
         accepted=meta["accepted"],
         blank=meta["blank"],
         rejected=rejected,
+        reasons=reasons,
         warnings=tuple(meta["warnings"]),
     )
     return IngestedFile(meta["path"], meta["sha256"], result)

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ..common.errors import InputError, UsageError, one_line
-from . import archives, blocks, packed
+from . import archives, chunks, packed
 from .flight_file import IngestedFile, read_flight
 from .pieces import join
 from .readers import DEEP_BYTES, HEAD_BYTES, Reader, ReadOptions, by_name, claims, identify
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 MAX_BYTES = 2**32
-"""Largest content of a gzip file that is unpacked in memory: larger logs are read in blocks, or are no logs."""
+"""Largest content of a packed file that is unpacked in memory."""
 
 FIRST_REJECTED = 3
 """Rejected lines of a file that a summary quotes."""
@@ -357,8 +357,8 @@ def read_file(path: str | Path, *, options: OptionsFor | None = None, reader: Re
         )
     if reader is None and head:
         reader = identify(head, path=str(path))  # before the rest: folders hold large files that are no logs
-    if (large := _in_blocks(place, reader, options)) is not None:
-        return large
+    if reader is not None and head.strip() and (file := _in_pieces(place, reader, options)) is not None:
+        return file
     data, digest = read_bytes(place)
     data = as_utf8(data)
     if not data.strip() or data.startswith(b"version https://git-lfs"):
@@ -388,28 +388,15 @@ def _source(flight_file: Path, name: str) -> IngestedFile:
     return named[0]
 
 
-def _in_blocks(place: Path, reader: Reader | None, options: OptionsFor | None) -> IngestedFile | None:
-    """A large log, read block by block; None for others, and where a log must be read in one piece after all."""
-    from . import limits
-
-    begin = _raw(place, HEAD_BYTES)
-    other = packed.form(begin) is not None
-    least = blocks.FROM_BYTES // 16 if other else blocks.FROM_BYTES
-    if place.stat().st_size < least or reader is None or reader.in_blocks is None:
+def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> IngestedFile | None:
+    """A log of a reader that takes pieces; None for text in UTF-16, which is turned as one."""
+    if reader.read_pieces is None or _raw(place, 2) in _UTF_16:
         return None
-    if begin[:2] in _UTF_16:
-        return None
+    digest = hashlib.sha256()
     given = _options(place, options, _beside(place))
-    try:
-        if other:
-            made = hashlib.sha256()
-            result = reader.in_blocks(blocks.counted(packed.stream(place), made), given)
-            digest = made.hexdigest()
-        else:
-            result, digest = blocks.read(place, reader, given)
-    except blocks.Whole:
-        return None
-    return IngestedFile(str(place), digest, limits.check(result)) if result.accepted else None
+    read_pieces = reader.read_pieces
+    result = _checked(place, reader, lambda: read_pieces(chunks.file_pieces(place, digest), given))
+    return IngestedFile(str(place), digest.hexdigest(), result)
 
 
 def _options(path: Path, options: OptionsFor | None, beside: Callable[[str], bytes | None]) -> ReadOptions:
@@ -435,13 +422,18 @@ def _read(
     options: OptionsFor | None,
     beside: Callable[[str], bytes | None] | None = None,
 ) -> IngestedFile:
+    given = _options(path, options, beside or _beside(path))
+    return IngestedFile(str(path), digest, _checked(path, reader, lambda: reader.read(data, given)))
+
+
+def _checked(path: Path, reader: Reader, read: Callable[[], ReadResult]) -> ReadResult:
+    """What a reader says, its impossible values flagged; messages name the file, which readers do not know."""
     from . import limits  # loads pandas, as any reader does
 
-    given = _options(path, options, beside or _beside(path))
     try:
-        result = limits.check(_parsed(reader, data, given))
+        result = limits.check(read())
     except (InputError, UsageError) as error:
-        if error.path is None:  # readers know bytes only
+        if error.path is None:
             raise type(error)(
                 error.found, expected=error.expected, cause=error.cause, path=path, line=error.line
             ) from error
@@ -454,17 +446,7 @@ def _read(
             cause="a log of another kind, or an aborted run",
             path=path,
         )
-    return IngestedFile(str(path), digest, result)
-
-
-def _parsed(reader: Reader, data: bytes, options: ReadOptions) -> ReadResult:
-    """What a reader says of content in memory; of a large one (a member of an archive) block by block."""
-    if reader.in_blocks is not None and len(data) >= blocks.FROM_BYTES:
-        try:
-            return reader.in_blocks((data[i : i + 2**22] for i in range(0, len(data), 2**22)), options)
-        except blocks.Whole:
-            pass
-    return reader.read(data, options)
+    return result
 
 
 def _folder(
@@ -503,7 +485,7 @@ def summary(files: Sequence[IngestedFile]) -> dict[str, Any]:
             "reader": file.result.reader,
             "lines": file.result.lines,
             "accepted": file.result.accepted,
-            "rejected": len(file.result.rejected),
+            "rejected": file.result.rejected_count,
             "first_rejected": [asdict(line) for line in file.result.rejected[:FIRST_REJECTED]],
             "blank": file.result.blank,
             "streams": [

@@ -147,11 +147,6 @@ def head_of(place: Path, count: int) -> bytes:
     return made[:count]
 
 
-def stream(place: Path) -> Iterator[bytes]:
-    """Content of a packed file on disk, some MiB at a time."""
-    return pieces(_chunks(place), place)
-
-
 def _chunks(place: Path) -> Iterator[bytes]:
     with place.open("rb") as file:
         while chunk := file.read(_PIECE):

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from .flight_file import IngestedFile
 from .readers import catalogue
-from .records import ReadResult, RejectedLine, Stream
+from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -41,11 +42,15 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
     before = 0
     parts: dict[tuple[str, str], list[tuple[Stream, pd.DataFrame]]] = {}
     rejected: list[RejectedLine] = []
+    reasons: dict[str, RejectedReason] = {}
     for file in group:
         for stream in file.result.streams:
             frame = stream.frame.assign(line=stream.frame["line"] + before)
             parts.setdefault((stream.kind, stream.name), []).append((stream, frame))
         rejected += [RejectedLine(line.number + before, line.reason, line.text) for line in file.result.rejected]
+        for one in file.result.reasons:
+            old = reasons.get(one.reason, replace(one, count=0, first=one.first + before))
+            reasons[one.reason] = replace(old, count=old.count + one.count, last=one.last + before)
         before += file.result.lines
     streams = tuple(_stream(part) for part in parts.values())
     warnings = dict.fromkeys(text for file in group for text in file.result.warnings)
@@ -56,6 +61,7 @@ def _joined(folder: str, group: Sequence[IngestedFile]) -> IngestedFile:
         accepted=sum(file.result.accepted for file in group),
         blank=sum(file.result.blank for file in group),
         rejected=tuple(rejected),
+        reasons=tuple(reasons.values()),
         warnings=(f"{len(group)} files of this folder were joined", *warnings),
     )
     return IngestedFile(folder, digest, result)

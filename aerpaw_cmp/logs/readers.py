@@ -7,7 +7,7 @@ lists it in the catalogue that the entry-point group ``aerpaw_cmp.readers`` name
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import cache
 from typing import Literal
@@ -21,8 +21,8 @@ HEAD_BYTES = 65_536
 DEEP_BYTES = 4 << 20
 """And this much where no log reader knows those."""
 
-InBlocks = Callable[[Iterator[bytes], "ReadOptions"], ReadResult]
-"""Reads a log from the pieces of its file."""
+ReadPieces = Callable[[Iterable[bytes], "ReadOptions"], ReadResult]
+"""Reads a log from pieces of whole lines: the same result whatever their size."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -93,9 +93,9 @@ class Reader:
         ``read(data: bytes, options: ReadOptions) -> ReadResult``.
     pieces : bool
         Is a file of a few records a piece of the log that its folder holds?
-    in_blocks : callable, optional
-        ``in_blocks(chunks, options) -> ReadResult``: the same from pieces of the file, in memory that its size does not
-        move; see :func:`aerpaw_cmp.logs.blocks.by_lines`. None where a file is read in one piece.
+    read_pieces : callable, optional
+        ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
+        memory; see :mod:`aerpaw_cmp.logs.chunks`.
     """
 
     name: str
@@ -105,7 +105,7 @@ class Reader:
     sniff: Callable[[bytes], bool]
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
-    in_blocks: InBlocks | None = None
+    read_pieces: ReadPieces | None = None
 
 
 @cache

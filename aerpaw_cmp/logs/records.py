@@ -1,9 +1,9 @@
 """The record model: what every reader returns, whatever the format.
 
-A log file becomes a :class:`ReadResult`: streams of records, the account of its lines, and every
-rejected line with its reason. The accounting law, checked when the result is built::
+A log file becomes a :class:`ReadResult`: streams of records, the account of its lines, and the rejected lines with
+their reasons (the first thousand verbatim, all counted). The accounting law, checked when the result is built::
 
-    lines == accepted + rejected + blank
+    lines == accepted + rejected_count + blank
 
 Columns (UTC ``time`` as naive ``datetime64[ns]``; units in names). Every frame has ``time``, ``line``
 (1-based line, or row of a binary file) and ``flag`` (empty, or reasons joined by ``;``).
@@ -28,7 +28,7 @@ A cell: an rss stream may be that of one cell; its attributes then hold ``pci`` 
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal
 
@@ -102,6 +102,30 @@ class RejectedLine:
 
 
 @dataclass(frozen=True, slots=True)
+class RejectedReason:
+    """Why lines were rejected: how many, and the first and last of them (1-based)."""
+
+    reason: str
+    count: int
+    first: int
+    last: int
+
+
+KEPT_REJECTED = 1000
+"""Rejected lines of a file that are kept verbatim: the first; all others are counted."""
+
+
+def reasons_of(rejected: Iterable[RejectedLine]) -> tuple[RejectedReason, ...]:
+    """Rejected lines counted by reason, in the order of their first lines."""
+    found: dict[str, RejectedReason] = {}
+    for line in rejected:
+        old = found.get(line.reason, RejectedReason(line.reason, 0, line.number, line.number))
+        first, last = min(old.first, line.number), max(old.last, line.number)
+        found[line.reason] = RejectedReason(line.reason, old.count + 1, first, last)
+    return tuple(sorted(found.values(), key=lambda one: one.first))
+
+
+@dataclass(frozen=True, slots=True)
 class ReadResult:
     """What a reader made of one file.
 
@@ -114,7 +138,9 @@ class ReadResult:
     lines, accepted, blank : int
         ``blank`` counts blank lines, headers and comments.
     rejected : tuple of RejectedLine
-        Every line that is neither.
+        Lines that are neither; of more than ``KEPT_REJECTED`` the first are kept.
+    reasons : tuple of RejectedReason
+        All of them by reason; by default counted from ``rejected``.
     warnings : tuple of str
         What the user should know, one sentence each.
 
@@ -131,13 +157,23 @@ class ReadResult:
     blank: int
     rejected: tuple[RejectedLine, ...] = ()
     warnings: tuple[str, ...] = ()
+    reasons: tuple[RejectedReason, ...] = ()
 
     def __post_init__(self) -> None:
-        if self.lines != self.accepted + len(self.rejected) + self.blank:
+        if not self.reasons:
+            object.__setattr__(self, "reasons", reasons_of(self.rejected))
+        if len(self.rejected) > KEPT_REJECTED:
+            object.__setattr__(self, "rejected", self.rejected[:KEPT_REJECTED])
+        if self.lines != self.accepted + self.rejected_count + self.blank:
             raise ValueError(
                 f"accounting law broken by reader {self.reader!r}: {self.lines} lines are not "
-                f"{self.accepted} accepted + {len(self.rejected)} rejected + {self.blank} blank"
+                f"{self.accepted} accepted + {self.rejected_count} rejected + {self.blank} blank"
             )
+
+    @property
+    def rejected_count(self) -> int:
+        """Rejected lines, those that are not kept included."""
+        return sum(one.count for one in self.reasons)
 
 
 def has_wall_clock(start: np.datetime64) -> bool:

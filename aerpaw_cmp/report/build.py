@@ -395,7 +395,7 @@ def inputs_of(logs: Sequence[LogSettings], files: Sequence[IngestedFile]) -> tup
             reader=file.result.reader,
             lines=file.result.lines,
             accepted=file.result.accepted,
-            rejected=len(file.result.rejected),
+            rejected=file.result.rejected_count,
             blank=file.result.blank,
             role=", ".join(sorted({s.kind for s in file.result.streams})),
             warnings=file.result.warnings,

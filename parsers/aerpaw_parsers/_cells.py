@@ -2,21 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs.records import ReadResult, Stream
+from aerpaw_cmp.logs.records import Stream
 
-from . import _decided, _lines, _rows
+from . import _lines, _rows
 
 RATS = ("", "lte", "nr")
 """Radio accesses; the first where a log does not say."""
 BESIDE = ("rsrq_db", "rssi_dbm", "sinr_db", "pathloss_db")
-_SEVERAL = "several"
-"""In place of the carrier of a cell that a block heard on several, until all blocks are there."""
 RANGE_DBM = (-170.0, -1.0)
 """RSRP beyond these is a sentinel (2147483647, 0) or a mistake."""
 
@@ -99,113 +97,82 @@ def joined(tables: Sequence[Table]) -> Table:
     return Table(**{name: np.concatenate(column, axis=-1) for name, column in columns.items()})
 
 
-def streams(
-    rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str, before: Mapping[str, float] | None = None
-) -> list[Stream]:
-    """A stream per radio access and PCI; a cell that is told twice at one time is kept once, as serving.
+def streams(rows: _rows.Rows, readings: Table | Iterable[Reading], *, source: str) -> list[Stream]:
+    """A stream per cell: radio access, PCI and carrier. Every reading with a level is a record.
 
-    A cell is serving from the moment that the log says so until it names another of the same radio access.
+    A cell is serving from the moment that the log says so until it names another of the same radio access. A PCI that
+    the log knows on one carrier only is one cell, also where a reading names no carrier; of several carriers each is a
+    cell of its own. The same cell a second time in one row of the log is flagged ``cell_twice``.
 
     Parameters
     ----------
     rows : Rows
     readings : Table or iterable of Reading
     source : str
-    before : mapping of str to float, optional
-        PCI of the cell that served, by radio access, where these rows begin.
     """
     found = readings if isinstance(readings, Table) else table(readings)
     order = np.argsort(found.row, kind="stable")
     order = order[np.isfinite(found.rsrp_dbm[order])]
-    rats, pci = found.rat[order], found.pci[order]
-    served = _serving(found, order, before or {})
-    key = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
+    rats, pci, arfcn = found.rat[order], found.pci[order], found.arfcn[order]
+    served = _serving(found, order)
+    pci = np.where(np.isfinite(pci) & (pci >= 0), pci, -1.0)
     made: list[Stream] = []
     for rat in np.unique(rats).tolist():
-        of_rat = np.flatnonzero(rats == rat)
-        cell = key[of_rat]
-        for one in np.unique(cell).tolist():
-            pick = of_rat[cell == one]
-            made.append(_stream(rows, found, order[pick], served[pick], RATS[rat], one, source))
+        for one in np.unique(pci[rats == rat]).tolist():
+            of_pci = np.flatnonzero((rats == rat) & (pci == one))
+            carriers = np.unique(arfcn[of_pci][np.isfinite(arfcn[of_pci])])
+            if len(carriers) < 2:
+                parts = [(of_pci, float(carriers[0]) if len(carriers) else np.nan)]
+            else:
+                parts = [(of_pci[arfcn[of_pci] == carrier], carrier) for carrier in carriers.tolist()]
+                parts.append((of_pci[np.isnan(arfcn[of_pci])], np.nan))
+            for pick, carrier in parts:
+                cell = Cell(RATS[rat], one, carrier, several=len(carriers) > 1)
+                made += [_stream(rows, found, order[pick], served[pick], cell, source)] if len(pick) else []
     return made
 
 
-def _serving(found: Table, order: IntArray, before: Mapping[str, float]) -> FloatArray:
+@dataclass(frozen=True)
+class Cell:
+    """Identity of a cell: radio access, PCI (-1: unknown), carrier (NaN: unknown), and if others share its PCI."""
+
+    rat: str
+    pci: float
+    arfcn: float
+    several: bool
+
+    @property
+    def name(self) -> str:
+        """Name of its stream."""
+        parts = [self.rat, f"pci{int(self.pci)}" if self.pci >= 0 else "rsrp"]
+        if self.several and np.isfinite(self.arfcn):
+            parts.append(f"arfcn{int(self.arfcn)}")
+        return "_".join(part for part in parts if part)
+
+
+def _serving(found: Table, order: IntArray) -> FloatArray:
     """1 where the reading is of the cell that serves, 0 where another does, NaN where nothing is known."""
-    row, rats, pci, serving = (column[order] for column in (found.row, found.rat, found.pci, found.serving))
+    row, rats, serving = (column[order] for column in (found.row, found.rat, found.serving))
+    cell = np.stack([found.pci[order], np.nan_to_num(found.arfcn[order], nan=-1.0)])
     served = np.full(len(order), np.nan)
-    for rat, one in before.items():
-        mine = np.flatnonzero(rats == RATS.index(rat))
-        served[mine] = pci[mine] == one
     for rat in np.unique(rats[serving]).tolist():
         mine = np.flatnonzero(rats == rat)
-        told = mine[serving[mine]]
+        named = mine[serving[mine]]
         # all readings of a row at once: the serving one may stand behind its neighbours
-        last = np.searchsorted(row[told], row[mine], side="right") - 1
+        last = np.searchsorted(row[named], row[mine], side="right") - 1
         known = last >= 0
         mine = mine[known]
-        served[mine] = serving[mine] | (pci[mine] == pci[told[last[known]]])
+        served[mine] = serving[mine] | (cell[:, mine] == cell[:, named[last[known]]]).all(axis=0)
     return served
 
 
-def _once(time: AnyArray, served: FloatArray) -> IntArray:
-    """Rows to keep: of two readings of one instant the serving one."""
-    if (time[1:] > time[:-1]).all():
-        return np.arange(len(time))
-    order = np.lexsort((-np.nan_to_num(served), time))
-    return np.asarray(np.sort(order[np.concatenate(([True], np.diff(time[order]) != np.timedelta64(0)))]))
-
-
-def settled(result: ReadResult) -> ReadResult:
-    """A result whose blocks may have cut an instant in two: each cell once at each time, the cells in their order.
-
-    A cell that was heard on several carriers has no ``arfcn``.
-    """
-    places = [_place(stream) for stream in result.streams]
-    streams = [_settled(stream) if _is_cell(stream) else stream for stream in result.streams]
-    ordered = sorted(zip(places, streams, strict=True), key=lambda pair: pair[0])
-    return _decided.finished(result, [stream for _, stream in ordered])
-
-
-def _is_cell(stream: Stream) -> bool:
-    return stream.kind == "rss" and "serving" in stream.frame
-
-
-_KINDS = ("telemetry", "rank", "rss", "kpi")
-
-
-def _place(stream: Stream) -> tuple[int, bool, int, int, str]:
-    """Place of a stream among the others: the track, ranks, cells by radio access and PCI, what else there is."""
-    kind = _KINDS.index(stream.kind)
-    if not _is_cell(stream):
-        return kind, True, 0, 0, stream.name
-    return kind, False, RATS.index(str(stream.attributes.get("rat", ""))), int(stream.attributes.get("pci", -1)), ""
-
-
-def _settled(stream: Stream) -> Stream:
-    twice = np.ones(len(stream.frame), dtype=bool)
-    twice[_once(stream.frame["time"].to_numpy(), stream.frame["serving"].to_numpy())] = False
-    frame = _decided.without(stream.frame, twice)
-    columns = [name for name in frame if name not in BESIDE]
-    columns += [name for name in BESIDE if name in frame and frame[name].notna().any()]
-    frame = frame if list(frame) == columns else frame[columns]  # no copy in vain
-    about = {key: value for key, value in stream.attributes.items() if (key, value) != ("arfcn", _SEVERAL)}
-    return replace(stream, frame=frame, attributes=about)
-
-
-def _stream(
-    rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, rat: str, pci: float, source: str
-) -> Stream:
+def _stream(rows: _rows.Rows, found: Table, pick: IntArray, served: FloatArray, cell: Cell, source: str) -> Stream:
     """Readings of one cell, in the order of the log."""
-    numbers = np.unique(found.arfcn[pick])
-    numbers = numbers[np.isfinite(numbers)]
-    keep = _once(rows.time[found.row[pick]], served)
-    if len(keep) < len(pick):
-        pick, served = pick[keep], served[keep]
     row, level = found.row[pick], found.rsrp_dbm[pick]
     flag = rows.flag[row]
     outside = ~((level >= RANGE_DBM[0]) & (level <= RANGE_DBM[1]))
     _lines.add_flag(flag, outside, "out_of_coverage")
+    _lines.add_flag(flag, np.concatenate(([False], row[1:] == row[:-1])), "cell_twice")
     level[outside] = np.nan
     values: dict[str, FloatArray] = {"rss_db": level, "serving": served}
     for name, column in zip(BESIDE, found.beside, strict=True):
@@ -213,12 +180,11 @@ def _stream(
         known = np.isfinite(mine)  # a ratio or loss written as 'inf' is none
         if known.any():
             values[name] = np.where(known, mine, np.nan)
-    carrier = None if not len(numbers) else int(numbers[0]) if len(numbers) == 1 else _SEVERAL
-    name = "_".join(part for part in (rat, f"pci{int(pci)}" if pci >= 0 else "rsrp") if part)
     made = rows.stream(
-        "rss", name, values, pick=row, flag=flag, channel=rows.options.channel or name,
-        unit=rows.options.unit or "dBm", quantity="RSRP", rat=rat or None, pci=int(pci) if pci >= 0 else None,
-        arfcn=carrier, source=source,
+        "rss", cell.name, values, pick=row, flag=flag, channel=rows.options.channel or cell.name,
+        unit=rows.options.unit or "dBm", quantity="RSRP", rat=cell.rat or None,
+        pci=int(cell.pci) if cell.pci >= 0 else None, arfcn=int(cell.arfcn) if np.isfinite(cell.arfcn) else None,
+        source=source,
     )  # fmt: skip
     assert made is not None
     return made

@@ -9,14 +9,15 @@ import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.units import AnyArray
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Attribute, Kind
 
 _INTEGERS = ("fix", "satellites")
 
 
-def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray]) -> pd.DataFrame:
+def frame(
+    kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Mapping[str, AnyArray], *, own: bool = False
+) -> pd.DataFrame:
     """Frame of a kind; columns that the log does not have are NaN (``fix`` and ``satellites``: -1).
 
     Its columns are copies, each an array of its own: streams of one log share their times.
@@ -32,19 +33,22 @@ def frame(kind: Kind, time: AnyArray, line: AnyArray, flag: AnyArray, values: Ma
         Reasons, empty where there is none.
     values : mapping of str to (n,)
         Columns of the kind that the log has.
+    own : bool
+        Whether the arrays are given away: a log of 1 GB has no room for copies.
     """
+    array = np.asarray if own else np.array
     count = len(time)
     content: dict[str, Any] = {
-        "time": np.array(time, dtype="datetime64[ns]"),
-        "line": np.array(line, dtype=np.int64),
+        "time": array(time, dtype="datetime64[ns]"),
+        "line": array(line, dtype=np.int64),
         # object, not pandas' string type: no scan of the column, the same on every pandas
-        "flag": pd.Series(np.array(flag, dtype=object), dtype=object, copy=False),
+        "flag": pd.Series(array(flag, dtype=object), dtype=object, copy=False),
     }
     for name in COLUMNS[kind]:
         if name in _INTEGERS:
-            content[name] = np.array(values[name], dtype=np.int64) if name in values else np.full(count, -1)
+            content[name] = array(values[name], dtype=np.int64) if name in values else np.full(count, -1)
         else:
-            content[name] = np.array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
+            content[name] = array(values[name], dtype=np.float64) if name in values else np.full(count, np.nan)
     for name, column in values.items():
         if name not in content:
             content[name] = np.array(column)
@@ -66,5 +70,6 @@ def attributes(options: ReadOptions, **extra: Attribute | None) -> dict[str, Att
 
 def steps_back(records: pd.DataFrame) -> list[str]:
     """Warning where the clock of a log runs backwards."""
-    back = blocks.steps_back(records["time"].to_numpy())
+    time = records["time"].to_numpy()
+    back = int(np.count_nonzero(time[1:] < time[:-1]))
     return [f"time steps back at {back} places"] if back else []

@@ -7,14 +7,14 @@ without LF is a line too; a file that ends with LF has no further, empty line.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
-from aerpaw_cmp.logs.records import RejectedLine
+from aerpaw_cmp.logs.records import KEPT_REJECTED, RejectedLine, RejectedReason
 
 TEXT_LIMIT = 500
 """Characters of a rejected line that are kept."""
@@ -171,6 +171,40 @@ def _each(lines: Lines, pattern: re.Pattern[bytes], numbers: Iterable[int]) -> t
     found = [(i, pattern.match(lines.raw(i))) for i in numbers]
     kept = [(i, one.groups(b"")) for i, one in found if one is not None]
     return np.array([i for i, _ in kept], dtype=np.int64), [groups for _, groups in kept]
+
+
+class Rejects:
+    """Rejected lines of a log that is read in pieces: the first of them verbatim, all counted by reason."""
+
+    def __init__(self) -> None:
+        self.before = 0  # lines of the pieces in front of this one
+        self._kept: list[RejectedLine] = []
+        self._reasons: dict[str, RejectedReason] = {}
+
+    def add(self, lines: Lines, numbers: Sequence[int] | IntArray, reason: str) -> None:
+        """Lines (0-based) of a piece, for one reason; of each reason and piece the first are kept."""
+        if not len(numbers):
+            return
+        low, high = int(min(numbers)) + self.before + 1, int(max(numbers)) + self.before + 1
+        self._count(reason, len(numbers), low, high)
+        if len(self._kept) < 4 * KEPT_REJECTED:  # more come in the order of the file, but for the reasons of a piece
+            for i in sorted(numbers)[:KEPT_REJECTED]:
+                self._kept.append(RejectedLine(int(i) + self.before + 1, reason, lines.text(int(i))))
+
+    def one(self, number: int, reason: str, text: str) -> None:
+        """A line by its number from 1."""
+        self._count(reason, 1, number, number)
+        if len(self._kept) < 8 * KEPT_REJECTED:
+            self._kept.append(RejectedLine(number, reason, text))
+
+    def _count(self, reason: str, count: int, low: int, high: int) -> None:
+        old = self._reasons.get(reason, RejectedReason(reason, 0, low, high))
+        self._reasons[reason] = RejectedReason(reason, old.count + count, min(old.first, low), max(old.last, high))
+
+    def result(self) -> tuple[tuple[RejectedLine, ...], tuple[RejectedReason, ...]]:
+        """The first of them in the order of the file, and the reasons."""
+        kept = sorted(self._kept, key=lambda line: line.number)[:KEPT_REJECTED]
+        return tuple(kept), tuple(sorted(self._reasons.values(), key=lambda one: one.first))
 
 
 def remainder(

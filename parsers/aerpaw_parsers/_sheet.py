@@ -18,14 +18,12 @@ from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _alike, _by_eights, _decided, _lines, _rows, _stamps, _table
+from . import _lines, _rows, _stamps
 from ._quantities import plain
 
 SEPARATORS = (",", ";", "\t", "|")
 TITLES = 60
 """Lines in front of a header, at most."""
-_MOST_TEXTS = 200_000
-_LONGEST_TIME = 64
 _NUMBER = re.compile(r"[-+]?\d{0,20}(?:[.,]\d{0,20})?(?:[eE][-+]?\d{1,3})?")
 _UNIT = re.compile(r"[\[(]([^\[\]()]{1,12})[\])]\s*$")
 _READ_IN = {
@@ -96,30 +94,19 @@ def _number(text: str) -> float:
 
 @dataclass
 class Sheet:
-    """A table: names of its columns, and where its cells are.
+    """A table: names of its columns, and the texts of its cells.
 
     Parameters
     ----------
     lines : Lines
-    names, plain : list of str
-        Column names as written, and in plain form.
+    names : list of str
+        Column names as written.
     row : int array, shape (n,)
         0-based lines of the rows.
-    quick : Fields
-        Cells of the rows that separators alone divide.
-    quick_at : int array
-        Which of the rows these are.
-    slow : list of list of str
-        Cells of all other rows: quoted ones, mostly.
-    slow_at : int array
-        Which of the rows these are.
+    cells : list of list of str, length n
     blank_rows : int array
-        0-based lines of titles and header.
+        0-based lines of titles, headers and words below the table.
     rejected : list of RejectedLine
-    comma : bool
-        Is a comma in a number its decimal sign?
-    foot : bool
-        Do words stand below the table?
     units : dict of int to str
         Units of columns whose names have none.
     """
@@ -127,14 +114,9 @@ class Sheet:
     lines: _lines.Lines
     names: list[str]
     row: IntArray
-    quick: _table.Fields
-    quick_at: IntArray
-    slow: list[list[str]]
-    slow_at: IntArray
+    cells: list[list[str]]
     blank_rows: IntArray
     rejected: list[RejectedLine] = field(default_factory=list)
-    comma: bool = False
-    foot: bool = False
     units: dict[int, str] = field(default_factory=dict)
     _silent: dict[int, BoolArray] = field(default_factory=dict)
     _numbers: dict[int, FloatArray] = field(default_factory=dict)
@@ -147,12 +129,6 @@ class Sheet:
     def plain(self) -> list[str]:
         """Names in plain form."""
         return [plain(name) for name in self.names]
-
-    @cached_property
-    def _pointed(self) -> _lines.Lines:
-        """The lines with each comma of a number as a point."""
-        lines = self.lines
-        return _lines.Lines(lines.data.replace(b",", b"."), lines.starts, lines.ends) if self.comma else lines
 
     def find(self, *patterns: str) -> int | None:
         """The first column whose plain name is wholly one of the patterns; earlier patterns are preferred."""
@@ -178,85 +154,28 @@ class Sheet:
 
     def keep(self, where: BoolArray) -> None:
         """Leave the rows out that a mask does not hold."""
-        if where.all():
-            return
-        at = np.cumsum(where) - 1
-        quick, slow = where[self.quick_at], where[self.slow_at]
-        self.quick, self.quick_at = self.quick.take(quick), at[self.quick_at[quick]]
-        self.slow = [cells for cells, kept in zip(self.slow, slow.tolist(), strict=True) if kept]
-        self.slow_at = at[self.slow_at[slow]]
+        self.cells = [cells for cells, kept in zip(self.cells, where.tolist(), strict=True) if kept]
         self.row = self.row[where]
         self._silent = {column: mask[where] for column, mask in self._silent.items()}
         self._numbers = {}
 
     def texts(self, column: int) -> list[str]:
         """A column as text."""
-        made = np.full(len(self), "", dtype=object)
-        if column < self.quick.ends.shape[1]:
-            made[self.quick_at] = self._cells(column)
-        made[self.slow_at] = [cells[column].strip() for cells in self.slow]
+        made = [cells[column].strip() for cells in self.cells]
         if column in self._silent:
-            made[self._silent[column]] = ""
-        return list(made)
-
-    def cells(self, column: int) -> Sequence[str]:
-        """A column as text, spaces around included; without an object per cell where that can be."""
-        plain = not self.slow and column not in self._silent and self.lines.data.isascii() and len(self) > 0
-        if not plain or column >= self.quick.ends.shape[1] or int(self.quick.width(column).max()) > _LONGEST_TIME:
-            return self.texts(column)
-        return _alike.Cells(_table.texts(self.lines, self.quick.start(column), self.quick.ends[:, column]))
-
-    def _cells(self, column: int) -> list[str]:
-        """Texts of the quick rows."""
-        data, form, text = self.lines.data, _form(column), self._ascii
-        places = zip(self.quick.start(column).tolist(), self.quick.ends[:, column].tolist(), strict=True)
-        if text is not None:
-            return [text[begin:end].strip() for begin, end in places]
-        return [data[begin:end].decode(form, "replace").strip() for begin, end in places]
-
-    @cached_property
-    def _ascii(self) -> str | None:
-        return self.lines.data.decode("ascii") if self.lines.data.isascii() else None
+            made = ["" if silent else text for text, silent in zip(made, self._silent[column].tolist(), strict=True)]
+        return made
 
     def numbers(self, column: int) -> FloatArray:
         """A column as numbers in the unit of its name's brackets made SI or degrees; what is none is NaN. Read only."""
         if column not in self._numbers:
-            self._numbers[column] = self._parsed(column)
-            self._numbers[column].flags.writeable = False  # the next who asks gets the same
+            texts = self.texts(column)
+            known = {text: _number(text) for text in set(texts)}  # tables repeat themselves
+            made = np.array([known[text] for text in texts], dtype=np.float64)
+            made *= _FACTORS.get(self.unit(column), ("", 1.0))[1]
+            made.flags.writeable = False  # the next who asks gets the same
+            self._numbers[column] = made
         return self._numbers[column]
-
-    def _parsed(self, column: int) -> FloatArray:
-        factor = _FACTORS.get(self.unit(column), ("", 1.0))[1]
-        quick = len(self.quick.rows) > 0 and column < self.quick.ends.shape[1]
-        if quick and not self.slow:
-            out = self._quick_numbers(column)
-        else:
-            out = np.full(len(self), np.nan)
-            if quick:
-                out[self.quick_at] = self._quick_numbers(column)
-        if self.slow:
-            texts = [cells[column] for cells in self.slow]
-            known = {text: _number(text.strip()) for text in set(texts)}  # few distinct texts in most columns
-            out[self.slow_at] = [known[text] for text in texts]
-        if column in self._silent:
-            out[self._silent[column]] = np.nan
-        return out if factor == 1.0 else out * factor
-
-    def _quick_numbers(self, column: int) -> FloatArray:
-        begin, end, data = self.quick.start(column), self.quick.ends[:, column], self.lines.data
-        spaced = self.lines.buffer[np.minimum(begin, len(data) - 1)] == 32
-        if spaced.any():
-            begin = begin + (spaced & (end > begin))
-        read = _by_eights.decimals(self._pointed, _table.Fields(self.quick.rows, begin, end[:, None]), [0])
-        value, odd = read.value[0], np.flatnonzero(read.odd[0])
-        known: dict[bytes, float] = {}
-        for i, first, last in zip(odd.tolist(), begin[odd].tolist(), end[odd].tolist(), strict=True):
-            cell = data[first:last]
-            found = known.get(cell)
-            if found is None:
-                found = known[cell] = _number(cell.decode(_form(column), "replace").strip())
-            value[i] = found
-        return value
 
 
 @cache
@@ -270,120 +189,51 @@ def matches(name: str, patterns: tuple[str, ...]) -> bool:
     return _compiled(patterns)[0].fullmatch(name) is not None
 
 
-def _form(column: int) -> str:
-    """What a cell is encoded as: a mark may stand in front of a line."""
-    return "utf-8" if column else "utf-8-sig"
-
-
-def head_bytes(is_header: IsHeader) -> Callable[[bytes], int]:
-    """How many bytes titles and header of a table take: ``head(data)``, more than there are while it may yet come."""
-
-    def head(data: bytes) -> int:
-        lines: list[bytes] = []
-        ends = [0]
-        while len(lines) < TITLES and (stop := data.find(b"\n", ends[-1])) >= 0:
-            lines.append(data[ends[-1] : stop].removesuffix(b"\r"))
-            ends.append(stop + 1)
-        found = header_of(lines, is_header)
-        if found is None:
-            return 0 if len(lines) == TITLES else len(data) + 1
-        return ends[found[0] + 1]
-
-    return head
-
-
-def read(data: bytes, is_header: IsHeader, decided: _decided.Decided) -> Sheet | None:
-    """The table of a file or of a block of it, None where no line is its header; all blocks have one, or none has."""
+def read(data: bytes, is_header: IsHeader) -> Sheet | None:
+    """The table of a file, None where none of its first lines is its header."""
     found = header_of([line.removesuffix(b"\r") for line in data.split(b"\n", TITLES)[:TITLES]], is_header)
-    decided.agree("a header among the first lines", found is not None)
     if found is None:
         return None
     at, separator, names = found
-    lines, fields = _by_eights.table(data, len(names), ord(separator))
-    quick = _quick(lines, fields, at, separator, names)
+    lines = _lines.split(data)
     left = ~lines.blank
     left[: at + 1] = False
-    left[quick.rows] = False
-    rest = _rest(lines, np.flatnonzero(left), separator, names)
-    number = np.array(rest.number, dtype=np.int64)
-    row = np.sort(np.concatenate((quick.rows, number))) if len(number) else quick.rows
-    last = int(row[-1]) if len(row) else at
-    foot = [line.number - 1 for line in rest.rejected if line.number - 1 > last and separator not in line.text]
-    if foot and lines.unterminated and foot[-1] == len(lines) - 1:
-        foot.pop()  # a torn row
-    below = set(foot)  # words below the table, as Nemo writes them
+    row: list[int] = []
+    cells: list[list[str]] = []
+    other: list[int] = [*range(at + 1)]
+    odd: list[tuple[int, int]] = []
+    for i in np.flatnonzero(left).tolist():
+        fields = _fitted(_split(lines.raw(i), separator), names)
+        if len(fields) != len(names):
+            odd.append((i, len(fields)))
+        elif fields[0].strip() == names[0] and [text.strip() for text in fields] == names:
+            other.append(i)  # a header again: files joined by hand
+        else:
+            row.append(i)
+            cells.append(fields)
+    last = row[-1] if row else at
+    torn = len(lines) - 1 if lines.unterminated else -1
+    # words below the table, as Nemo writes them, have no separator
+    foot = {i for i, count in odd if i > last and count == 1 and i != torn}
     return Sheet(
         lines=lines,
         names=names,
-        row=row,
-        quick=quick,
-        quick_at=np.searchsorted(row, quick.rows) if len(number) else np.arange(len(row)),
-        slow=rest.cells,
-        slow_at=np.searchsorted(row, number),
-        blank_rows=np.array([*range(at + 1), *rest.repeats, *foot], dtype=np.int64),
-        rejected=[line for line in rest.rejected if line.number - 1 not in below],
-        comma=separator != ",",
-        foot=bool(foot),
+        row=np.array(row, dtype=np.int64),
+        cells=cells,
+        blank_rows=np.array([*other, *foot], dtype=np.int64),
+        rejected=[
+            lines.reject(i, f"{count} fields where the header has {len(names)} (torn line?)")
+            for i, count in odd
+            if i not in foot
+        ],
     )
 
 
-def _quick(lines: _lines.Lines, found: _table.Fields, at: int, separator: str, names: list[str]) -> _table.Fields:
-    """Of the lines with as many cells as names the rows that separators alone divide: no quote, no repeated header."""
-    width = len(names)
-    if 2 * len(found.rows) < len(lines) - at and len(lines) > at + 1:
-        others = [_table.fields(lines, width + 1, ord(separator))]  # a separator at the end of each row
-        if not names[-1]:
-            others.append(_table.fields(lines, width - 1, ord(separator)))
-        found = max(found, *others, key=lambda fields: len(fields.rows))
-    plain_rows = (found.rows > at) & ~lines.blank[found.rows]
-    for sign in (b'"', b"\0"):
-        if sign in lines.data:
-            marked = np.searchsorted(lines.starts, _lines.places(lines.buffer, sign[0]), side="right") - 1
-            plain_rows &= ~np.isin(found.rows, marked)
-    if found.ends.shape[1] > width:
-        plain_rows &= found.width(width) == 0
-    plain_rows &= ~_may_be(lines, found, names[0])
-    return found.take(plain_rows)
-
-
-def _may_be(lines: _lines.Lines, found: _table.Fields, name: str) -> BoolArray:
-    """Rows whose first cell may be a name: one that begins as the name does, or with what is no text."""
-    first = lines.buffer[np.minimum(found.begin, max(len(lines.data) - 1, 0))]
-    begins = name.encode()[:1]
-    if not begins:
-        return np.asarray((first < 48) | (first > 57))
-    return np.asarray((first == begins[0]) | (first <= 32) | (first >= 128))
-
-
-@dataclass
-class _Rest:
-    """Lines that are read one by one: rows, lines of another width, repeated headers."""
-
-    number: list[int] = field(default_factory=list)
-    cells: list[list[str]] = field(default_factory=list)
-    rejected: list[RejectedLine] = field(default_factory=list)
-    repeats: list[int] = field(default_factory=list)
-
-
-def _rest(lines: _lines.Lines, numbers: IntArray, separator: str, names: list[str]) -> _Rest:
-    made, width = _Rest(), len(names)
-    same: dict[str, str] = {}  # one text object for equal cells: tables repeat themselves
-    for i in numbers.tolist():
-        one = _split(lines.raw(i), separator)
-        if len(one) == width + 1 and not one[-1].strip():
-            one.pop()  # a separator at the end of each row
-        if len(one) == width - 1 and not names[-1]:
-            one.append("")
-        if [text.strip() for text in one] == names:
-            made.repeats.append(i)  # files joined by hand
-        elif len(one) == width:
-            made.number.append(i)
-            made.cells.append([same.setdefault(text, text) for text in one])
-            if len(same) > _MOST_TEXTS:
-                same.clear()
-        else:
-            made.rejected.append(lines.reject(i, f"{len(one)} fields where the header has {width} (torn line?)"))
-    return made
+def _fitted(fields: list[str], names: list[str]) -> list[str]:
+    """Fields of a row without what a separator at the end of rows, or of the header alone, makes of them."""
+    if len(fields) == len(names) + 1 and not fields[-1].strip():
+        return fields[:-1]
+    return [*fields, ""] if len(fields) == len(names) - 1 and not names[-1] else fields
 
 
 TIME_NAMES = (
@@ -401,23 +251,18 @@ SRSUE = {"time", "cc", "earfcn", "rsrp", "cfo"}
 """Columns of srsUE's metrics file, whose time counts milliseconds."""
 
 
-def rows(
-    sheet: Sheet, options: ReadOptions, decided: _decided.Decided, *, reader: str, also: Sequence[str] = ()
-) -> _rows.Rows | None:
+def rows(sheet: Sheet, options: ReadOptions, *, reader: str, also: Sequence[str] = ()) -> _rows.Rows | None:
     """Rows of a table with their times; None where no column is one of times.
 
     Parameters
     ----------
-    decided : Decided
-        How earlier blocks of the table were read. Raises ``blocks.Whole`` where this one must be read otherwise.
     also : sequence of str
         Patterns of further names of the time column, preferred.
     """
     column = sheet.find(*also, *TIME_NAMES)
     if column is None:
         return None
-    decided.begin(len(sheet), foot=sheet.foot)
-    texts = sheet.cells(column)
+    texts = sheet.texts(column)
     day = sheet.find(r"(custom )?date( local| utc)?")
     if day is not None and day != column:
         pairs = zip(sheet.texts(day), sheet.texts(column), strict=True)
@@ -426,10 +271,7 @@ def rows(
     in_ms = unit in ("ms", "millisecond", "milliseconds") or re.search(r"\bms\b|millisecond", name) is not None
     count = "ms" if in_ms or set(sheet.plain) >= SRSUE else "s" if unit or name.endswith(" s") else None
     utc = re.search(r"\b(utc|gps|gmt)\b", name) is not None
-    course: _stamps.Course = decided.kept.setdefault("times", _stamps.Course())
-    clock, cells, warnings = _stamps.read(texts, options, unit=count, course=course)
-    if any(texts):
-        decided.agree("times", (clock, course.day_first, *warnings))
+    clock, cells, warnings = _stamps.read(texts, options, unit=count)
     if clock == "wall" and utc and not np.char.endswith(cells, b"Z").all():
         cells = np.array([cell if re.search(rb"(Z|[+-]\d\d:?\d\d)$", cell) else cell + b"Z" for cell in cells.tolist()])
     made = _rows.built(

@@ -8,15 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
-from itertools import islice
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
 from aerpaw_cmp.logs.readers import ReadOptions
 
-from . import _alike, _time
+from . import _time
 
 _CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
 _ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
@@ -81,88 +79,19 @@ def _dated(text: str, day_first: bool) -> bytes | None:
     return None
 
 
-def _dates(part: _alike.Alike, day_first: bool) -> AnyArray:
-    """Times of one form in the common form, as :func:`_dated` writes each."""
-    found = _YEAR_FIRST.fullmatch(part.first) or _YEAR_LAST.fullmatch(part.first) or _WORD_MONTH.fullmatch(part.first)
-    if found is None:
-        return np.full(len(part), b"-")
-    span = _alike.spans(found)
-    if found.re is _YEAR_FIRST:
-        return _common(part, span[1:9])
-    if found.re is _YEAR_LAST:
-        day, month = (1, 3) if day_first else (3, 1)
-        return _common(part, [span[4], span[month], span[day], *span[5:]])
-    return _common(part, [span[3], span[2], span[1], *span[4:]])
-
-
-def _common(part: _alike.Alike, span: Sequence[tuple[int, int]]) -> AnyArray:
-    """The common form from the places of year, month, day, hour, minute, second, half of the day and zone."""
-    year, month, _day, _hour, _minute, second, half, zone = (part.first[begin:end] for begin, end in span)
-    hours = part.whole(span[3])
-    if half:
-        hours = hours % 12 + (12 if half.lower() == "pm" else 0)
-    months = part.whole(span[1]) if month.isdigit() else np.full(len(part), _month(month))
-    end = "Z" if zone in ("UTC", "GMT") else zone
-    begin = span[5][0]
-    seconds = part.whole((begin, begin + 2) if second else (0, 0))
-    made = np.empty((len(part), 19 + len(second[2:]) + len(end)), dtype=np.uint8)
-    made[:, :19] = np.frombuffer(b"2000-00-00 00:00:00", dtype=np.uint8)
-    made[:, 4 - len(year) : 4] = part.cells[:, slice(*span[0])]
-    for place, value in ((5, months), (8, part.whole(span[2])), (11, hours), (14, part.whole(span[4])), (17, seconds)):
-        made[:, place], made[:, place + 1] = 48 + value // 10, 48 + value % 10
-    if second[2:]:
-        made[:, 19] = 46
-        made[:, 20 : 19 + len(second[2:])] = part.cells[:, begin + 3 : span[5][1]]
-    if end:
-        made[:, -len(end) :] = part.cells[:, slice(*span[7])] if end == zone else 90
-    return np.asarray(made.view(f"S{made.shape[1]}").ravel())
-
-
-def _day_first(texts: Sequence[str], groups: Iterable[_alike.Alike]) -> bool | None:
+def _day_first(texts: Iterable[str]) -> bool | None:
     """Whether the day stands before the month; None where every date can be read both ways."""
-    points, pairs = [], []
-    for part in groups:
-        found = _YEAR_LAST.fullmatch(part.first)
-        if found is None:
-            continue
-        points.append(found[2] == ".")
-        if part.at_once:
-            span = _alike.spans(found)
-            pairs.append((int(part.whole(span[1]).max()), int(part.whole(span[3]).max())))
-        else:
-            ones = [one for i in part.at.tolist() if (one := _YEAR_LAST.fullmatch(texts[i]))]
-            pairs += [(int(one[1]), int(one[3])) for one in ones]
-    if points and all(points):
+    dates = [found for text in texts if (found := _YEAR_LAST.fullmatch(text))]
+    if dates and all(found[2] == "." for found in dates):
         return True  # 02.03.2025: where points stand, the day comes first
-    if any(first > 12 for first, _ in pairs):
+    if any(int(found[1]) > 12 for found in dates):
         return True
-    if any(second > 12 for _, second in pairs) or not pairs:
+    if any(int(found[3]) > 12 for found in dates) or not dates:
         return False
     return None
 
 
-@dataclass
-class Course:
-    """Where a column of times has come to.
-
-    Parameters
-    ----------
-    last_s : float
-        The last time of the day [s].
-    midnights : int
-        Since the first.
-    day_first : bool or None
-        Whether the day of a date came before its month, as the last part of the column says.
-    """
-
-    last_s: float = np.nan
-    midnights: int = 0
-    day_first: bool | None = False
-
-
-def read(
-    texts: Sequence[str], options: ReadOptions, *, unit: str | None = None, course: Course | None = None
-) -> tuple[str, AnyArray, list[str]]:
+def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None) -> tuple[str, AnyArray, list[str]]:
     """A column of times in any of the known forms.
 
     Parameters
@@ -170,8 +99,6 @@ def read(
     texts : sequence of str
     unit : {"s", "ms"}, optional
         Of numbers, where the head of the column says so and they count from no known origin.
-    course : Course, optional
-        Of the column's part before; brought to the end of this one.
 
     Returns
     -------
@@ -181,47 +108,22 @@ def read(
         Bytes or floats for it.
     warnings : list of str
     """
-    shown, groups = texts, texts.grouped() if isinstance(texts, _alike.Cells) else None
-    if groups is None:
-        shown = [_alike.bare(text) for text in texts]
-        groups = _alike.grouped(shown)
-    some, counts, of_day = (
-        sum(len(part) for part in groups if known(part.first)) for known in (bool, _NUMBER.fullmatch, _OF_DAY.fullmatch)
-    )
-    if counts * 2 > some and not any(_DIGITS.fullmatch(text) for text in islice(filter(None, shown), 3)):
-        return _numbers(shown, groups, unit, options)
-    if of_day * 2 > some:
-        return _of_day(shown, groups, options, course or Course())
-    first = _day_first(shown, groups)
-    if course is not None:
-        course.day_first = first
+    shown = [text.strip().strip('"').strip() for text in texts]
+    some = [text for text in shown if text]
+    counts = sum(_NUMBER.fullmatch(text) is not None for text in some)
+    if counts * 2 > len(some) and not any(_DIGITS.fullmatch(text) for text in some[:3]):
+        return _numbers(shown, unit, options)
+    if sum(_OF_DAY.fullmatch(text) is not None for text in some) * 2 > len(some):
+        return _of_day(shown, options)
+    first = _day_first(some)
     warnings = ["the dates can be read with the day or the month first: the month was taken"] if first is None else []
-    parts = [(part.at, _in_common(part, shown, bool(first))) for part in groups]
-    cells = np.zeros(len(shown), dtype=f"S{max((made.dtype.itemsize for _, made in parts), default=1)}")
-    for at, made in parts:
-        cells[at] = made
-    return "wall", cells, warnings
+    made = [text.encode() if _COMMON.fullmatch(text) else _dated(text, bool(first)) or b"-" for text in shown]
+    return "wall", np.array(made or [b"-"], dtype=np.bytes_)[: len(made)], warnings
 
 
-def _in_common(part: _alike.Alike, texts: Sequence[str], day_first: bool) -> AnyArray:
-    """Times of one form in the common one, ``-`` where they are none."""
-    if part.at_once and _COMMON.fullmatch(part.first):
-        return np.ascontiguousarray(part.cells).view(f"S{len(part.first)}").ravel()
-    if part.at_once and not part.first[:8].isdigit():  # of _DIGITS it matters which they are
-        return _dates(part, day_first)
-    return np.array([_dated(texts[i], day_first) or b"-" for i in part.at.tolist()], dtype=np.bytes_)
-
-
-def _numbers(
-    texts: Sequence[str], groups: Iterable[_alike.Alike], unit: str | None, options: ReadOptions
-) -> tuple[str, AnyArray, list[str]]:
+def _numbers(texts: Sequence[str], unit: str | None, options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
     """Numbers: epochs by their size, else relative times."""
-    value = np.full(len(texts), np.nan)
-    for part in groups:
-        if _NUMBER.fullmatch(part.first) and part.at_once:
-            value[part.at] = part.numbers((0, len(part.first)))
-        elif _NUMBER.fullmatch(part.first):
-            value[part.at] = [float(texts[i].replace(",", ".")) for i in part.at.tolist()]
+    value = np.array([float(text.replace(",", ".")) if _NUMBER.fullmatch(text) else np.nan for text in texts])
     middle = float(np.nanmedian(np.abs(value))) if np.isfinite(value).any() else 0.0
     for scale, form in ((1e18, None), (1e15, "epoch_us"), (1e12, "epoch_ms"), (1e9, "epoch_s")):
         if middle >= 0.9 * scale:
@@ -236,19 +138,12 @@ def _numbers(
 _MILLISECONDS = "the times are whole numbers beyond a day of seconds: read as milliseconds"
 
 
-def _of_day(
-    texts: Sequence[str], groups: Iterable[_alike.Alike], options: ReadOptions, course: Course
-) -> tuple[str, AnyArray, list[str]]:
+def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, list[str]]:
     """Times of the day: their date is that of ``time_origin``, of the file name, or nobody's."""
-    seconds = np.full(len(texts), np.nan)
-    marked = False
-    for part in groups:
-        if found := _OF_DAY.fullmatch(part.first):
-            marked |= bool(found[5])
-            seconds[part.at] = _seconds_of(part, found, texts)
-    midnights = course.midnights + np.cumsum(np.nan_to_num(np.diff(seconds, prepend=course.last_s)) < -43_200)
-    course.last_s, course.midnights = float(seconds[-1]), int(midnights[-1])
-    seconds = seconds + 86_400.0 * midnights
+    found = [_OF_DAY.fullmatch(text) for text in texts]
+    seconds = np.array([_seconds(one.groups()) if one else np.nan for one in found], dtype=np.float64)
+    seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
+    marked = any(one[5] for one in found if one)
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
     return _on_a_date(seconds, options, warnings)
 
@@ -263,18 +158,6 @@ def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -
     cells = np.where(np.isnan(seconds), b"-", cells)
     source = "time_origin" if options.time_origin else "the file name"
     return "wall", cells, [f"the times have no date: it is that of {source}, {date}", *warnings]
-
-
-def _seconds_of(part: _alike.Alike, found: re.Match[str], texts: Sequence[str]) -> FloatArray:
-    """Times of the day of one form [s]."""
-    if not part.at_once:
-        ones = [_OF_DAY.fullmatch(texts[i]) for i in part.at.tolist()]
-        return np.array([_seconds(one.groups()) if one else np.nan for one in ones], dtype=np.float64)
-    span = _alike.spans(found)
-    hour = part.whole(span[1])
-    if found[4]:
-        hour = hour % 12 + (12 if found[4].lower() == "pm" else 0)
-    return np.asarray(hour * 3600.0 + part.whole(span[2]) * 60.0 + part.numbers(span[3]))
 
 
 def _seconds(parts: Sequence[str | None]) -> float:

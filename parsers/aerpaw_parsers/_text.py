@@ -1,15 +1,14 @@
 """A text format from its parts: the regular expression of its rows, what marks it, and the streams of its columns.
 
-:func:`reader` does the rest: sniffing, the account of all lines, times, torn last lines, and reading in blocks.
+:func:`reader` does the rest: sniffing, the account of all lines, times, torn last lines.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Kind, ReadResult, Stream
 
@@ -35,8 +34,6 @@ def reader(
     fields: int = 0,
     clock: str = "wall",
     skip: Callable[[bytes, IntArray], BoolArray] | None = None,
-    keep: Sequence[Pattern] = (),
-    settle: Callable[[ReadResult], ReadResult] | None = None,
 ) -> Reader:
     r"""A reader of lines that a pattern describes.
 
@@ -52,7 +49,7 @@ def reader(
         By default a file is known by its first line where there is a ``header``, by ``mark`` where there is one, else
         by most of its first lines being rows.
     header : re.Pattern, optional
-        The whole line above a table: a comment wherever it stands, and part of every block of a large file.
+        The whole line above a table: a comment wherever it stands.
     mark : re.Pattern, optional
         MULTILINE; a line by which a console is known.
     torn : re.Pattern, optional
@@ -66,9 +63,6 @@ def reader(
         See :func:`_rows.times`.
     skip : callable, optional
         ``skip(data, lines)``: which of the matching lines (0-based) are comments after all.
-    keep : sequence of re.Pattern
-    settle : callable, optional
-        See :func:`aerpaw_cmp.logs.blocks.by_lines`.
     """
 
     def reason(line: bytes) -> str | None:
@@ -100,5 +94,4 @@ def reader(
         sample=sample,
         sniff=sniff or (known if mark is None else marked),
         read=read,
-        in_blocks=blocks.by_lines(read, head=None if header is None else blocks.first_line, keep=keep, settle=settle),
     )

@@ -121,15 +121,15 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
                      for fold in (0, 1))  # fmt: skip
     length = np.diff(np.append(starts, len(wall_ns)))
     if np.array_equal(first, second):
-        utc = (wall_ns - np.repeat(first[index] * 1_000_000_000, length)).view("datetime64[ns]")
-        return Instants(utc, np.zeros(len(utc), dtype=bool), np.zeros(len(utc), dtype=bool))
-    inverse = np.repeat(index, length)
-    ambiguous = (first > second)[inverse]
-    nonexistent = (first < second)[inverse]
-    offset = first[inverse]
-    if ambiguous.any():
-        stepped = np.concatenate(([False], np.diff(wall_ns // 1_000_000_000) <= -1800))
-        offset = np.where(ambiguous & (np.cumsum(stepped) > 0), second[inverse], offset)
+        return Instants(_minus(wall_ns, first[index], length), *np.zeros((2, len(wall_ns)), dtype=bool))
+    ambiguous = np.repeat((first > second)[index], length)
+    nonexistent = np.repeat((first < second)[index], length)
+    utc = _minus(wall_ns, first[index], length)
+    back = _first_step_back(wall_ns) if ambiguous.any() else len(wall_ns)
+    if back < len(wall_ns):
+        behind = ambiguous.copy()
+        behind[:back] = False
+        utc[behind] += np.repeat((first - second)[index], length)[behind].astype("timedelta64[s]")
     warnings = []
     if ambiguous.any():
         warnings.append(
@@ -140,8 +140,27 @@ def local_to_utc(wall_ns: IntArray, name: str | None, *, needed_by: str) -> Inst
         warnings.append(
             f"{int(nonexistent.sum())} times lie in the hour that {name} skipped: wrong zone? flagged {NONEXISTENT}"
         )
-    utc = (wall_ns - offset * 1_000_000_000).astype("datetime64[ns]")
     return Instants(utc, ambiguous, nonexistent, tuple(warnings))
+
+
+def _minus(wall_ns: IntArray, offset_s: IntArray, length: IntArray) -> AnyArray:
+    """UTC of wall clocks [ns] in runs of so many with one offset [s]; no more memory than the result."""
+    utc = np.repeat(offset_s * 1_000_000_000, length)
+    np.subtract(wall_ns, utc, out=utc)
+    return utc.view("datetime64[ns]")
+
+
+def _first_step_back(wall_ns: IntArray) -> int:
+    """Index behind the first step back by half an hour or more; the number of times where there is none."""
+    for first in range(0, len(wall_ns) - 1, _AT_ONCE):
+        whole_s = wall_ns[first : first + _AT_ONCE + 1] // 1_000_000_000
+        steps = np.flatnonzero(whole_s[1:] - whole_s[:-1] <= -1800)
+        if len(steps):
+            return first + int(steps[0]) + 1
+    return len(wall_ns)
+
+
+_AT_ONCE = 1 << 20
 
 
 def _runs(wall_ns: IntArray) -> tuple[IntArray, IntArray, IntArray]:

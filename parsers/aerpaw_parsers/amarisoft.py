@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _decided, _json, _lines, _rows, _time
+from . import _json, _lines, _rows, _time
 
 _STAMP = rb"^\[(" + _time.TIME + rb")\] *"
 _TITLE = re.compile(
@@ -91,17 +90,10 @@ def sniff_json(head: bytes) -> bool:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE, cell and answer; one without the time that the others have is rejected."""
-    return _read_answers(data, options, _decided.Decided())
-
-
-def _read_answers(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
-    """Answers of a block; whether they have ``utc`` no log may change half way."""
     lines = _lines.split(data)
     answers = _json.objects(lines)
     found = answers.found
     has_utc = any("utc" in one for one in found)
-    if found:
-        decided.agree("utc", has_utc)
     time = _json.column(found, "utc" if has_utc else "time")
     rows = _rows.built(
         lines, answers.row, {"time": time}, options, reader="amarisoft_json", reason=_json.bracket,
@@ -131,7 +123,6 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000] UE_ID  CL RNTI C cqi  ri  mcs retx txok brate",
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read, keep=(_TITLE,)),
 )
 JSON_READER = Reader(
     name="amarisoft_json",
@@ -140,5 +131,4 @@ JSON_READER = Reader(
     sample='{"message": "ue_get", "utc": 1740927600.25, "ue_list": [{"rnti": 70, "cells": [{"cqi": 15, "ri": 2.0}]}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_decided.json_in_blocks(_read_answers),
 )

@@ -14,7 +14,7 @@ import numpy as np
 from aerpaw_cmp.common.units import BoolArray, IntArray
 from aerpaw_cmp.logs.records import Stream
 
-from . import _decided, _lines, _rows, _text, _time
+from . import _lines, _rows, _text, _time
 
 _STAMP = rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] "
 _VALUE = re.compile(_STAMP + rb"(?P<tower>\d{1,2}):(?P<snr>" + _lines.NUMBER + rb"|nan|-?inf)[ \t]*\r?$", re.MULTILINE)
@@ -43,7 +43,5 @@ READER = _text.reader(
     row=_VALUE,
     torn=re.compile(_STAMP + rb"\d{1,2}:"),
     skip=_no_level,
-    keep=(_BLOCK,),
     streams=_streams,
-    settle=_decided.ordered(lambda stream: int(stream.name.removeprefix("LW"))),
 )

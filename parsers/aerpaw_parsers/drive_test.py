@@ -20,7 +20,6 @@ from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import (
     _cells,
-    _decided,
     _lines,
     _nemo,
     _pose,
@@ -196,87 +195,27 @@ def _or_nan(sheet: _sheet.Sheet, column: int | None, count: int) -> FloatArray:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells, ranks, KPIs and the track of the phone; UsageError if the clock has no zone and none is given."""
-    return _decided.in_one_piece(_read, _settled, data, options)
-
-
-def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
-    """What each row says by itself, and the cell that served before."""
-    sheet = _sheet.read(data, is_header, decided)
-    rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="drive_test")
+    sheet = _sheet.read(data, is_header)
+    rows = None if sheet is None else _sheet.rows(sheet, options, reader="drive_test")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "drive_test", "no header with a time and a level, ratio or rank")
     _settle_names(sheet)
     cells, others, ranks = _places(sheet)
-    readings = _readings(sheet, cells)
-    track = _pose.from_sheet(rows, sheet, decided, name="phone", source="table of a phone")
-    serving: dict[str, float] = decided.kept.setdefault("serving", {})
-    levels = _cells.streams(rows, readings, source="drive test", before=serving)
-    _carry_on(readings, serving)
-    columns = [*ranks, *others, *_beside(sheet, cells, decided)]
-    names = [_stream_name(sheet, column) for column in columns]
-    if len(sheet):
-        decided.kept["order"] = names
-    if len(set(names) | _TAKEN) < len(names) + len(_TAKEN):
-        decided.one_piece()  # which of two columns of one name has values all rows say
+    track = _pose.from_sheet(rows, sheet, name="phone", source="table of a phone")
+    levels = _cells.streams(rows, _readings(sheet, cells), source="drive test")
+    columns = [*ranks, *others, *_beside(sheet, cells)]
     streams = [(_rank if column in ranks else _other)(rows, sheet, column) for column in columns]
     return rows.result(_distinct([track, *levels, *streams]))
 
 
-_TAKEN = {"phone", "rsrp", "lte_rsrp", "nr_rsrp"}
-"""Names that other streams may have."""
-
-
-def _stream_name(sheet: _sheet.Sheet, column: int) -> str:
-    name = sheet.plain[column]
-    found = _TOWER_SNR.fullmatch(name)
-    return found[1].upper() if found else re.sub(r"\W+", "_", name)
-
-
-def _carry_on(readings: _cells.Table, serving: dict[str, float]) -> None:
-    """Note for the next block which cell serves."""
-    known = np.isfinite(readings.rsrp_dbm)
-    for code, rat in enumerate(_cells.RATS):
-        told = np.flatnonzero(known & readings.serving & (readings.rat == code))
-        if len(told):
-            last = told[readings.row[told] == readings.row[told].max()][-1]
-            serving[rat] = float(readings.pci[last])
-
-
-def _beside(sheet: _sheet.Sheet, cells: list[_Cell], decided: _decided.Decided) -> list[int]:
+def _beside(sheet: _sheet.Sheet, cells: list[_Cell]) -> list[int]:
     """Columns beside a serving level with values in rows of their own, which become streams: Nemo's rows are events."""
     found = []
     for cell in cells:
-        if cell.rsrp is None or not cell.serving or not len(sheet):
-            continue
-        silent = np.isnan(sheet.numbers(cell.rsrp))
-        for column in cell.beside.values():
-            alone = bool(np.isfinite(sheet.numbers(column)[silent]).any())
-            shown = decided.kept.setdefault(("alone", column), alone)
-            if alone and not shown:
-                decided.one_piece()  # the blocks before left it out
-            if shown:
-                found.append(column)
+        if cell.rsrp is not None and cell.serving:
+            silent = np.isnan(sheet.numbers(cell.rsrp))
+            found += [i for i in cell.beside.values() if np.isfinite(sheet.numbers(i)[silent]).any()]
     return found
-
-
-def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
-    """What only the whole table says."""
-    order: list[str] = decided.kept.get("order", [])
-    streams: list[Stream] = []
-    warnings: list[str] = []
-    for stream in _cells.settled(result).streams:
-        if stream.kind == "telemetry":
-            stream, warnings = _pose.settled(stream, decided)
-        streams.append(stream)
-
-    def place(stream: Stream) -> tuple[int, int]:
-        if stream.kind == "telemetry":
-            return 0, 0
-        if "serving" in stream.frame:
-            return 1, 0  # in the order that they have
-        return 2, order.index(stream.name)
-
-    return _decided.finished(result, sorted(streams, key=place), *warnings)
 
 
 def _settle_names(sheet: _sheet.Sheet) -> None:
@@ -342,5 +281,4 @@ READER = Reader(
     sample="Time,Latitude,Longitude,Physical cell identity (LTE pcell),RSRP (LTE pcell)",
     sniff=sniff,
     read=read,
-    in_blocks=_decided.in_blocks(_read, _settled, _sheet.head_bytes(is_header)),
 )

@@ -7,22 +7,19 @@ since ``time_origin`` where that is given, else since 1970 in UTC (``clock: loca
 from __future__ import annotations
 
 import csv
-import io
 import re
-from collections.abc import Iterable, Mapping
-from dataclasses import replace
+from collections.abc import Iterable
 from difflib import get_close_matches
 
 import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import blocks
+from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
-from . import _by_eights, _frames, _lines, _table, _time
+from . import _frames, _lines, _time
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")
@@ -34,7 +31,6 @@ _VALUE = {"telemetry": ("latitude_deg", "longitude_deg", "altitude_m"), "rss": (
 _TEXT = re.compile(_time.TIME + _time.ZONE)
 _PLAIN = re.compile(_lines.NUMBER)
 _INK = re.compile(rb"\S")
-_FORM = re.compile(rb"%s|%s" % (_TEXT.pattern, _PLAIN.pattern))
 
 
 def sniff(head: bytes) -> bool:  # noqa: ARG001 - the contract of sniffers
@@ -165,57 +161,18 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If ``kind``, ``columns``, ``ri_base`` or ``timezone`` is missing or names what is not there.
     """
-    return _settled(_read(data, options))
-
-
-def _settled(result: ReadResult) -> ReadResult:
-    """How many rows hold a word where a number belongs, with the first of them."""
-    if not result.streams:
-        return result
-    frame = result.streams[0].frame
-    flag = frame["flag"].to_numpy(dtype=object)
-    marked = np.flatnonzero(flag != "").tolist()
-    odd = [i for i in marked if "no_number" in flag[i].split(";")]
-    if not odd:
-        return result
-    words = "1 row is" if len(odd) == 1 else f"{len(odd)} rows are"
-    first = int(frame["line"].iloc[odd[0]])
-    text = f"{words} flagged no_number; the first: line {first}, a word or an infinity; not scored"
-    return replace(result, warnings=(*result.warnings, text))
-
-
-def _head(data: bytes, options: ReadOptions) -> int:
-    """Bytes of the header and of the rows down to the first with a time: that row says which form times have."""
-    end, column, sign = 0, -1, ","
-    for line in io.BytesIO(data[:1_000_000]):  # lines end with a line feed alone
-        end += len(line)
-        if not line.strip():
-            continue
-        try:
-            text = line.removeprefix(b"\xef\xbb\xbf").rstrip(b"\r\n")
-            sign = _separator(text) if column < 0 else sign
-            cells = _fields(text, sign)
-        except csv.Error:
-            continue
-        if column < 0:
-            names = [name.strip() for name in cells]
-            column = names.index(options.columns.get("time", "")) if options.columns.get("time") in names else 0
-        elif len(cells) == len(names) and _FORM.fullmatch(cells[column].strip().strip('"').encode("ascii", "replace")):
-            break
-    return end
-
-
-def _read(data: bytes, options: ReadOptions) -> ReadResult:
-    """What each row says by itself."""
     top = _header(data)
     if top is None:
         count = len(_lines.split(data))
         return ReadResult("generic_csv", (), count, 0, count)
     first, separator, header = top
     kind, where = _checked(options, header)
-    lines, found = _by_eights.table(data, len(header), ord(separator))
-    table = _at_once(lines, found, first, where, options) or _one_by_one(lines, first, where, header, options)
-    rows, rejected, instants, valid, numbers = table
+    lines = _lines.split(data)
+    rows, cells, rejected = _cells(lines, first, separator, len(header))
+    column = {name: [fields[i] for fields in cells] for name, i in where.items()}
+    instants, valid = _times(column.pop("time"), options)
+    # a decimal comma, where the separator leaves room for one
+    numbers = {name: _numbers(texts, comma=separator != ",") for name, texts in column.items()}
     rejected += [lines.reject(int(i), "the time is of another form") for i in rows[~valid]]
     flag = _lines.flags(len(rows))
     instants.flag(flag)
@@ -230,6 +187,13 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
         frame = frame[valid].reset_index(drop=True)
     stream = Stream(kind, options.channel or kind, frame, _frames.attributes(options, **extra))
     warnings = [*instants.warnings, *_frames.steps_back(frame)]
+    words = np.flatnonzero(odd[valid])
+    if len(words):
+        rows_are = "1 row is" if len(words) == 1 else f"{len(words)} rows are"
+        first_line = int(frame["line"].iloc[words[0]])
+        warnings.append(
+            f"{rows_are} flagged no_number; the first: line {first_line}, a word or an infinity; not scored"
+        )
     if kind == "rss" and options.unit is None:
         warnings.append("no 'unit:' is given: the levels are taken as dB re full scale")
     return ReadResult(
@@ -243,145 +207,13 @@ def _read(data: bytes, options: ReadOptions) -> ReadResult:
     )
 
 
-_Table = tuple[IntArray, list[RejectedLine], _time.Instants, BoolArray, dict[str, FloatArray]]
-"""0-based rows, other lines as rejected, times, whether they are some, and the mapped columns."""
-
-
-def _one_by_one(
-    lines: _lines.Lines, first: int, where: Mapping[str, int], header: list[str], options: ReadOptions
-) -> _Table:
-    """The table cell by cell, whatever it holds."""
-    rows, cells, rejected = _cells(lines, first, len(header))
-    column = {name: [line[i] for line in cells] for name, i in where.items()}
-    instants, valid = _times(column.pop("time"), options)
-    comma = _separator(lines.raw(first)) != ","
-    return rows, rejected, instants, valid, {name: _numbers(texts, comma) for name, texts in column.items()}
-
-
-def _at_once(
-    lines: _lines.Lines, found: _table.Fields, first: int, where: Mapping[str, int], options: ReadOptions
-) -> _Table | None:
-    """The table column by column, or None where quotes or a cell beyond any number stand in the way."""
-    separator, width = _separator(lines.raw(first)), found.ends.shape[1]
-    if b'"' in lines.data or b"\0" in lines.data:
-        return None
-    found = found.take(~lines.blank[found.rows] & (found.rows != first))
-    if not len(found.rows):
-        return None
-    left = ~lines.blank
-    left[found.rows] = left[first] = False
-    rejected = []
-    for i in np.flatnonzero(left).tolist():
-        count = lines.raw(i).count(separator.encode()) + 1
-        rejected.append(lines.reject(i, f"{count} fields where the header has {width} (torn line?)"))
-
-    numbers = dict(where)
-    clock = numbers.pop("time")
-    columns = sorted(set(numbers.values()))
-    plain = _by_eights.decimals(lines, found, columns, comma=separator != ",")
-    read: dict[int, FloatArray] = {}
-    for column, value, odd in zip(columns, plain.value, plain.odd, strict=True):
-        made = _mended(lines, found, column, value, odd, comma=separator != ",")
-        if made is None:
-            return None
-        read[column] = made
-    times = _clock(_texts(lines, found, clock), options)
-    if times is None:
-        return None
-    return found.rows, rejected, *times, {name: read[column] for name, column in numbers.items()}
-
-
-def _texts(lines: _lines.Lines, found: _table.Fields, column: int) -> AnyArray:
-    return _table.texts(lines, found.start(column), found.ends[:, column])
-
-
-def _mended(
-    lines: _lines.Lines, found: _table.Fields, column: int, value: FloatArray, odd: BoolArray, *, comma: bool
-) -> FloatArray | None:
-    """Numbers of a column with the odd cells as :func:`_number` reads them, each text once; None if one is long."""
-    rows = np.flatnonzero(odd)
-    if 8 * len(rows) > len(odd):
-        separator = chr(lines.data[int(found.ends[0, 0])]) if found.ends.shape[1] > 1 else ","
-        also = b" :TZ/" + (separator.encode() if comma else b"")
-        width = found.ends.shape[1]
-        read = _table.numbers(lines, found.rows, width, [column], also=also, separator=separator) if _EXACT else None
-        return read[0] if read is not None else _column(_texts(lines, found, column), comma=comma)
-    known: dict[bytes, float] = {}
-    places = zip(rows.tolist(), found.start(column)[rows].tolist(), found.ends[rows, column].tolist(), strict=True)
-    for i, begin, end in places:
-        if end - begin > _MOST_BYTES:
-            return None
-        text = lines.data[begin:end]
-        if text not in known:
-            known[text] = float(_numbers([text.decode("utf-8", "replace")], comma)[0])
-        value[i] = known[text]
-    return value
-
-
-_EXACT = int(pd.__version__.split(".")[0]) >= 3
-"""Whether pandas' parser reads each decimal as ``float`` does, to the last digit."""
-_MOST_BYTES = 400
-_OF_NUMBERS = np.zeros(256, dtype=np.bool_)
-_OF_NUMBERS[np.frombuffer(b"0123456789+-.eE\0", dtype=np.uint8)] = True
-
-
-def _column(cells: AnyArray, *, comma: bool) -> FloatArray | None:
-    """As :func:`_numbers`, of byte strings without NUL: numbers at once, each other text once; None if one is long."""
-    width = cells.dtype.itemsize
-    if width > _MOST_BYTES:
-        return None
-    byte = np.zeros((len(cells), width + 1), dtype=np.uint8)
-    byte[:, :width] = cells.view(np.uint8).reshape(len(cells), width)
-    if comma:
-        byte[byte == 44] = 46
-    begin = np.where((byte[:, 0] == 43) | (byte[:, 0] == 45), byte[:, 1], byte[:, 0])
-    number = begin - np.uint8(48) <= 9
-    for column in byte.T:
-        number &= _OF_NUMBERS[column]
-    shown = byte.view(f"S{width + 1}").ravel()
-    out = np.full(len(cells), np.nan)
-    try:
-        out[number] = shown[number].astype(np.float64)
-    except ValueError:  # such as 1e or 1.2.3
-        number[:] = False
-    known: dict[bytes, float] = {b"": np.nan}
-    for i in np.flatnonzero(~number & (byte[:, 0] > 0)).tolist():
-        text = bytes(cells[i])
-        if text not in known:
-            known[text] = float(_numbers([text.decode("utf-8", "replace")], comma)[0])
-        out[i] = known[text]
-    return out
-
-
-def _clock(cells: AnyArray, options: ReadOptions) -> tuple[_time.Instants, BoolArray] | None:
-    """As :func:`_times`, of byte strings without NUL; None where some are long."""
-    width = cells.dtype.itemsize
-    if width > _MOST_BYTES:
-        return None
-    byte = cells.view(np.uint8).reshape(len(cells), width)
-    last = byte[:, -1]
-    if not last.all():
-        last = byte[np.arange(len(cells)), np.maximum(np.char.str_len(cells) - 1, 0)]
-    strange = (byte[:, 0] <= 32) | (last <= 32)
-    if byte.max() > 126:
-        strange |= (byte > 126).any(axis=1)
-    odd = np.flatnonzero(strange)
-    if len(odd):  # blanks around, which are taken off, or letters of no time
-        bare = [_bare(bytes(cells[i]).decode("utf-8", "replace")) for i in odd.tolist()]
-        cells = cells.astype(f"S{max(width, *map(len, bare))}")
-        cells[odd] = bare
-    if not _counts(bytes(cell) for cell in cells):
-        return _time.texts_to_utc(cells, options, needed_by="generic_csv")
-    seconds = _column(cells, comma=False)
-    return None if seconds is None else _counted(np.where(np.isinf(seconds), np.nan, seconds), options)
-
-
-def _cells(lines: _lines.Lines, first: int, width: int) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
+def _cells(
+    lines: _lines.Lines, first: int, separator: str, width: int
+) -> tuple[AnyArray, list[list[str]], list[RejectedLine]]:
     """Rows with as many fields as the header, and the rest as rejected lines."""
     numbers: list[int] = []
     cells: list[list[str]] = []
     rejected: list[RejectedLine] = []
-    separator = _separator(lines.raw(first))
     for i in np.flatnonzero(~lines.blank).tolist():
         if i == first:
             continue
@@ -453,5 +285,4 @@ READER = Reader(
     sample="Time,Power,...",
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, head=_head, settle=_settled),
 )

@@ -13,12 +13,10 @@ OAI's own seconds (``log_config ... time``: from an unknown origin unless they a
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, IntArray
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
@@ -35,7 +33,6 @@ _UE = re.compile(
 )
 _UE_LEVEL = re.compile(rb"\[UE \d{1,2}\] RSRP = (?P<rsrp>-?\d{1,3}) dBm")
 _STAMP = re.compile(rb"^\[?(" + _time.TIME + _time.ZONE + rb")\]?[ :]")
-_STAMPED = re.compile(_STAMP.pattern, re.MULTILINE)
 _SECONDS = re.compile(rb"^(?:\x1b\[[0-9;]{0,8}m)?(\d{1,10}\.\d{3,9}) ")
 _FRAME = re.compile(rb"Frame\.Slot \d")
 _FRAMES_S = 1.28
@@ -77,26 +74,7 @@ def _rows_of(lines: _lines.Lines) -> tuple[IntArray, list[dict[str, bytes]], str
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``oai`` and RSRP; UsageError if stamps have no zone and none is given."""
     lines = _lines.split(data)
-    return _result(lines, _rows_of(lines), options)
-
-
-def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    """The same from pieces of the file, where all lines have stamps: other clocks are those of the whole log."""
-
-    def block(data: bytes, options: ReadOptions) -> ReadResult:
-        lines = _lines.split(data)
-        found = _rows_of(lines)
-        if len(found[0]) and found[2] != "wall":
-            raise blocks.Whole
-        return _result(lines, found, options)
-
-    return blocks.by_lines(block, keep=(_STAMPED,), settle=_cells.settled)(chunks, options)
-
-
-def _result(
-    lines: _lines.Lines, rows_of: tuple[IntArray, list[dict[str, bytes]], str, AnyArray], options: ReadOptions
-) -> ReadResult:
-    row, found, clock, time = rows_of
+    row, found, clock, time = _rows_of(lines)
     rows = _rows.built(lines, row, {"time": time}, options, reader="oai_log", reason=lambda _line: None, clock=clock)
     kept = [found[i] for i in rows.at.tolist()]
     value = {
@@ -127,5 +105,4 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000] UE 1f4d: CQI 15, RI 2, PMI (14,1)",
     sniff=sniff,
     read=read,
-    in_blocks=in_blocks,
 )

@@ -7,15 +7,13 @@ origin.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _decided, _rows, _sheet
+from . import _rows, _sheet
 
 _RSS = ("time utc", "tower", "channel", "unit", "measured db")
 _RANK = ("time utc", "tower", "measured rank")
@@ -34,50 +32,19 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """What the table was made of."""
-    return _decided.in_one_piece(_read, _settled, data, options)
-
-
-def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
-    """What each row says by itself."""
-    sheet = _sheet.read(data, is_header, decided)
+    sheet = _sheet.read(data, is_header)
     if sheet is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
     column = sheet.find("time utc")
     empty = column is not None and not any(sheet.texts(column))
-    if len(sheet):
-        decided.agree("times in UTC", empty)
     also = ("time s",) if empty and sheet.find("time s") is not None else ("time utc",)
-    rows = _sheet.rows(sheet, options, decided, reader="own_csv", also=also)
+    rows = _sheet.rows(sheet, options, reader="own_csv", also=also)
     if rows is None:
         return _sheet.nothing(data, "own_csv", "no header of an export")
     names = set(sheet.plain)
     if set(_RSS) <= names:
-        return rows.result(_levels(rows, sheet, decided))
-    return rows.result(_ranks(rows, sheet, decided) if set(_RANK) <= names else _tap(rows, sheet))
-
-
-_TAPPED = ("nr5g", "lte", "nr5g_rsrp")
-
-
-def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
-    """Streams in the order of the table, with the unit of their first row; the LTE leg of a tap where it has a rank."""
-    first: dict[str, tuple[str, ...]] = decided.kept.get("streams", {})
-    order = [*first, *_TAPPED]
-    streams = []
-    for stream in result.streams:
-        if stream.name == "lte" and not np.isfinite(stream.frame["rank"].to_numpy()).any():
-            continue
-        if stream.kind == "rss" and stream.name in first:
-            stream = replace(stream, attributes={**stream.attributes, "unit": first[stream.name][-1]})
-        streams.append(stream)
-    return _decided.finished(result, sorted(streams, key=lambda stream: order.index(stream.name)))
-
-
-def _of_stream(decided: _decided.Decided, name: str, *about: str) -> None:
-    """What the first row of a stream says of it; two streams of one name are told apart in one piece only."""
-    known: dict[str, tuple[str, ...]] = decided.kept.setdefault("streams", {})
-    if known.setdefault(name, about)[:-1] != about[:-1]:
-        decided.one_piece()
+        return rows.result(_levels(rows, sheet))
+    return rows.result(_ranks(rows, sheet) if set(_RANK) <= names else _tap(rows, sheet))
 
 
 def _text(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-arg]
@@ -92,7 +59,7 @@ def _number(sheet: _sheet.Sheet, name: str) -> np.ndarray:  # type: ignore[type-
     return np.full(len(sheet), np.nan) if place is None else sheet.numbers(place)
 
 
-def _levels(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) -> list[Stream | None]:
+def _levels(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     tower, channel, unit = (_text(sheet, name) for name in ("tower", "channel", "unit"))
     level, flag = rows.level(_number(sheet, "measured db"))
     made = []
@@ -100,17 +67,15 @@ def _levels(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) ->
         mine: BoolArray = (tower == node) & (channel == channel_name)
         name = f"{node}_{channel_name}"
         about = {"node": node, "channel": channel_name, "unit": str(unit[mine][0])}
-        _of_stream(decided, name, *about.values())
         made.append(rows.stream("rss", name, {"rss_db": level}, where=mine, flag=flag, about=about))
     return made
 
 
-def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet, decided: _decided.Decided) -> list[Stream | None]:
+def _ranks(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
     tower, ri = _text(sheet, "tower"), _number(sheet, "measured rank")
     values = rows.rank(ri)
     made = []
     for node in dict.fromkeys(tower.tolist()):
-        _of_stream(decided, f"{node}_rank", node, "")
         about = {"node": node, "ri_base": "one", "source": "report"}
         made.append(rows.stream("rank", f"{node}_rank", values, where=tower == node, about=about))
     return made
@@ -128,6 +93,8 @@ def _tap(rows: _rows.Rows, sheet: _sheet.Sheet) -> list[Stream | None]:
         rows.mark(odd, "ri_out_of_range")
         values["rank"] = np.where(odd, np.nan, rank)
         name = name.removesuffix("_csi")
+        if name == "lte" and not np.isfinite(values["rank"][mine]).any():
+            continue
         made.append(rows.stream("rank", name, values, where=mine, channel=name, ri_base="one", source="CSI report"))
     cell: BoolArray = (query == "servingcell") & np.isfinite(_number(sheet, "rsrp dbm"))
     level, flag = rows.level(_number(sheet, "rsrp dbm"))
@@ -145,5 +112,4 @@ READER = Reader(
     sample="time_utc,time_s,tower,channel,unit,east_m,north_m,up_m,measured_db",
     sniff=sniff,
     read=read,
-    in_blocks=_decided.in_blocks(_read, _settled, _sheet.head_bytes(is_header)),
 )

@@ -12,20 +12,12 @@ from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
 from . import _cells, _json, _lines, _pose, _rows
 
 _MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
-
-_CONNECTED = tuple(
-    re.compile(rb'^[^\n]*"technology": ?"[^"\n]*%s[^\n]*"is_connected": ?"?[Tt]rue' % rat, re.MULTILINE)
-    for rat in (b"LTE", b"NR")
-)
-"""The last line that says which cell serves holds for those after it."""
-
 
 _TEXT = re.compile(rb"^CELL_LOG_START,(\d{13}),.*?,?CELL_LOG_STOP[ \t]*\r?$", re.MULTILINE)
 _BLOCK = re.compile(rb"BS_INFO_START,([^\n]*?),?BS_INFO_STOP")
@@ -133,23 +125,14 @@ def _track(rows: _rows.Rows, found: list[dict[str, Any]]) -> Stream | None:
     if not np.isfinite(values["latitude_deg"]).any():
         return None
     lost = _pose.clean(rows, values)
-    values["altitude_m"] = _json.column(places, "altitude", "alt")
+    values["altitude_m"] = _pose.above_takeoff(rows, _json.column(places, "altitude", "alt"), lost)
     return rows.stream("telemetry", "phone", values, where=~lost, source="PawPrints location")
 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """A level stream per LTE or NR cell, the level of the NR leg, and the phone's track where it is logged."""
     if data[:4096].lstrip().startswith(b"CELL_LOG_START,"):
-        return _cells.settled(_read_text(data, options))
-    return _settled(_read(data, options))
-
-
-def _settled(result: ReadResult) -> ReadResult:
-    return _cells.settled(_pose.from_takeoff(result))
-
-
-def _read(data: bytes, options: ReadOptions) -> ReadResult:
-    """What each line says, altitudes above sea level."""
+        return _read_text(data, options)
     lines = _lines.split(data)
     one = _json.objects(lines)
     found = one.found
@@ -173,5 +156,4 @@ READER = Reader(
     sample='{"abs_time": 1740927600000, "connected_pci": 2, "cells": [{"technology": "4G_LTE", "rsrp": -6, "pci": 2}]}',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, apart=_json.WHOLE, keep=_CONNECTED, settle=_settled),
 )

@@ -9,7 +9,7 @@ from __future__ import annotations
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _decided, _nemo, _pose, _quantities, _sheet, quectel_ri, vehicle_out
+from . import _nemo, _pose, _quantities, _sheet, quectel_ri, vehicle_out
 
 
 def is_header(names: list[str]) -> bool:
@@ -35,24 +35,11 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Telemetry ``vehicle``; UsageError if the clock has no zone and none is given."""
-    return _decided.in_one_piece(_read, _settled, data, options)
-
-
-def _read(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
-    """What each row says by itself."""
-    sheet = _sheet.read(data, is_header, decided)
-    rows = None if sheet is None else _sheet.rows(sheet, options, decided, reader="pose_csv")
+    sheet = _sheet.read(data, is_header)
+    rows = None if sheet is None else _sheet.rows(sheet, options, reader="pose_csv")
     if sheet is None or rows is None:
         return _sheet.nothing(data, "pose_csv", "no header with a time, a latitude and a longitude")
-    return rows.result([_pose.from_sheet(rows, sheet, decided, name="vehicle", source="table of positions")])
-
-
-def _settled(result: ReadResult, decided: _decided.Decided) -> ReadResult:
-    """What only the whole table says."""
-    if not result.streams:
-        return result
-    track, warnings = _pose.settled(result.streams[0], decided)
-    return _decided.finished(result, [track], *warnings)
+    return rows.result([_pose.from_sheet(rows, sheet, name="vehicle", source="table of positions")])
 
 
 READER = Reader(
@@ -62,5 +49,4 @@ READER = Reader(
     sample="timestamp,Lat,Lng,Alt,Roll,Pitch,Yaw",
     sniff=sniff,
     read=read,
-    in_blocks=_decided.in_blocks(_read, _settled, _sheet.head_bytes(is_header)),
 )

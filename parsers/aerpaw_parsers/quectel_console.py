@@ -11,7 +11,6 @@ import re
 
 import numpy as np
 
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
@@ -19,14 +18,7 @@ from . import _cells, _lines, _rows, _time
 
 _STAMP = re.compile(rb"^(" + _time.TIME + rb")")
 _ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')
-_HEAD = rb"^\|[ \t]*\|[ \t]*(%b)[ \t]*\|(.*)\|[ \t\r]*$"
-_TITLES = (b"LTE", b"NR5G-NSA", b"NR5G-SA", b"servingcell")
-_HEADER = re.compile(_HEAD % b"|".join(_TITLES))
-_KEPT = (
-    re.compile(_STAMP.pattern, re.MULTILINE),
-    *(re.compile(_HEAD % title, re.MULTILINE) for title in _TITLES),
-)
-"""Lines on which the rows below hang: the time of a table, and the head of each kind; as :func:`_tables` knows them."""
+_HEADER = re.compile(rb"^\|[ \t]*\|[ \t]*(LTE|NR5G-NSA|NR5G-SA|servingcell)[ \t]*\|(.*)\|[ \t\r]*$")
 _CSI = ("lte_csi", "nr5g_csi")
 
 
@@ -68,11 +60,6 @@ def _tables(lines: _lines.Lines) -> tuple[list[tuple[int, bytes, str, dict[str, 
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Cells by PCI, and rank where CSI tables stand; UsageError if no time zone is given."""
-    return _cells.settled(_read(data, options))
-
-
-def _read(data: bytes, options: ReadOptions) -> ReadResult:
-    """What each row says by itself."""
     lines = _lines.split(data)
     found, rejected = _tables(lines)
     row = np.array([one[0] for one in found], dtype=np.int64)
@@ -112,5 +99,4 @@ READER = Reader(
     sample='|  0 | +QNWCFG: "nr5g_csi" |        24 |       2 |       12 |        5 |',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(_read, keep=_KEPT, settle=_cells.settled),
 )

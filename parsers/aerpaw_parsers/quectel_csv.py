@@ -26,15 +26,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-from . import _by_eights, _decided, _frames, _lines, _table, _time
+from . import _frames, _lines, _time
 
 _C = rb"[^,\n]{0,80}"
-_DIGITS = 7
-"""Of a whole number, at most."""
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'
 _T = rb"^(" + _time.TIME + _time.ZONE + rb"),"
 
@@ -143,68 +140,8 @@ def _rows(
     return _Rows(number[valid], instants, kept)
 
 
-_LAUNCHED = ((1, b'"+QNWCFG: ""lte_csi"""'), (6, b'"+QNWCFG: ""nr5g_csi"""'))
-"""Places of the two tokens in the 11 columns of the launched logger."""
-
-
-def _csi_rows(lines: _lines.Lines, options: ReadOptions, rejected: list[RejectedLine]) -> _Rows | None:
-    """CSI rows: those of the launched logger at once, others by the pattern; all columns but the first are numbers."""
-    number, wall, value = _launched(lines)
-    odd, groups = _lines.match_rest(lines, _CSI, number)
-    valid, zoned, offset_s = np.ones(len(number), dtype=bool), np.zeros(len(number), dtype=bool), np.zeros_like(number)
-    if len(odd):
-        column = _lines.columns(groups, _CSI.groups)
-        parsed = _time.parse_texts(column[0])
-        order = np.argsort(np.concatenate((number, odd)), kind="stable")
-        number = np.concatenate((number, odd))[order]
-        known = (wall, valid, offset_s, zoned)
-        wall, valid, offset_s, zoned = (np.concatenate(pair)[order] for pair in zip(known, parsed, strict=True))
-        read = [_values(cells) for cells in column[1:]]
-        value = [np.concatenate(pair)[order] for pair in zip(value, read, strict=True)]
-    if not len(number):
-        return None
-    if not valid.all():
-        rejected += lines.reject_all(number[~valid], "the time stamp is no date of the calendar")
-        number, wall, value = number[valid], wall[valid], [column[valid] for column in value]
-        offset_s, zoned = offset_s[valid], zoned[valid]
-    every = np.ones(len(number), dtype=bool)
-    instants = _time.parsed_to_utc(wall, every, offset_s, zoned, options, needed_by="quectel_csv")
-    return _Rows(number, instants, [np.zeros(0), *value])
-
-
-def _launched(lines: _lines.Lines) -> tuple[IntArray, IntArray, list[FloatArray]]:
-    """Lines, wall clocks and eight numbers of rows as the launched logger writes them."""
-    none = np.zeros(0, dtype=np.int64)
-    nothing = none, none, [np.empty(0)] * 8
-    found = _table.fields(lines, 11)
-    mine = found.width(0) == 23
-    for place, token in _LAUNCHED:
-        mine &= found.width(place) == len(token)
-    found = found.take(mine)
-    for place, token in _LAUNCHED:
-        if (
-            not len(found.rows)
-            or (_table.cells_at(lines, found.start(place), len(token)) != np.frombuffer(token, dtype=np.uint8)).any()
-        ):
-            return nothing
-    places = (2, 3, 4, 5, 7, 8, 9, 10)
-    made = _by_eights.decimals(lines, found, places)
-    wall, keep = _time.parse_digits(_table.cells_at(lines, found.begin, 23), 3)
-    for place, number, odd in zip(places, made.value, made.odd, strict=True):
-        begin, end = found.start(place), found.ends[:, place]
-        first, last = lines.buffer[np.minimum(begin, len(lines.data) - 1)], lines.buffer[end - 1]
-        # plain decimals that the pattern has not: 12345678, +5, 5.
-        keep &= ~odd & ~np.isnan(number) & (end - begin <= _DIGITS) & (first != 43) & (last != 46)
-    value = made.value
-    if keep.all():
-        return found.rows, wall, value
-    return found.rows[keep], wall[keep], [column[keep] for column in value]
-
-
 def _values(cells: AnyArray) -> FloatArray:
     """Numbers of one column; ``-`` and nothing mean 'not valid now'."""
-    if cells.dtype.kind == "f":
-        return cells
     return np.asarray(_lines.numbers(np.where(cells == b"-", b"", cells)))
 
 
@@ -262,10 +199,6 @@ def _level(
     )
 
 
-_STREAMS = ("nr5g_csi", "lte_csi", "lte_rsrp", "nr_rsrp")
-"""In their order."""
-
-
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank and level streams, whichever rows the file has.
 
@@ -276,7 +209,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     """
     lines = _lines.split(data)
     rejected: list[RejectedLine] = []
-    csi = _csi_rows(lines, options, rejected)
+    csi = _rows(lines, _CSI, options, rejected)
     serving = b"servingcell" in data  # a search of a whole log of CSI would find nothing, slowly
     lte = _rows(lines, _LTE, options, rejected) if serving else None
     sa = _rows(lines, _SA, options, rejected) if serving else None
@@ -318,5 +251,4 @@ READER = Reader(
     sample='2025-01-01 12:00:07.250,"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,2,12,5',
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(read, settle=_decided.ordered(lambda stream: _STREAMS.index(stream.name))),
 )

@@ -9,14 +9,15 @@ Writer: AERPAW ``startGNURadio-ChannelSounder-RX.sh``.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs import blocks
+from aerpaw_cmp.logs.chunks import Column
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
-from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
+from aerpaw_cmp.logs.records import KEPT_REJECTED, ReadResult, Stream
 
 from . import _decimal, _frames, _lines, _time
 
@@ -56,13 +57,17 @@ class _Samples:
     def take(self, order: AnyArray) -> _Samples:
         return _Samples(self.line[order], self.wall[order], self.offset[order], self.value[order])
 
-    def join(self, other: _Samples) -> _Samples:
-        return _Samples(
-            np.concatenate((self.line, other.line)),
-            np.concatenate((self.wall, other.wall)),
-            np.concatenate((self.offset, other.offset)),
-            np.concatenate((self.value, other.value)),
-        )
+    def join(self, *others: _Samples) -> _Samples:
+        """Samples of all in the order of their lines, those of one line in this order."""
+        parts = (self, *others)
+        made = _Samples(*(np.concatenate([getattr(part, name) for part in parts]) for name in _COLUMNS))
+        if np.all(made.line[1:] > made.line[:-1]):
+            return made
+        return made.take(np.argsort(made.line, kind="stable"))
+
+
+_COLUMNS = ("line", "wall", "offset", "value")
+_NONE = np.zeros(0, dtype=np.int64)
 
 
 def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
@@ -72,10 +77,13 @@ def _octal(cells: AnyArray) -> tuple[IntArray, BoolArray]:
     return digit.astype(np.int64) @ weight, np.all(digit <= 7, axis=1)
 
 
-def _fixed_layout(lines: _lines.Lines) -> _Samples:
-    """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines."""
+def _fixed_layout(lines: _lines.Lines) -> tuple[_Samples, IntArray]:
+    """Samples of all lines that have exactly the layout of ``ts`` and ``od``, without a Python loop over lines.
+
+    Second, such lines whose offset is no octal number.
+    """
     length = lines.ends - lines.starts
-    found = _Samples.none()
+    found, wrong = [], [np.zeros(0, dtype=np.int64)]
     for width in _WIDTHS:
         rows = np.flatnonzero(length == _STAMP + 1 + width + _VALUE)
         if not len(rows):
@@ -84,26 +92,40 @@ def _fixed_layout(lines: _lines.Lines) -> _Samples:
         wall, valid = _time.parse_digits(cells[:, 1 : _STAMP - 1], 6)
         offset, octal = _octal(cells[:, _STAMP + 1 : _STAMP + 1 + width])
         value, plain = _decimal.decimal(np.ascontiguousarray(cells[:, _STAMP + 1 + width :].T), len(rows))
-        valid &= octal & plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
+        valid &= plain & (cells[:, 0] == 91) & (cells[:, _STAMP - 1] == 93) & (cells[:, _STAMP] == 32)
         valid &= cells[:, _STAMP + 1 + width] == 32
-        found = found.join(_Samples(rows, wall, offset, value).take(valid))
-    return found
+        digits = (cells[:, _STAMP + 1 : _STAMP + 1 + width] - np.uint8(48) <= 9).all(axis=1)
+        wrong.append(rows[valid & ~octal & digits])
+        found.append(_Samples(rows, wall, offset, value).take(valid & octal))
+    return _Samples.none().join(*found), np.concatenate(wrong)
 
 
-def _odd_lines(lines: _lines.Lines, done: IntArray) -> tuple[_Samples, _Samples, list[int], list[RejectedLine]]:
-    """The few other lines, one by one: samples, ``*`` and foot lines (value NaN), blank lines, rejected lines."""
+@dataclass
+class _Piece:
+    """What a piece of a log holds: samples; ``*`` and foot lines (value NaN) with their texts; the account."""
+
+    samples: _Samples
+    marks: _Samples
+    texts: dict[int, str]
+    lines: int
+    blank: int
+
+
+def _piece(lines: _lines.Lines, rejects: _lines.Rejects) -> _Piece:
+    """Samples of od's layout at once, the few other lines one by one."""
+    fixed, wrong = _fixed_layout(lines)
+    rejects.add(lines, wrong, "the offset is no octal number: not written by od")
     left = np.ones(len(lines), dtype=bool)
-    left[done] = False
+    left[fixed.line] = left[wrong] = False
     samples: list[tuple[int, bytes, bytes, float]] = []
     marks: list[tuple[int, bytes, bytes, float]] = []
-    blank: list[int] = []
-    rejected: list[RejectedLine] = []
+    blank = 0
     for i in np.flatnonzero(left).tolist():
         line = lines.raw(i)
         if found := _ODD.match(line):
             short = len(line) < _STAMP + 1 + len(found[2]) + _VALUE
             if short and i == len(lines) - 1 and lines.unterminated:
-                rejected.append(lines.reject(i, "torn last line: the value is cut short"))
+                rejects.add(lines, [i], "torn last line: the value is cut short")
             else:
                 samples.append((i, found[1], found[2], float(found[3])))
         elif found := _STAR.match(line):
@@ -111,13 +133,14 @@ def _odd_lines(lines: _lines.Lines, done: IntArray) -> tuple[_Samples, _Samples,
         elif found := _FOOT.match(line):
             marks.append((i, found[1], found[2], np.nan))
         elif not line.strip():
-            blank.append(i)
+            blank += 1
         else:
-            rejected.append(lines.reject(i, _reason(line)))
-    kept, wrong = _collect(samples)
+            rejects.add(lines, [i], _reason(line))
+    odd, wrong_dates = _collect(samples)
     marked, wrong_marks = _collect(marks)
-    rejected += [lines.reject(i, "the time stamp is no date of the calendar") for i in wrong + wrong_marks]
-    return kept, marked, blank, rejected
+    rejects.add(lines, wrong_dates + wrong_marks, "the time stamp is no date of the calendar")
+    texts = {i: lines.text(i) for i in marked.line[:KEPT_REJECTED].tolist()}
+    return _Piece(fixed.join(odd) if len(odd.line) else fixed, marked, texts, len(lines), blank)
 
 
 def _collect(rows: list[tuple[int, bytes, bytes, float]]) -> tuple[_Samples, list[int]]:
@@ -154,9 +177,11 @@ def _expand(samples: _Samples, marks: _Samples) -> tuple[_Samples, IntArray, lis
     """
     stars = marks.take(marks.offset < 0)
     feet = marks.take(marks.offset >= 0)
+    if not len(stars.line):
+        return _Samples.none(), stars.line, []
     # a foot line bounds a last run: it is an end without a value
-    ends = samples.join(feet)
-    ends = ends.take(np.argsort(ends.line, kind="stable"))
+    near = np.unique(np.searchsorted(samples.line, stars.line).clip(max=len(samples.line) - 1))
+    ends = (samples.take(near) if len(samples.line) else samples).join(feet)
     after = np.searchsorted(ends.line, stars.line)
     before = np.searchsorted(samples.line, stars.line) - 1
     bad: list[tuple[int, str]] = []
@@ -196,65 +221,82 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     UsageError
         If no time zone is given.
     """
-    lines = _lines.split(data)
-    fixed = _fixed_layout(lines)
-    odd, marks, blank, rejected = _odd_lines(lines, fixed.line)
-    samples = fixed.join(odd)
-    if len(odd.line) or not np.all(np.diff(samples.line) > 0):
-        samples = samples.take(np.argsort(samples.line, kind="stable"))
+    return read_pieces((data,), options)
+
+
+def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
+    """The same from pieces of whole lines: of each its samples are kept; runs, times and flags are those of all."""
+    columns = [Column(np.int64), Column(np.int64), Column(np.int64), Column(np.float64)]
+    marks, texts = _Samples.none(), dict[int, str]()
+    rejects, before, blank, unterminated = _lines.Rejects(), 0, 0, False
+    for data in pieces:
+        lines = _lines.split(data)
+        rejects.before = before
+        piece = _piece(lines, rejects)
+        for part in (piece.samples, piece.marks):
+            part.line += before
+        for column, name in zip(columns, _COLUMNS, strict=True):
+            column.extend(getattr(piece.samples, name))
+        marks = marks.join(piece.marks) if len(piece.marks.line) else marks
+        texts |= {before + i: text for i, text in piece.texts.items()} if len(texts) < KEPT_REJECTED else {}
+        before, blank, unterminated = before + len(lines), blank + piece.blank, lines.unterminated
+    samples = _Samples(*(column.array() for column in columns))
+    del columns
     repeats, used, bad = _expand(samples, marks)
-    rejected += [lines.reject(i, reason) for i, reason in bad]
-    foot_reason = "no value behind the offset (torn last line, or the end of od's input)"
-    rejected += [lines.reject(int(i), foot_reason) for i in marks.line[marks.offset >= 0]]
+    foot = "no value behind the offset (torn last line, or the end of od's input)"
+    for i, reason in (*bad, *((i, foot) for i in marks.line[marks.offset >= 0].tolist())):
+        rejects.one(i + 1, reason, texts.get(i, ""))
     accepted = len(samples.line) + len(used)
     warnings: list[str] = []
-    stream = _stream(samples, repeats, lines, options, warnings)
+    stream = _stream(samples, repeats, before - 1 if unterminated else -1, options, warnings)
+    kept, reasons = rejects.result()
     return ReadResult(
         reader="sounder_log",
         streams=(stream,) if stream is not None else (),
-        lines=len(lines),
+        lines=before,
         accepted=accepted,
-        blank=len(blank),
-        rejected=tuple(sorted(rejected, key=lambda line: line.number)),
+        blank=blank,
+        rejected=kept,
         warnings=tuple(warnings),
+        reasons=reasons,
     )
 
 
 def _stream(
-    samples: _Samples, repeats: _Samples, lines: _lines.Lines, options: ReadOptions, warnings: list[str]
+    samples: _Samples, repeats: _Samples, torn: int, options: ReadOptions, warnings: list[str]
 ) -> Stream | None:
-    """The stream with its flags; ``None`` without samples."""
+    """The stream with its flags, ``torn`` the 0-based line without an end (-1: none); ``None`` without samples."""
     if not len(samples.line):
         return None
-    jump = np.concatenate(([0], np.diff(samples.offset)))
-    repeated = np.zeros(len(samples.line), dtype=bool)
+    repeated = np.zeros(0, dtype=bool)
     if len(repeats.line):
         samples = samples.join(repeats)
-        order = np.argsort(samples.line, kind="stable")
-        repeated = np.concatenate((repeated, np.ones(len(repeats.line), dtype=bool)))[order]
-        samples = samples.take(order)
-        jump = np.concatenate(([0], np.diff(samples.offset)))
+        repeated = np.isin(samples.line, repeats.line)  # lines of '*' hold nothing else
         warnings.append(f"{len(repeats.line)} samples that od had suppressed as '*' were put back; flagged repeated")
+    # what is not needed any more makes room at once: logs may have 1 GB
+    jump = samples.offset
+    jump[1:] -= jump[:-1]
+    jump[0] = 0
+    lost, back = jump > 4, int((jump < 0).sum())
+    missing = int((jump[lost] // 4 - 1).sum())
+    samples.offset = jump = _NONE
     instants = _time.wall_to_utc(samples.wall, options, needed_by="sounder_log")
+    samples.wall = _NONE
     flag = _lines.flags(len(samples.line))
     instants.flag(flag)
     _lines.add_flag(flag, repeated, "repeated")
-    value = samples.value
-    silent = ~(value > options.floor_db)
-    if silent.any():
-        value = np.where(silent, np.nan, value)
-        _lines.add_flag(flag, silent, "out_of_coverage")
-    lost = jump > 4
+    silent = ~(samples.value > options.floor_db)
+    samples.value[silent] = np.nan
+    _lines.add_flag(flag, silent, "out_of_coverage")
+    _lines.add_flag(flag, lost, "samples_lost_before")
     if lost.any():
-        _lines.add_flag(flag, lost, "samples_lost_before")
-        warnings.append(
-            f"offsets jump at {int(lost.sum())} places: {int((jump[lost] // 4 - 1).sum())} samples are missing"
-        )
-    if (jump < 0).any():
-        warnings.append(f"offsets step back at {int((jump < 0).sum())} places: several runs in one file?")
-    if lines.unterminated:
-        _lines.add_flag(flag, samples.line == len(lines) - 1, _lines.UNTERMINATED)
-    frame = _frames.frame("rss", instants.time, samples.line + 1, flag, {"rss_db": value})
+        warnings.append(f"offsets jump at {int(lost.sum())} places: {missing} samples are missing")
+    if back:
+        warnings.append(f"offsets step back at {back} places: several runs in one file?")
+    if torn >= 0:
+        _lines.add_flag(flag, samples.line == torn, _lines.UNTERMINATED)
+    samples.line += 1
+    frame = _frames.frame("rss", instants.time, samples.line, flag, {"rss_db": samples.value}, own=True)
     warnings += [*instants.warnings, *_frames.steps_back(frame)]
     named = _NAMED.search(options.file_name.lower())
     name = options.channel or (named.group() if named else "power")
@@ -281,7 +323,5 @@ READER = Reader(
     sample="[2025-01-01 12:00:00.032760] 0000004       -35.12345",
     sniff=sniff,
     read=read,
-    in_blocks=blocks.by_lines(
-        read, apart=re.compile(rb"\[" + _time.CERTAIN + rb"\] +[0-7]{7,12} +-?\d{1,9}(?:\.\d{1,9})?\r?$")
-    ),
+    read_pieces=read_pieces,
 )

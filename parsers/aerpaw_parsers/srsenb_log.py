@@ -51,6 +51,5 @@ READER = _text.reader(
     mark=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:rat +(?:pci +)?)?rnti +cqi +ri +mcs", re.MULTILINE),
     row=_ROW,
     torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:lte|nr) +[0-9a-fA-F]{1,5} "),
-    keep=(_CHANNELS,),
     streams=_streams,
 )

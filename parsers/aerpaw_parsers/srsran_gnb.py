@@ -12,16 +12,14 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
 
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _decided, _json, _lines, _rows, _stamps, _time
+from . import _json, _lines, _rows, _stamps, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"
@@ -43,8 +41,6 @@ _LOG = re.compile(
 )
 _TITLE = re.compile(_STAMP + rb" *\|? *pci +rnti +(?:\| +)?cqi +ri +mcs", re.MULTILINE)
 _SCHEDULER = re.compile(_STAMP + rb" +\[METRICS *\][^\n]{0,300}\bdl_ri=", re.MULTILINE)
-_HEAD_BYTES = 1 << 20
-"""What says whether the log has a table."""
 _TORN = re.compile(rb"^\[?[-0-9/]{10}[ T][0-9:.]{8,18}\]? +\d{1,4} +(?:0x)?[0-9a-fA-F]{1,6} ")
 
 
@@ -55,21 +51,7 @@ def sniff(head: bytes) -> bool:
 
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
-    return _read(_pattern(data), data, options)
-
-
-def _pattern(begin: bytes) -> re.Pattern[bytes]:
-    """Rows of the table, or of the log where the beginning has no table."""
-    begin = begin[:_HEAD_BYTES]
-    return _LOG if _SCHEDULER.search(begin) and not _TITLE.search(begin) else _ROW
-
-
-def _in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    begin, chunks = blocks.beginning(chunks, _HEAD_BYTES)
-    return blocks.by_lines(partial(_read, _pattern(begin)), keep=(_TITLE, _SCHEDULER))(chunks, options)
-
-
-def _read(pattern: re.Pattern[bytes], data: bytes, options: ReadOptions) -> ReadResult:
+    pattern = _LOG if _SCHEDULER.search(data) and not _TITLE.search(data) else _ROW
     torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
     rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
     rnti = np.array([int(text, 16) if text else -1 for text in rows.text("rnti")], dtype=np.float64)
@@ -97,20 +79,12 @@ def _ues(one: dict[str, Any]) -> Iterator[dict[str, Any]]:
 
 def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb``: a record per UE and report."""
-    return _read_reports(data, options, _decided.Decided())
-
-
-def _read_reports(data: bytes, options: ReadOptions, decided: _decided.Decided) -> ReadResult:
-    """Reports of a block; how times are understood all blocks must agree on."""
     lines = _lines.split(data)
     reports = _json.objects(lines)
     row, found = reports.row, reports.found
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
-    course: _stamps.Course = decided.kept.setdefault("times", _stamps.Course())
-    clock, time, warnings = _stamps.read(texts, options, course=course)
-    if texts:
-        decided.agree("times", (clock, course.day_first, *warnings))
+    clock, time, warnings = _stamps.read(texts, options)
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
         lines,
@@ -140,7 +114,6 @@ READER = Reader(
     sample="[2025-01-01 12:00:07.000000]   1 4601 |  15   2   28    17M  908    0   0%    44k |  26.7 -21.2",
     sniff=sniff,
     read=read,
-    in_blocks=_in_blocks,
 )
 JSON_READER = Reader(
     name="srsran_json",
@@ -149,5 +122,4 @@ JSON_READER = Reader(
     sample='{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "cqi": 15, "dl_ri": 2.0}}]}',
     sniff=sniff_json,
     read=read_json,
-    in_blocks=_decided.json_in_blocks(_read_reports),
 )

@@ -52,5 +52,4 @@ READER = _text.reader(
     row=_ROW,
     torn=re.compile(rb"^\[[^\]\n]{19,40}\] *(?:\d{1,2}|lte|nr) +\d{1,4} +-?\d"),
     streams=_streams,
-    settle=_cells.settled,
 )

@@ -22,14 +22,13 @@ from __future__ import annotations
 import json
 import zlib
 from collections import defaultdict
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
 
@@ -79,15 +78,11 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     InputError
         If the schema is a later one than we know.
     """
-    return _read((data,), options)
+    return read_pieces((data,), options)
 
 
-def in_blocks(chunks: Iterator[bytes], options: ReadOptions) -> ReadResult:
-    """The same from pieces of the file; only numbers are kept of a block."""
-    return _read(blocks.whole_lines(chunks), options)
-
-
-def _read(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
+def read_pieces(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
+    """The same from pieces of whole lines; only numbers are kept of a piece."""
     log = _Log()
     for data in pieces:
         log.add(data)
@@ -96,12 +91,12 @@ def _read(pieces: Iterable[bytes], options: ReadOptions) -> ReadResult:
     for name, value in (("node", options.node), ("frequency_hz", options.frequency_hz)):
         if value is not None:
             common[name] = value
-    rsrp = log.rsrp.frame() if log.rsrp.count else None
+    rsrp = _joined(log.rsrp)
     streams = []
     for query, name in _RANKS:
-        if not log.rank[query].count:
+        frame = _joined(log.rank[query])
+        if frame is None:
             continue
-        frame = log.rank[query].frame()
         if name == "nr5g" or frame["rank"].notna().any():
             if name == "nr5g":
                 frame = _beside(frame, rsrp)
@@ -132,8 +127,8 @@ class _Log:
 
     def __init__(self) -> None:
         self.header: dict[str, Any] | None = None
-        self.rank = {query: blocks.Records() for query, _ in _RANKS}
-        self.rsrp = blocks.Records()
+        self.rank: dict[str, list[pd.DataFrame]] = {query: [] for query, _ in _RANKS}
+        self.rsrp: list[pd.DataFrame] = []
         self.lines = self.exchanges = self.blank = 0
         self.rejected: list[RejectedLine] = []
         self.events: list[str] = []
@@ -150,8 +145,8 @@ class _Log:
         self.exchanges += len(exchanges)
         self.blank += blank + len(records) - len(exchanges)
         for query, kept in self.rank.items():
-            _keep(kept, _rank_frame([item for item in exchanges if item[1].get("query") == query]))
-        _keep(self.rsrp, _rsrp_frame(exchanges))
+            kept.append(_rank_frame([item for item in exchanges if item[1].get("query") == query]))
+        self.rsrp.append(_rsrp_frame(exchanges))
         for _, record in records:
             self._note(record)
 
@@ -196,9 +191,10 @@ class _Log:
         return tuple(found)
 
 
-def _keep(records: blocks.Records, frame: pd.DataFrame) -> None:
-    if len(frame):
-        records.extend({str(name): frame[name].to_numpy() for name in frame.columns})
+def _joined(frames: list[pd.DataFrame]) -> pd.DataFrame | None:
+    """All records, None where there are none."""
+    some = [frame for frame in frames if len(frame)]
+    return pd.concat(some, ignore_index=True) if some else None
 
 
 def _records(data: bytes, before: int) -> tuple[list[tuple[int, dict[str, Any]]], list[RejectedLine], int]:
@@ -320,5 +316,5 @@ READER = Reader(
     sample='{"kind":"header","schema":"aerpaw-cmp-tap/1", ...',
     sniff=sniff,
     read=read,
-    in_blocks=in_blocks,
+    read_pieces=read_pieces,
 )

@@ -266,7 +266,6 @@ def test_a_log_of_a_named_reader_is_read_once(
 ) -> None:
     """What another reader would say of it takes its first bytes alone, however large the log is."""
     (tmp_path / "log").write_bytes(pack(VEHICLE * 2000))
-    monkeypatch.setattr(room.blocks, "FROM_BYTES", 1)  # nothing is small
     whole = []
     raw = room._raw
 
@@ -275,7 +274,6 @@ def test_a_log_of_a_named_reader_is_read_once(
         return raw(place, limit)
 
     monkeypatch.setattr(room, "_raw", counted)
-    monkeypatch.setattr(room, "_in_blocks", lambda *_: None)
     assert read_log(tmp_path, "log", OPTIONS, reader="vehicle_out").result.accepted
     assert sum(whole) == 1
     with pytest.raises(InputError, match="the content is that of vehicle_out"):

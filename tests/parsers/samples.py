@@ -52,6 +52,22 @@ SOUNDER = (
     b"[2025-03-02 10:00:00.229320] 0000034           2e-05\n"
     b"[2025-03-02 10:00:00.262080] 0000040\n"
 )
+
+
+def sounder_log(count: int) -> bytes:
+    """A power log of so many samples: a run of '*', a jump and a silent sample among them."""
+    out, offset = [], 0
+    for i in range(count):
+        stamp = f"[2025-03-02 10:{i // 1500:02d}:{i // 25 % 60:02d}.{i % 25 * 40000:06d}]"
+        if i % 40 == 17:
+            out.append(f"{stamp} *")
+            offset += 12
+            continue
+        offset += 44 if i % 97 == 96 else 4
+        out.append(f"{stamp} {offset:07o} {-788.5956 if i % 50 == 9 else -40 - i % 13:15.4f}")
+    return ("\n".join(out) + "\n").encode()
+
+
 SOUNDER_GROWN = (
     b"[2025-03-02 10:00:00.000000] 7777770       -20.12345\n"
     b"[2025-03-02 10:00:00.032760] 7777774           -21.5\n"

@@ -11,7 +11,6 @@ import pandas as pd
 import pytest
 
 from aerpaw_cmp.common.errors import InputError
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.readers import ReadOptions, by_name
 from aerpaw_cmp.logs.records import ReadResult
 from aerpaw_parsers import _json, _lines
@@ -47,38 +46,22 @@ def test_a_mean_of_ranks_is_no_rank(
 
 
 @pytest.mark.parametrize("utc", [b'"UTC"', b'"time"'])
-def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(
-    utc: bytes, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """All were rejected; cut into blocks, a block without ``utc`` counted from another origin."""
+def test_an_answer_without_the_time_of_the_others_is_the_one_that_is_rejected(utc: bytes) -> None:
     line = samples.AMARISOFT_JSON.splitlines(keepends=True)[0]
     data = line * 3 + line.replace(b'"utc"', utc) * 5
     whole = read("amarisoft_json", data)
     assert (whole.lines, whole.accepted, [one.number for one in whole.rejected]) == (8, 3, [4, 5, 6, 7, 8])
-    in_blocks = by_name("amarisoft_json").in_blocks
-    assert in_blocks is not None
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
-    with pytest.raises(blocks.Whole):
-        in_blocks(iter([data]), PLAIN)
     assert read("amarisoft_json", line.replace(b'"utc"', b'"time"') * 2).accepted == 2, "seconds of the program"
 
 
-def test_reports_whose_times_are_of_two_forms_are_read_in_one_piece(monkeypatch: pytest.MonkeyPatch) -> None:
-    """The form of the most is that of all; in blocks each had decided for itself."""
+def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
     line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
     data = line * 5 + line.replace(epoch, b'"no time"') * 4
     assert read("srsran_json", data).accepted == 5
-    in_blocks = by_name("srsran_json").in_blocks
-    assert in_blocks is not None
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 2 * len(line))
-    with pytest.raises(blocks.Whole):
-        in_blocks(iter([data]), PLAIN)
-    assert in_blocks(iter([line * 9]), PLAIN).accepted == 9
 
 
-def test_reports_with_times_of_the_day_alone_pass_midnight_in_blocks(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whether midnight has passed the block before tells: those after it were placed a day early."""
+def test_reports_with_times_of_the_day_alone_pass_midnight() -> None:
     line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)
     data = b"".join(
@@ -87,11 +70,6 @@ def test_reports_with_times_of_the_day_alone_pass_midnight_in_blocks(monkeypatch
     options = replace(PLAIN, file_name="gnb_2025-03-02.json")
     time = by_name("srsran_json").read(data, options).streams[0].frame["time"].to_numpy()
     assert (time[1:] - time[:-1] == np.timedelta64(1, "s")).all()
-    in_blocks = by_name("srsran_json").in_blocks
-    assert in_blocks is not None
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 1)
-    pieces = data.splitlines(keepends=True)
-    assert (in_blocks(iter(pieces), options).streams[0].frame["time"].to_numpy() == time).all()
 
 
 def test_oai_layouts() -> None:

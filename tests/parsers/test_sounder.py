@@ -40,7 +40,7 @@ GOOD = [sample(3, 0o17, -20.5), sample(4, 0o7777777, 3.25), line(5, f"10000000 {
 
 
 def test_lines_of_od_are_read_at_once() -> None:
-    found = sounder_log._fixed_layout(_lines.split("".join(GOOD).encode()))
+    found, _ = sounder_log._fixed_layout(_lines.split("".join(GOOD).encode()))
     assert found.line.tolist() == [0, 1, 2]
     assert found.offset.tolist() == [0o17, 0o7777777, 0o10000000]
     assert found.value.tolist() == [-20.5, 3.25, -788.5956]
@@ -58,7 +58,7 @@ def test_lines_with_one_sign_changed_are_left_to_the_strict_way(row: int, place:
     if row == 2 and place == 36:
         place += 1  # the space behind the offset
     bad = good[:place] + sign + good[place + 1 :]
-    assert len(sounder_log._fixed_layout(_lines.split(bad.encode())).line) == 0
+    assert len(sounder_log._fixed_layout(_lines.split(bad.encode()))[0].line) == 0
     result = read(*GOOD, bad)
     assert (result.accepted, len(result.rejected)) == (3, 1)
 
@@ -106,8 +106,8 @@ def test_a_run_has_as_many_samples_as_its_offsets_say_at_even_times() -> None:
 
 def test_offsets_of_a_run_go_on_from_the_sample_before() -> None:
     lines = _lines.split("".join((sample(0, 8), star(1), sample(4, 24))).encode())
-    samples, marks, _, _ = sounder_log._odd_lines(lines, np.zeros(0, dtype=np.int64))
-    repeats, used, bad = sounder_log._expand(samples, marks)
+    piece = sounder_log._piece(lines, _lines.Rejects())
+    repeats, used, bad = sounder_log._expand(piece.samples, piece.marks)
     assert (repeats.offset.tolist(), used.tolist(), bad) == ([12, 16, 20], [1], [])
 
 

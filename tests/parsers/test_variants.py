@@ -9,7 +9,6 @@ from pathlib import Path
 import pandas as pd
 import pytest
 
-from aerpaw_cmp.logs import blocks
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import by_name, identify
 from tests.parsers.samples import BINARY, NEMO_CSV, OPTIONS, QUECTEL_CSI, SAMPLES
@@ -53,16 +52,6 @@ def test_a_table_that_begins_behind_long_talk_is_found(reader: str, name: str, t
     (tmp_path / "log.txt").write_bytes(talk + data)
     (file,) = ingest(tmp_path / "log.txt", options=OPTIONS)
     assert (file.result.reader, file.result.accepted) == (reader, accepted)
-
-
-def test_a_mark_in_front_of_a_large_log_is_no_part_of_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(blocks, "FROM_BYTES", 100)
-    monkeypatch.setattr(blocks, "BLOCK_BYTES", 100)
-    data = SAMPLES["vehicle_out"]["ten_fields"][0]
-    (tmp_path / "a.txt").write_bytes(b"\xef\xbb\xbf" + data)
-    (tmp_path / "b.txt").write_bytes(data.decode().encode("utf-16"))
-    for file in ingest(tmp_path, options=OPTIONS):
-        assert (file.result.accepted, file.result.rejected) == (3, ())
 
 
 def _cells(data: bytes) -> list[list[bytes]]:

@@ -28,11 +28,28 @@ RANK_COLUMNS = {
 }
 
 
+TITLES = {
+    "free_space": "free space",
+    "log_distance": "log-distance line",
+    "two_ray": "two-ray",
+    "tr36777_rma_av": "3GPP RMa-AV",
+    "tr36777_uma_av": "3GPP UMa-AV",
+    "kriging": "Kriging of the level",
+    "replay_paper": "ray tracing, the paper's settings",
+    "replay_drafted": "ray tracing, as drafted",
+    "replay_sionna": "ray tracing, Sionna's paths",
+    "learned": "learned antennas",
+    "learned_residual": "learned antennas and residual field",
+    "boosted_trees": "gradient-boosted trees",
+}
+"""Names of our entrants on the page."""
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Bar:
     """One entrant in a task: its row of numbers, and its dot and whisker in percent of the width."""
 
-    entrant: str
+    title: str
     scores: Mapping[str, Any]
     at: float
     low: float
@@ -50,6 +67,9 @@ class TaskTable:
     skipped: Sequence[str]
     columns: Mapping[str, tuple[str, str]]
     bars: Sequence[Bar]
+    scores: Mapping[str, Mapping[str, Any]]
+    key: str
+    unit: str
     reach: float
     words: str
 
@@ -75,7 +95,7 @@ def task_table(name: str, about: Mapping[str, Any], scores: Mapping[str, Mapping
         known = low is not None and high is not None and math.isfinite(low) and math.isfinite(high)
         span = (low, high) if known else (value, value)
         at, start, stop = (100.0 * x / (1.05 * reach) for x in (value, *span))
-        bars.append(Bar(entrant=entrant, scores=scores[entrant], at=at, low=start, high=stop))
+        bars.append(Bar(title=TITLES.get(entrant, entrant), scores=scores[entrant], at=at, low=start, high=stop))
     return TaskTable(
         name=name,
         title=about["title"],
@@ -84,26 +104,44 @@ def task_table(name: str, about: Mapping[str, Any], scores: Mapping[str, Mapping
         skipped=about["skipped"],
         columns=columns,
         bars=bars,
+        scores=scores,
+        key=key,
+        unit="nat" if rank else "dB",
         reach=reach,
         words=_words(order, scores, key),
     )
 
 
 def _words(order: Sequence[str], scores: Mapping[str, Mapping[str, Any]], key: str) -> str:
-    """Who leads, and against which baseline its lead is shown by a paired 95 % interval."""
+    """The best model, and the baselines that a paired 95 % interval shows it to beat."""
     if not order:
         return "No entrant."
-    best = scores[order[0]]
+    best, name = scores[order[0]], TITLES.get(order[0], order[0])
     if key == "log_score":
-        return f"Lowest log score: {order[0]}, {best[key]:.2f} nat; the constant has {best['constant_log_score']:.2f}."
-    said = []
-    for name in ("free_space", "log_distance"):
-        low, high = best.get(f"difference_to_{name}_ci95_db", (math.nan, math.nan))
-        if order[0] != name and math.isfinite(low):
-            shown = "lower" if high < 0 else "not significantly different"
-            said.append(f"{shown} than {name}" if high < 0 else f"{shown} from {name}")
-    beaten = f" It is {' and '.join(said)} (paired, 95 %)." if said else ""
-    return f"Lowest RMSE: {order[0]}, {best[key]:.2f} dB.{beaten}"
+        return f"Lowest log score: {name}, {best[key]:.2f} nat; the constant has {best['constant_log_score']:.2f}."
+    beaten: list[str] = []
+    equal: list[str] = []
+    for other in ("free_space", "log_distance"):
+        low, high = best.get(f"difference_to_{other}_ci95_db", (math.nan, math.nan))
+        if order[0] != other and math.isfinite(low):
+            (beaten if high < 0 else equal).append(TITLES[other])
+    words = [f"Lowest RMSE: {name}, {best[key]:.2f} dB."]
+    if beaten:
+        words.append(f"It is lower than that of {' and '.join(beaten)} (paired, 95 %).")
+    if equal:
+        words.append(f"The difference from {' and '.join(equal)} is not significant.")
+    return " ".join(words)
+
+
+def _first_words(tables: Sequence[TaskTable]) -> str:
+    """On how many tasks a model without ray tracing and learning is as good as any."""
+    simple = {TITLES[n] for n in ("free_space", "log_distance", "two_ray", "tr36777_rma_av", "tr36777_uma_av")}
+    simple |= {"constant", TITLES["kriging"]}
+    won = [one.title for one in tables if one.bars and one.bars[0].title in simple]
+    text = f"{len(tables)} tasks were scored. "
+    if not won:
+        return text + "On none of them is a baseline the best model."
+    return text + f"A baseline is the best model on {len(won)}: {'; '.join(won)}."
 
 
 def benchmark_page(tables: Sequence[TaskTable], missing: Sequence[str], generated: str, version: str) -> str:
@@ -124,6 +162,13 @@ def benchmark_page(tables: Sequence[TaskTable], missing: Sequence[str], generate
     text: str = (
         environment()
         .get_template("benchmark.html.jinja")
-        .render(tables=tables, missing=missing, generated=generated, version=version, content_policy=policy())
+        .render(
+            tables=tables,
+            first_words=_first_words(tables),
+            missing=missing,
+            generated=generated,
+            version=version,
+            content_policy=policy(),
+        )
     )
     return text

@@ -151,7 +151,8 @@ class Score:
     whose error is within two standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured
     minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
     place of the flight's own. ``constant_rmse_db``, ``log_distance_rmse_db``: of a constant, and of a line over log
-    distance whose slope at each of eight places comes from the other places of the flight.
+    distance whose slope at each of eight places comes from the other places of the flight. Where a part of a flight is
+    scored, the offset of every model (and the slope of the line) comes from outside that part.
     """
 
     flight: str
@@ -168,17 +169,35 @@ class Score:
     rmse_shared_offset_db: float = math.nan
 
 
-def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = None) -> Score | None:
-    """Score of a prediction; None with fewer than 50 samples to score."""
+def score(
+    observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = None, simple: Simple | None = None
+) -> Score | None:
+    """Score of a prediction; None with fewer than 50 samples to score.
+
+    Parameters
+    ----------
+    observed : Observed
+    gain_db : (n,)
+        Predicted level above free space [dB]; NaN is not scored.
+    sd_db : (n,), optional
+        Its standard deviation [dB]; NaN is not checked.
+    simple : Simple, optional
+        Baselines whose offset in each scored part, like that of ``gain_db``, comes from samples outside the part, so
+        that they are compared like for like. Without, they have one offset for the whole flight.
+    """
     s = observed.samples
-    error = s.residual_db - gain_db
-    good = np.isfinite(error)
+    free = np.zeros(len(s)) if simple is None else simple.free_db
+    good = np.isfinite(s.residual_db - gain_db) & np.isfinite(free)
     if good.sum() < LEAST_SAMPLES:
         return None
-    time, free, left = s.time_s[good], observed.free_space_db[good], error[good]
-    measured, level = s.residual_db[good] + free, gain_db[good] + free
-    line = log_distance_level_db(measured, 10.0 ** (-free / 20.0), s.position_m[good])
-    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, level, 4.0)
+    time, level, left = s.time_s[good], observed.free_space_db[good], (s.residual_db - gain_db)[good]
+    measured = s.residual_db[good] + level
+    if simple is None:
+        constant = np.zeros(len(left))
+        line = log_distance_level_db(measured, 10.0 ** (-level / 20.0), s.position_m[good])
+    else:
+        constant, line = simple.constant_db[good], simple.line_db[good]
+    means = local_mean_db(time, measured, 4.0) - local_mean_db(time, gain_db[good] + level, 4.0)
     known = np.zeros(len(left), np.bool_) if sd_db is None else np.isfinite(sd_db[good])
     inside = math.nan
     if sd_db is not None and known.any():
@@ -189,13 +208,36 @@ def score(observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = No
         channel=s.channel,
         rmse_db=float(left.std()),
         rmse_4s_db=float(means.std()),
-        free_space_rmse_db=float(s.residual_db[good].std()),
-        constant_rmse_db=float(measured.std()),
+        free_space_rmse_db=float((s.residual_db - free)[good].std()),
+        constant_rmse_db=float((measured - constant).std()),
         log_distance_rmse_db=float((measured - line).std()),
         n=int(good.sum()),
         offset_db=float(left.mean()),
         within_2sd=inside,
     )
+
+
+@dataclass(frozen=True, slots=True)
+class Simple:
+    """Models without antennas, each (n,): free space above its level, a constant and a line over log distance [dB]."""
+
+    free_db: FloatArray
+    constant_db: FloatArray
+    line_db: FloatArray
+
+    @classmethod
+    def unknown(cls, samples: int) -> Simple:
+        """Nothing predicted yet."""
+        return cls(*np.full((3, samples), np.nan))
+
+    def predict(self, o: Observed, inside: BoolArray, outside: BoolArray) -> None:
+        """Fill in the samples of a part, every number of it from samples outside."""
+        measured = o.samples.residual_db + o.free_space_db
+        known = outside & np.isfinite(measured)
+        line = np.polynomial.Polynomial.fit(o.free_space_db[known], measured[known], 1)
+        self.free_db[inside] = o.samples.residual_db[known].mean()
+        self.constant_db[inside] = measured[known].mean()
+        self.line_db[inside] = line(o.free_space_db[inside])
 
 
 def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:
@@ -305,6 +347,7 @@ def parts_left_out(
     flights = spread_flights(flights_of(observed))
     of = {flight: [o for o in observed if o.samples.flight == flight] for flight in flights}
     stitched = {flight: [np.full(len(o.samples), np.nan) for o in of[flight]] for flight in flights}
+    simple = {flight: [Simple.unknown(len(o.samples)) for o in of[flight]] for flight in flights}
     # one part after the other: what the flights learn from is much the same, and kept
     for k in range(max(len(parts(mine[0], mine[0])) for mine in of.values())):
         for flight, mine in of.items():
@@ -318,7 +361,7 @@ def parts_left_out(
             except InputError:
                 continue
             known = {s.antenna for s in train}
-            for o, whole in zip(mine, stitched[flight], strict=True):
+            for o, whole, baselines in zip(mine, stitched[flight], simple[flight], strict=True):
                 inside, outside = parts(o, o)[k]
                 if o.samples.antenna not in known or not inside.any():
                     continue
@@ -326,7 +369,12 @@ def parts_left_out(
                 rest = (o.samples.residual_db - gain)[outside]
                 if np.isfinite(rest).sum() >= LEAST_SAMPLES:
                     whole[inside] = gain[inside] + np.nanmean(rest)
-    out = [score(o, whole) for flight in flights for o, whole in zip(of[flight], stitched[flight], strict=True)]
+                    baselines.predict(o, inside, outside)
+    out = [
+        score(o, whole, simple=baselines)
+        for flight in flights
+        for o, whole, baselines in zip(of[flight], stitched[flight], simple[flight], strict=True)
+    ]
     return tuple(s for s in out if s is not None)
 
 

@@ -534,9 +534,9 @@ def words_of(
         gain = free - here
         share = (base - left) / gain if gain > 0 else 0.0
         out.append(
-            f"Towards sectors of directions that the other flights never saw it leaves {left:.2f} dB: "
-            f"{100 * min(max(share, 0.0), 1.0):.0f} % of the gain over free space carries over there; the rest is "
-            "bound to directions and places that were flown before."
+            f"Towards sectors of directions that the other flights never saw, with offsets from outside the sector, it "
+            f"leaves {left:.2f} dB and free space {base:.2f} dB: {100 * min(max(share, 0.0), 1.0):.0f} % of the gain "
+            "over free space carries over to new directions."
         )
     body, world, wrong = (
         mean(controls.get(name, ())) for name in

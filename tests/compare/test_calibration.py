@@ -8,7 +8,15 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.compare import calibration
-from aerpaw_cmp.compare.calibration import Observed, Recipe, flight_left_out, flights_of, groups_of, spread_flights
+from aerpaw_cmp.compare.calibration import (
+    Observed,
+    Parts,
+    Recipe,
+    flight_left_out,
+    flights_of,
+    groups_of,
+    spread_flights,
+)
 from aerpaw_cmp.compare.direction_gain import GainModel, LinkSamples, Term
 
 MODEL = GainModel(terms=(Term("mast", "antenna", 0.5, 3.0),), bin_s=4.0)
@@ -83,3 +91,67 @@ def test_the_mean_alone_is_that_of_the_prediction() -> None:
     np.testing.assert_allclose(learned.mean(lost), learned.predict(lost)[0], rtol=0, atol=1e-9)
     assert learned.mean_error(lost) == pytest.approx(np.nanmean(lost.residual_db - learned.mean(lost)), abs=1e-9)
     assert np.isnan(learned.mean(lost)).sum() == 5
+
+
+def leaving(parts: Parts, flights: list[Observed]) -> tuple[calibration.Score, ...]:
+    """Scores of a split by parts, each flight predicted from the other."""
+    kept: dict[str, calibration.Learned] = {}
+    flight_left_out(flights, RECIPE, kept)
+    return calibration.parts_left_out(flights, RECIPE, kept, parts, own=False)
+
+
+def planted(o: Observed, part: np.ndarray, fault_db: float) -> Observed:
+    """The samples of a part shifted: only whoever learns from them, or fits an offset there, can know."""
+    level = o.samples.residual_db + np.where(part, fault_db, 0.0)
+    return dataclasses.replace(o, samples=dataclasses.replace(o.samples, residual_db=level))
+
+
+def circled(flight: str, seed: int) -> Observed:
+    """Two heights and all headings along four circles: whole parts can be left out."""
+    once = observed(flight, seed=seed)
+    o = once.part(np.tile(np.arange(len(once.samples)), 4))
+    count = len(o.samples)
+    position = o.samples.position_m.copy()
+    position[:, 2] = np.where(np.arange(count) % 5 == 0, 40.0, 90.0 + np.arange(count))
+    heading = np.degrees(np.arctan2(o.samples.at_tower[:, 0], o.samples.at_tower[:, 1])) % 360.0
+    samples = dataclasses.replace(o.samples, position_m=position)
+    return Observed(samples, o.free_space_db + np.linspace(0.0, 6.0, count), heading)
+
+
+@pytest.mark.parametrize("split", ["altitude", "heading", "sector"])
+def test_nothing_of_a_part_left_out_is_learned_or_fitted(split: str) -> None:
+    """A fault of 20 dB planted into one part of every flight: whoever learned or fitted any of it would know."""
+    every = getattr(calibration, f"{split}_parts")
+
+    def first(scored: Observed, other: Observed) -> list[tuple[np.ndarray, np.ndarray]]:
+        return every(scored, other)[:1]
+
+    flights = [circled("a", 1), circled("b", 2)]
+    unseen = [~first(flights[0], o)[0][1] for o in flights]
+    assert all(50 <= mask.sum() < 400 for mask in unseen)
+    faulty = [planted(o, mask, 20.0) for o, mask in zip(flights, unseen, strict=True)]
+    scores = [{s.flight: s for s in leaving(first, some)} for some in (flights, faulty)]
+    before, after = (some["a"] for some in scores)
+    assert before.n == after.n >= 50
+    assert after.offset_db - before.offset_db == pytest.approx(20.0, abs=1e-6)
+    for name in ("rmse_db", "free_space_rmse_db", "constant_rmse_db", "log_distance_rmse_db"):
+        assert getattr(after, name) == pytest.approx(getattr(before, name), abs=1e-6)
+
+
+@pytest.mark.parametrize("split", ["sector", "heading"])
+def test_baselines_of_a_part_take_their_offset_from_outside_it_too(split: str) -> None:
+    """Like for like: by hand, free space with the mean of the samples outside each part."""
+    flights = [circled("a", 1), circled("b", 2)]
+    scores = leaving(getattr(calibration, f"{split}_parts"), flights)
+    assert [s.flight for s in scores] == ["a", "b"]
+    for o, found in zip(flights, scores, strict=True):
+        error = np.full(len(o.samples), np.nan)
+        constant = error.copy()
+        for inside, outside in getattr(calibration, f"{split}_parts")(o, o):
+            level = o.samples.residual_db + o.free_space_db
+            error[inside] = o.samples.residual_db[inside] - o.samples.residual_db[outside].mean()
+            constant[inside] = level[inside] - level[outside].mean()
+        assert np.isfinite(error).all()
+        assert found.free_space_rmse_db == pytest.approx(error.std(), abs=1e-9)
+        assert found.constant_rmse_db == pytest.approx(constant.std(), abs=1e-9)
+        assert found.free_space_rmse_db > o.samples.residual_db.std()  # the flight's own offset flatters

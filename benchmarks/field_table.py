@@ -382,6 +382,15 @@ def best_k_table(found: dict[str, Any]) -> str:
     return markdown(header, rows)
 
 
+def carried(splits: dict[str, dict[str, float]]) -> float:
+    """Share of the gain over free space that is left towards directions that were never flown [%]."""
+    gains = [splits[name]["free_space_rmse_db"] - splits[name]["rmse_db"] for name in SECTOR_OF_FLIGHT]
+    return 100.0 * gains[0] / gains[1]
+
+
+SECTOR_OF_FLIGHT = ("sector_left_out", "flight_left_out")
+
+
 TEXT = """# Lake Wheeler, real flights
 
 Statistics of real AERPAW logs against the replay. Made by `benchmarks/field_table.py`; every number is also in
@@ -393,7 +402,8 @@ intervals by block bootstrap ({replicates} replicates).
 RMSE in dB after one offset per flight and channel. Everything else was learned on other flights (`aerpaw-cmp
 calibrate`): mounts and gain over direction at both ends. Each further row leaves out more: the flight's height, its
 headings, its directions at the tower; that of the route learns from the rest of the flight itself. Controls are simpler
-or wrong models, scored as the first row.
+or wrong models, scored as the first row. In the rows of parts the offset of every model, of free space too, comes from
+outside the part.
 
 {held_rss}
 
@@ -412,7 +422,8 @@ SNR of four towers in one flight, paper's geometry, nothing learned but one offs
 
 What does not work:
 
-- Most of what is learned does not carry over to directions that were never flown (row "and its directions").
+- Towards directions that were never flown {carried} of the gain over free space is
+  left (row "and its directions").
 - AFAR: the sounder loses its lock in fades and its level falls by 30 dB; no gain describes that.
 - Rank of a pose is predicted to kappa {kappas}; total variation of the expected histogram is no better than that of
   the constant forecast, and many geometries of the antennas explain the reports equally well.
@@ -564,6 +575,7 @@ def page(found: dict[str, Any], replicates: int) -> str:
     return TEXT.format(
         replicates=replicates,
         held_rss=markdown(*field_held_out.rows_of_rss(held)),
+        carried=", ".join(f"{carried(one['splits']):.0f} % ({name})" for name, one in held["rss"].items()),
         held_words="\n".join(f"- {name}: {' '.join(one['words'])}" for name, one in held["rss"].items()),
         held_flights=markdown(*field_held_out.rows_of_flights(held)),
         held_rank=markdown(*field_held_out.rows_of_rank(held)),

@@ -184,6 +184,10 @@ def score(
     simple : Simple, optional
         Baselines whose offset in each scored part, like that of ``gain_db``, comes from samples outside the part, so
         that they are compared like for like. Without, they have one offset for the whole flight.
+
+    Returns
+    -------
+    Score or None
     """
     s = observed.samples
     free = np.zeros(len(s)) if simple is None else simple.free_db
@@ -217,6 +221,10 @@ def score(
     )
 
 
+STEEPEST = 3.0
+"""Of a line over log distance: times free space."""
+
+
 @dataclass(frozen=True, slots=True)
 class Simple:
     """Models without antennas, each (n,): free space above its level, a constant and a line over log distance [dB]."""
@@ -234,10 +242,14 @@ class Simple:
         """Fill in the samples of a part, every number of it from samples outside."""
         measured = o.samples.residual_db + o.free_space_db
         known = outside & np.isfinite(measured)
-        line = np.polynomial.Polynomial.fit(o.free_space_db[known], measured[known], 1)
+        free, level = o.free_space_db[known], measured[known]
+        spread = float(((free - free.mean()) ** 2).sum())
+        slope = float(((free - free.mean()) * (level - level.mean())).sum()) / spread if spread else 0.0
+        # 0 to 60 dB per decade: seen from one height only, a line may point anywhere else
+        slope = min(max(slope, 0.0), STEEPEST)
         self.free_db[inside] = o.samples.residual_db[known].mean()
-        self.constant_db[inside] = measured[known].mean()
-        self.line_db[inside] = line(o.free_space_db[inside])
+        self.constant_db[inside] = level.mean()
+        self.line_db[inside] = level.mean() + slope * (o.free_space_db[inside] - free.mean())
 
 
 def mean_rmse(scores: Sequence[Score], name: str = "rmse_db") -> float:

@@ -48,7 +48,7 @@ def flight_file(hours: float, *, rank: bool) -> dict:
     }  # fmt: skip
     wanted = ("LW1", None) if rank else ("LW1",)
     logs = [g for g in content["logs"] if g.get("node", "") in (*wanted, "") and (rank or "ri" not in g["path"])]
-    return {**content, "logs": logs, "report": {"speed_table": False}, "rt": {**content["rt"], "audit_links": 0}}
+    return {**content, "logs": logs, "rt": {**content["rt"], "audit_links": 0}}
 
 
 def _seconds(points: list[dict], plan: dict) -> float:

@@ -41,7 +41,6 @@ def report(tmp_path_factory: pytest.TempPathFactory) -> Report:
         settings = yaml.safe_load(FLIGHTS[name].read_text(encoding="utf-8"))
         settings.setdefault("rss", {})["bootstrap"] = 100
         settings.setdefault("rank", {})["bootstrap"] = 100
-        settings["report"] = {"speed_table": False}
         if variant == "vertical":
             settings["link"]["rank"]["tower"]["slant_deg"] = 0
             settings["link"]["rank"]["uav"]["slant_deg"] = 0

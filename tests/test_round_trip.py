@@ -86,7 +86,6 @@ def test_the_clock_has_one_sign_on_every_path(tmp_path: Path) -> None:
     path = flight(tmp_path, clock_shift_s={"LW1": 2.5}, offsets_db={"LW1": {"USRP1": 12.3}})
     content = yaml.safe_load(path.read_text())
     content["logs"] = [log for log in content["logs"] if log.get("node", "LW1") == "LW1"]
-    content["report"] = {"speed_table": False}
     path.write_text(yaml.safe_dump(content))
     assert main(["simulate", str(path)]) == 0
     settings = load_flight(path)

@@ -496,9 +496,10 @@ class ReportSettings(Settings):
 
     title: str | None = None
     waypoints: list[Waypoint] = []
-    speed_table: bool = True
+    speed_table: bool | None = None
+    """Ignored, and said so in the report: it will be refused in the next release."""
     audit: Literal["now", "later"] = "now"
-    """``later``: the report is written without the audit and the table of speed; ``aerpaw-cmp audit`` fills them in."""
+    """``later``: the report is written without the audit; ``aerpaw-cmp audit`` fills it in."""
     export: list[Literal["geojson", "geopackage", "kmz", "gpx", "mat", "netcdf", "parquet", "all"]] = []
     """Formats of the samples besides rss.csv and rank.csv."""
 

@@ -1,8 +1,8 @@
-"""The audit and the table of speed against error as a later stage of a report.
+"""The audit as a later stage of a report.
 
-They cost more than the rest of a short report, most of it to load the other engine. ``report.audit: later`` (or
-``--audit later``) writes the report without them; the page says so, ``--strict`` fails, and ``aerpaw-cmp audit`` fills
-them in. It does so by the job that made the report, on the same inputs, and exchanges the folder as a whole: page,
+It costs more than the rest of a short report, most of it to load the other engine. ``report.audit: later`` (or
+``--audit later``) writes the report without it; the page says so, ``--strict`` fails, and ``aerpaw-cmp audit`` fills it
+in. It does so by the job that made the report, on the same inputs, and exchanges the folder as a whole: page,
 tables and audit are of one run and one version, never of two.
 """
 

@@ -33,7 +33,6 @@ MEASURED = {
     "ladder, replays of the RSS": 2.5,
     "audit": 9.0,
     "audit, per link": 0.02,
-    "speed": 6.0,
     "page": 0.6,
     "figures": 2.0,
     "figures, per channel": 0.61,
@@ -180,7 +179,7 @@ def report_plan(
     stages += [*rss, *rank]
     seconds = n_rss * cost["compare, per RSS sample"] + n_rank * cost["compare, per rank sample"]
     stages.append(PlannedStage(name="compare", work=f"{n_rss} RSS and {n_rank} rank samples", seconds=seconds))
-    if audited := rt.audit_links > 0 and settings.report.audit == "now":
+    if rt.audit_links > 0 and settings.report.audit == "now":
         links = min(rt.audit_links, n_rss + n_rank)
         seconds = cost["audit"] + links * cost["audit, per link"]
         stages.append(PlannedStage(name="audit", work=f"{links} links by the other engine", seconds=seconds))
@@ -188,8 +187,6 @@ def report_plan(
         known_s = [stage.seconds for stage in rss if stage.seconds is not None]
         seconds = MEASURED["ladder, replays of the RSS"] * sum(known_s)
         stages.append(PlannedStage(name="ladder", work="simpler and richer models", seconds=seconds))
-    if audited and settings.report.speed_table:
-        stages.append(PlannedStage(name="speed", work="table of speed against error", seconds=cost["speed"]))
     drawn = 0 if figures == "none" else len(data.rss) + len(data.rank)
     drawing = (cost["figures"] + drawn * cost["figures, per channel"]) * (3.0 if figures == "all" else 1.0)
     seconds = cost["page"] + (drawing if drawn else 0.0)

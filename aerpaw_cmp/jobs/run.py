@@ -190,8 +190,8 @@ def run_report(
     out, logs_root : Path, optional
         Results folder (default ``reports/<flight>``), folder against which the paths of the logs resolve.
     engine, audit : str, optional
-        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit and the
-        table of speed are left to :func:`run_audit`.
+        In place of ``rt.engine`` and ``rt.audit_links`` ("full", "none" or a number); with "later" the audit is
+        left to :func:`run_audit`.
     recommend : Path, optional
         Where to write it.
     force : bool
@@ -245,7 +245,7 @@ def run_report(
             data = load_data(settings, flight.parent, logs_root)
         replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
-        record = report_record(flight_run, other_inputs(settings, flight, logs_root), stages)
+        record = report_record(flight_run, other_inputs(settings, flight, logs_root))
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}
         record = with_later_audit(record, settings, flight, folder, logs_root, asked)
         if same_inputs is not None:
@@ -312,7 +312,7 @@ def run_audit(
     force: bool = False,
     progress: Progress = silent,
 ) -> ReportOutcome:
-    """Fill the audit and the table of speed into an existing report, whose folder is exchanged as a whole.
+    """Fill the audit into an existing report, whose folder is exchanged as a whole.
 
     Parameters
     ----------

@@ -43,7 +43,6 @@ def report_data(
     data: FlightData,
     result: FlightResult,
     *,
-    speed: Sequence[record.SpeedRow] = (),
     notes: Sequence[str] = (),
     other_inputs: Sequence[record.InputFile] = (),
     stages_s: Mapping[str, float] | None = None,
@@ -57,8 +56,6 @@ def report_data(
         Settings, site, logs and track.
     result : FlightResult
         The numbers.
-    speed : sequence of SpeedRow
-        The table of speed against error.
     notes : sequence of str
         Remarks beside those of the flight file.
     other_inputs : sequence of InputFile
@@ -99,7 +96,6 @@ def report_data(
         engine=result.engine,
         serving=result.serving,
         ladder=result.ladder,
-        speed=tuple(speed),
         synthetic=settings.flight.synthetic,
         warnings=tuple(dict.fromkeys(warnings)),
         notes=(*settings.flight.notes, *notes, *_serving_note(result)),  # the page adds those of the site

@@ -405,42 +405,6 @@ Engine: TypeAlias = EngineResult
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class SpeedRow:
-    """One row of speed against error; errors are against ``reference`` rows of the same run."""
-
-    engine: str
-    samples: int | None
-    arrays: str
-    depth: int
-    seconds: float
-    links_per_s: float
-    peak_mib: float = float("nan")
-    missing_paths: int | None = None
-    extra_paths: int | None = None
-    rss_max_error_db: float = float("nan")
-    rss_rms_error_db: float = float("nan")
-    rank_disagreement: Mapping[float, float] = field(default_factory=dict)
-    thinning: int = 1
-    reference: bool = False
-
-    @property
-    def samples_label(self) -> str:
-        """Samples per source as ``1e6``; empty for an engine without samples."""
-        return "" if self.samples is None else f"{self.samples:.0e}".replace("e+0", "e").replace("e+", "e")
-
-    @property
-    def family(self) -> str:
-        """The setting but for the number of samples."""
-        thin = "" if self.thinning == 1 else f", 1 pose in {self.thinning}"
-        return f"{self.engine}, {self.arrays}, depth {self.depth}{thin}"
-
-    @property
-    def label(self) -> str:
-        """Name of the row."""
-        return self.family.replace(",", f" {self.samples_label},", 1) if self.samples_label else self.family
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
 class ReportData:
     """Everything a report shows.
 
@@ -453,7 +417,7 @@ class ReportData:
         UTC, ISO 8601.
     versions : mapping of str to str
     inputs : tuple of InputFile
-    track, waypoints, rss, rank, pairs, engine, ladder, speed
+    track, waypoints, rss, rank, pairs, engine, ladder
         See their classes.
     synthetic : bool
         The logs were made by ``aerpaw-cmp simulate``; said on the first screen.
@@ -470,7 +434,7 @@ class ReportData:
     extra_metrics : mapping
         Merged into ``metrics.json`` last, key by key.
     audit_command : str
-        The command that fills in the audit and the table of speed, where they were put off; else empty.
+        The command that fills in the audit, where it was put off; else empty.
     """
 
     title: str
@@ -486,7 +450,6 @@ class ReportData:
     pairs: tuple[ChannelPair, ...] = ()
     engine: EngineResult | None = None
     ladder: tuple[LadderRow, ...] = ()
-    speed: tuple[SpeedRow, ...] = ()
     synthetic: bool = False
     warnings: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()

@@ -11,7 +11,7 @@ import numpy as np
 from ..common.jsonable import json_safe
 from ..common.provenance import KEY, union
 from ..logs.records import has_wall_clock
-from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel, SpeedRow
+from .data import RANKS, Engine, Histogram, Interval, RankPanel, ReportData, RssPanel
 from .names import RANK_COLUMNS, RSS_COLUMNS, iso_time, k_key
 
 _DECIMALS = 4  # 0.1 mm and 1e-4 dB: finer than any log, and the files stay readable
@@ -52,7 +52,6 @@ def metrics(data: ReportData) -> dict[str, Any]:
         "rss": rss,
         "rank": {panel.tower: _rank_metrics(panel) for panel in data.rank},
         "rt": None if data.engine is None else _engine_metrics(data.engine),
-        "speed": [_speed_metrics(row) for row in data.speed],
         "stages": {f"{name}_s": seconds for name, seconds in data.stages_s.items()},
         "warnings": list(data.warnings),
     }
@@ -149,14 +148,6 @@ def _engine_metrics(engine: Engine) -> dict[str, Any]:
             "reference_seconds": audit.reference_seconds,
         },
     }
-
-
-def _speed_metrics(row: SpeedRow) -> dict[str, Any]:
-    names = ["engine", "samples", "arrays", "depth", "thinning", "seconds", "links_per_s", "peak_mib"]
-    names += ["missing_paths", "extra_paths", "rss_max_error_db", "rss_rms_error_db"]
-    result: dict[str, Any] = {name: getattr(row, name) for name in names}
-    result["rank_disagreement"] = {k_key(k): v for k, v in row.rank_disagreement.items()}
-    return result
 
 
 def merge(into: dict[str, Any], other: Mapping[str, Any]) -> None:

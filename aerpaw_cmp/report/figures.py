@@ -24,7 +24,6 @@ from .rss_figures import (
     trajectory,
 )
 from .serving_figures import serving_spec
-from .speed_figures import pareto, rank_changes
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -63,20 +62,6 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
     for rank in data.rank:
         if len(rank.time):
             result += _rank_specs(data, rank)
-    if data.speed:
-        result.append(
-            FigureSpec(
-                name="speed_against_error",
-                page=True,
-                section="speed",
-                title="Speed against error",
-                caption="Down and left is better. The dashed line joins the settings that no other setting beats in "
-                "both seconds and error. Markers grow with the samples per source; an error of 0 has its place at the "
-                "foot of the scale." + ("" if rank_changes(data.speed) else " No setting changes the rank of a link."),
-                alt="Scatter plot of seconds against error for each engine setting.",
-                draw=lambda: pareto(data.speed),
-            )
-        )
     return _with_own_names(result)
 
 

@@ -221,7 +221,6 @@ def page(data: ReportData, pictures: Sequence[Picture], files: Sequence[str]) ->
         ladder=ladder_table(data.ladder),
         warnings=words.warnings(data),
         baselines=list(dict.fromkeys(b.name for panel in data.rss for b in panel.baselines)),
-        speed_ks=sorted({k for row in data.speed for k in row.rank_disagreement}),
         rss_columns=RSS_COLUMNS,
         rank_columns=RANK_COLUMNS,
         rejected_shown=REJECTED_SHOWN,

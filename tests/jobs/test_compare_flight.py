@@ -52,7 +52,6 @@ logs:
 rt: {{engine: image, max_depth: 1, audit_links: 0, attitude: logged{rt}}}
 rss: {{bootstrap: 50, span_db: [-100, 100], lag: "off"{rss_keys}}}
 rank: {{bootstrap: 50}}
-report: {{speed_table: false}}
 {more}
 """
 

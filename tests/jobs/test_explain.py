@@ -38,7 +38,6 @@ SETTINGS = {
     "link": {"rss": {"carrier_hz": 3.3e9, "tower": {**ANTENNA, "slant_deg": [20.0]}, "uav": ANTENNA}},
     "rt": {"audit_links": 0, "attitude": "logged", "foliage": "attenuating", "reflection_loss_db": 1.5},
     "rss": {"bootstrap": 20, "lag": "off"},
-    "report": {"speed_table": False},
 }  # fmt: skip
 
 

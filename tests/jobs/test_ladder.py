@@ -49,7 +49,6 @@ logs:
      columns: {{time: t, rss_db: level}}}}
 rt: {{max_depth: 1, audit_links: 0}}
 rss: {{lag: "off", bootstrap: 100, span_db: [-100, 100]}}
-report: {{speed_table: false}}
 """,
         encoding="utf-8",
     )

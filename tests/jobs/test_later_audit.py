@@ -52,7 +52,6 @@ def no_other_engine(monkeypatch: pytest.MonkeyPatch) -> list[int]:
         asked.append(data.settings.rt.audit_links)
 
     monkeypatch.setattr(audit_flight, "_audit", audit)
-    monkeypatch.setattr("aerpaw_cmp.jobs.speed_table.speed_rows", lambda *_: ())
     return asked
 
 

@@ -45,7 +45,6 @@ logs:
 rt: {{engine: {engine}, max_depth: 1, audit_links: 0}}
 rss: {{bootstrap: 20, lag: "off", span_db: [-100, 100]}}
 rank: {{bootstrap: 20, tower: ROVER}}
-report: {{speed_table: false}}
 """
 
 

@@ -44,11 +44,11 @@ def test_a_planned_report_names_its_links_and_poses_and_writes_nothing(
     assert work["replay RSS LW1 USRP1"].startswith("651 poses")
     assert work["replay rank LW1"].startswith("652 poses")
     assert {"clocks", "compare", "ladder", "report"} <= set(work)
-    assert not {"audit", "speed"} & set(work)
+    assert "audit" not in work
     assert plan["output"] == "reports/sample1"
     assert plan["seconds"] == pytest.approx(sum(stage["seconds"] for stage in plan["stages"]))
     audited = planned(capsys, "report", file, "--logs-root", SAMPLE, "--audit", "50", "--figures", "none")
-    assert {"audit", "speed"} <= {stage["name"] for stage in audited["stages"]}
+    assert "audit" in {stage["name"] for stage in audited["stages"]}
     assert "figures of 0 channels" in audited["stages"][-1]["work"]
     sionna = planned(capsys, "report", file, "--logs-root", SAMPLE, "--engine", "sionna")
     assert "replay RSS LW1 USRP1" in sionna["not_estimated"]

@@ -43,7 +43,7 @@ SETTINGS: dict[str, Any] = {
     "rt": {"max_depth": 1, "audit_links": 0},
     "rss": {"bootstrap": 50, "lag": "off"},
     "rank": {"k": [10, 100], "bootstrap": 20},
-    "report": {"speed_table": False, "export": ["gpx"]},
+    "report": {"export": ["gpx"]},
 }  # fmt: skip
 
 

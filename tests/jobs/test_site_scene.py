@@ -124,7 +124,6 @@ FLIGHT = {
     "link": {"rss": {"carrier_hz": 3.3e9, "tower": {"layout": "single"}, "uav": {"layout": "single"}}},
     "rt": {"audit_links": 3, "samples": 10_000, "cache": False, "power_cut_db": 30.0},
     "rss": {"bootstrap": 10, "lag": "off"},
-    "report": {"speed_table": False},
 }  # fmt: skip
 
 

@@ -24,7 +24,6 @@ from aerpaw_cmp.report.data import (
     RankPanel,
     ReportData,
     RssPanel,
-    SpeedRow,
     Track,
     Variant,
     Waypoint,
@@ -182,61 +181,6 @@ def make_rank(site: Site, track: Track) -> RankPanel:
     )  # fmt: skip
 
 
-def make_speed() -> tuple[SpeedRow, ...]:
-    rows = [
-        SpeedRow(
-            engine="image",
-            samples=None,
-            arrays="spherical float64",
-            depth=2,
-            seconds=0.09,
-            links_per_s=11000,
-            peak_mib=210,
-            missing_paths=0,
-            extra_paths=0,
-            rss_max_error_db=0.0,
-            rss_rms_error_db=0.0,
-            rank_disagreement={10.0: 0.0, 1000.0: 0.0},
-            reference=True,
-        )
-    ]
-    for samples, seconds, error in ((1000, 0.9, 18.0), (10000, 1.6, 9.0), (100000, 6.0, 2.1), (1000000, 31.0, 0.3)):
-        for arrays, wrong in (("plane wave", 0.45), ("explicit float32", 0.31), ("float64", 0.02)):
-            rows.append(
-                SpeedRow(
-                    engine="sionna",
-                    samples=samples,
-                    arrays=arrays,
-                    depth=2,
-                    seconds=seconds * (1.4 if "explicit" in arrays else 1.0),
-                    links_per_s=1000 / seconds,
-                    peak_mib=900,
-                    missing_paths=int(error * 20),
-                    extra_paths=0,
-                    rss_max_error_db=error,
-                    rss_rms_error_db=error / 10,
-                    rank_disagreement={10.0: wrong / 4, 1000.0: wrong},
-                )
-            )
-    rows.append(
-        SpeedRow(
-            engine="image",
-            samples=None,
-            arrays="spherical float64",
-            depth=1,
-            seconds=0.02,
-            links_per_s=50000,
-            peak_mib=180,
-            missing_paths=90,
-            extra_paths=0,
-            rss_max_error_db=1.2,
-            rss_rms_error_db=0.1,
-            rank_disagreement={10.0: 0.0, 1000.0: 0.05},
-        )
-    )
-    return tuple(rows)
-
-
 def make_report() -> ReportData:
     site, track = make_site(), make_track()
     waypoints = tuple(
@@ -311,7 +255,7 @@ def make_report() -> ReportData:
     return ReportData(
         title="Sample flight around LW1, 2024-07-15", flight="sample", site=site, generated="2026-11-21T00:00:00Z",
         versions={"aerpaw-cmp": "0.1.0", "numpy": np.__version__}, inputs=inputs, track=track, waypoints=waypoints,
-        rss=rss, rank=(make_rank(site, track),), pairs=(pair,), engine=engine, speed=make_speed(), synthetic=True,
+        rss=rss, rank=(make_rank(site, track),), pairs=(pair,), engine=engine, synthetic=True,
         settings={"flight": "sample", "rt": {"max_depth": 2}}, stages_s={"ingest": 0.2, "replay": 0.71, "report": 6.0},
     )  # fmt: skip
 

@@ -183,7 +183,7 @@ def test_a_broken_formula_would_be_seen(driver, small_report):
 
 
 def test_only_rank(small_report, tmp_path, driver):
-    bare = dataclasses.replace(small_report, rss=(), pairs=(), speed=())
+    bare = dataclasses.replace(small_report, rss=(), pairs=())
     path = write.write_report(bare, tmp_path, drawn="none").files[0]
     here = driver.current_url
     driver.get(path.as_uri())

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from PIL import Image
 
-from aerpaw_cmp.report import canvas, figures, html, rss_figures, speed_figures
+from aerpaw_cmp.report import canvas, figures, html, rss_figures
 from aerpaw_cmp.report.data import Histogram, RankPanel, ReportData, RssPanel, Track
 
 
@@ -48,7 +48,6 @@ def test_every_figure_has_labels_with_units_and_a_legend(small_report):
         "rss_LW4_USRP1",
         "rank_map_LW1",
         "rank_histogram_LW1",
-        "speed_against_error",
     } <= set(seen)
     assert len(seen) == len(set(seen))
 
@@ -184,16 +183,16 @@ def drawn_before():
         lambda d: {"rss": (dataclasses.replace(d.rss[2], offset_db=50.0, at_search_edge=True),), "rank": ()},
         lambda d: {"rss": (), "rank": (no_csi(d.rank[0]),)},
         lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=(), curve=None, singular_ratio_db=None),)},
-        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=d.rank[0].simulated[:1]),), "speed": d.speed[:1]},
+        lambda d: {"rss": (), "rank": (dataclasses.replace(d.rank[0], simulated=d.rank[0].simulated[:1]),)},
         lambda d: {"rss": (), "rank": (), "track": still(d.track)},
         lambda d: {"rss": (), "rank": (), "track": Track(time=d.track.time[:1], east_m=d.track.east_m[:1], north_m=d.track.north_m[:1], up_m=d.track.up_m[:1])},
         lambda d: {"rss": (), "rank": (), "track": dataclasses.replace(d.track, up_m=np.full(len(d.track.time), np.nan))},
-        lambda d: {"rss": (), "rank": (), "speed": (), "site": dataclasses.replace(d.site, towers={}, buildings=(), forests=(), geofences=(), trees=type(d.site.trees).none())},
+        lambda d: {"rss": (), "rank": (), "site": dataclasses.replace(d.site, towers={}, buildings=(), forests=(), geofences=(), trees=type(d.site.trees).none())},
     ],
     ids=["one sample", "all out of coverage", "edge", "no CSI at all", "rank without simulation", "one K", "hovering", "one pose", "no height", "bare site"],
 )  # fmt: skip
 def test_odd_flights_are_drawn_without_a_warning(report_data, drawn_before, change):
-    data = dataclasses.replace(report_data, **{"speed": (), **change(report_data)})
+    data = dataclasses.replace(report_data, **change(report_data))
     left_alone = data.track is report_data.track and data.site is report_data.site
     for spec in figures.figure_specs(data):
         if left_alone and spec.section.startswith(("flight", "pair/")):  # these have of the panels only what is named:
@@ -234,11 +233,6 @@ def test_thinning_keeps_a_gap_open():
     a, b = canvas.thinned(np.arange(10_000.0), level, 500)
     assert not np.isfinite(b[(a > 4050) & (a < 5950)]).any()
     assert np.isnan(b).any()
-
-
-def test_pareto_front_is_not_beaten():
-    seconds, error = [3.0, 1.0, 2.0, 2.0, 5.0], [1.0, 5.0, 3.0, 4.0, np.nan]
-    assert speed_figures.pareto_front(seconds, error) == [1, 2, 0]
 
 
 def test_residual_sign_is_measured_minus_simulated(report_data):
@@ -289,31 +283,6 @@ def test_relative_times_count_from_the_first_sample(small_report):
     page = html.page(data, [], [])
     assert "From (s)" in page
     assert "23:57" not in page
-
-
-def test_samples_are_told_by_size_and_no_labels_collide(report_data):
-    with canvas.style():
-        fig = speed_figures.pareto(report_data.speed)
-    left, right = fig.axes
-    assert not left.texts
-    assert not right.texts
-    sizes = {n: speed_figures.marker_size(n) for n in (1_000, 10_000, 100_000, 1_000_000)}
-    assert (np.diff(list(sizes.values())) >= 1.5).all()
-    drawn_sizes = {line.get_markersize() for line in left.lines if len(line.get_xdata()) == 1}
-    assert set(sizes.values()) <= drawn_sizes
-    told = {text.get_text() for text in fig.legends[0].get_texts()}
-    assert {"1e3 samples per source", "1e6 samples per source", "reference"} <= told
-
-
-def test_no_empty_rank_plane_where_no_setting_changes_a_rank(report_data):
-    same = tuple(
-        dataclasses.replace(r, rank_disagreement=dict.fromkeys(r.rank_disagreement, 0.0)) for r in report_data.speed
-    )
-    with canvas.style():
-        fig = speed_figures.pareto(same)
-    assert len(fig.axes) == 1
-    spec = next(p for p in figures.figure_specs(dataclasses.replace(report_data, speed=same)) if p.section == "speed")
-    assert spec.caption.endswith("No setting changes the rank of a link.")
 
 
 def test_captions_speak_of_what_is_drawn(report_data):

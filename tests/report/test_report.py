@@ -27,7 +27,7 @@ def test_whole_report(small_report, tmp_path):
 
 @pytest.mark.parametrize(("drawn", "suffixes"), [("none", set()), ("svg", {".svg"}), ("all", {".svg", ".png", ".pdf"})])
 def test_figures_are_drawn_as_asked(small_report, tmp_path, drawn, suffixes):
-    data = dataclasses.replace(small_report, rss=(), pairs=(), speed=(), rank=())
+    data = dataclasses.replace(small_report, rss=(), pairs=(), rank=())
     files = write.write_report(data, tmp_path, drawn=drawn, style="paper").files
     figures = [f for f in files if f.parent.name == "figures"]
     assert {f.suffix for f in figures} == suffixes
@@ -46,7 +46,7 @@ def test_the_seconds_of_the_writing_are_told(small_report, tmp_path):
 
 
 def test_without_rss_the_tables_have_their_columns(small_report, tmp_path):
-    bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), speed=(), track=None, waypoints=())
+    bare = dataclasses.replace(small_report, rss=(), rank=(), pairs=(), track=None, waypoints=())
     write.write_report(bare, tmp_path)
     assert (tmp_path / "rss.csv").read_text() == ",".join(names.RSS_COLUMNS) + "\n"
 

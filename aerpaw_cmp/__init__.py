@@ -20,7 +20,7 @@ _HOME = {
     "Logs": "logs.frames",
     "OrdinaryKriging": "maps.kriging",
     "Poses": "propagation.arrays",
-    "Replay": "propagation.tracer",
+    "Replay": "propagation.replay",
     "ReplayedFlight": "jobs.notebook",
     "Site": "site.site",
     "Variogram": "maps.variogram",

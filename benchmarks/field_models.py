@@ -39,7 +39,8 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
 from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.antennas import read_gain_grid
 from aerpaw_cmp.site.installed import InstalledPattern
 
@@ -130,7 +131,7 @@ def traced(
         def loss(paths: Any, sources: FloatArray, targets: FloatArray) -> FloatArray:
             return foliage_loss_db(sources[paths.tower], paths.vertices_m, targets[paths.pose], crowns, leafy)
 
-    found = replay(site, link, Poses(flight.poses.position_m, rotation), max_depth=depth, loss=loss)
+    found = replay(site, link, Poses(flight.poses.position_m, rotation), Search(max_depth=depth), Field(loss=loss))
     return (found.rss_power_dbm if power else found.rss_dbm)[:, 0]
 
 

@@ -24,11 +24,12 @@ import numpy as np
 from shapely.geometry import box
 
 import aerpaw_cmp
+from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.arrays import Poses, single_element
 from aerpaw_cmp.propagation.bench import random_scene
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
 POSES, TOWERS, SCENES = 400, 5, 10
@@ -91,7 +92,11 @@ def record(flights: list[Path], logs_root: Path | None) -> dict[str, Any]:
     if case is not None:
         held |= columns("street", replay(*case))
     for place in [SAMPLE, *flights]:
-        opened = aerpaw_cmp.open_flight(place, logs_root=None if place == SAMPLE else logs_root).replay()
+        try:
+            opened = aerpaw_cmp.open_flight(place, logs_root=None if place == SAMPLE else logs_root).replay()
+        except UsageError as error:
+            print(f"{place.stem} is left out: {error}", flush=True)
+            continue
         for number, series in enumerate(opened.replays.all):
             held |= columns(f"{place.stem} {number}", series.replay)
         print(place.stem, flush=True)

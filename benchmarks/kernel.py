@@ -27,8 +27,9 @@ from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.propagation import compiled
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.field.sum import channel_matrices
+from aerpaw_cmp.propagation.options import Run
+from aerpaw_cmp.propagation.replay import Replay, replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import Replay, replay
 
 TOWERS = 5
 FLOPS = {"pair": 213, "reflection": 115, "slab": 105}
@@ -40,7 +41,7 @@ def timed(mode: str, case, threads: int | None = 1) -> tuple[Replay, float, floa
     """A replay with its CPU and wall seconds."""
     os.environ[compiled.SWITCH] = mode
     cpu, wall = time.process_time(), time.perf_counter()
-    found = replay(*case, threads=threads)
+    found = replay(*case, run=Run(threads=threads))
     return found, time.process_time() - cpu, time.perf_counter() - wall
 
 
@@ -162,8 +163,9 @@ def cold(sizes: tuple[int, ...] = (1000, 3000, 5000, 10_000)) -> list[dict[str, 
         for mode in ("never", "always"):
             line = (
                 "import time\nfrom aerpaw_cmp.propagation.bench import random_scene\n"
-                "from aerpaw_cmp.propagation.tracer import replay\n"
-                f"case = random_scene({size}, towers={TOWERS})\nreplay(*case, threads=1)\nprint(time.process_time())"
+                "from aerpaw_cmp.propagation.options import Run\nfrom aerpaw_cmp.propagation.replay import replay\n"
+                f"case = random_scene({size}, towers={TOWERS})\nreplay(*case, run=Run(threads=1))\n"
+                "print(time.process_time())"
             )
             environment = os.environ | {compiled.SWITCH: mode}
             said = subprocess.run([sys.executable, "-c", line], env=environment, capture_output=True, check=True)

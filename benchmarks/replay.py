@@ -24,7 +24,8 @@ import numpy as np
 
 from aerpaw_cmp.propagation.arrays import Link, Poses
 from aerpaw_cmp.propagation.bench import path_search, random_scene, speed_against_error
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Run, Search
+from aerpaw_cmp.propagation.replay import replay
 
 REFERENCE = Path(__file__).parents[1] / "tests" / "propagation" / "reference.py"
 
@@ -144,8 +145,8 @@ def size(poses: int, towers: int) -> dict[str, object]:
 def cached(poses: int, folder: str) -> dict[str, float]:
     """A second replay by the sionna engine reads the paths."""
     site, link, some = random_scene(poses)
-    first = replay(site, link, some, "sionna", samples=100_000, cache_dir=folder)
-    second = replay(site, link, some, "sionna", samples=100_000, cache_dir=folder)
+    first = replay(site, link, some, Search("sionna", samples=100_000), run=Run(cache_dir=folder))
+    second = replay(site, link, some, Search("sionna", samples=100_000), run=Run(cache_dir=folder))
     return {"first_s": first.seconds, "second_s": second.seconds, "ratio": first.seconds / second.seconds}
 
 

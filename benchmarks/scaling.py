@@ -32,6 +32,8 @@ from typing import Any
 import numpy as np
 import yaml
 
+from aerpaw_cmp.propagation.options import Search
+
 ROOT = Path(__file__).resolve().parents[1]
 SIZES: dict[str, tuple[list[float], list[float]]] = {
     "poses": ([10_000, 30_000, 100_000], [10_000, 100_000, 1_000_000]),
@@ -68,10 +70,10 @@ def warm_timed(action: Callable[[], Any]) -> dict[str, float]:
 def replay_of(poses: int, towers: int = 1, buildings: int = 12) -> dict[str, float]:
     """Paths and fields of a random scene."""
     from aerpaw_cmp.propagation.bench import random_scene
-    from aerpaw_cmp.propagation.tracer import replay
+    from aerpaw_cmp.propagation.replay import replay
 
     site, link, some = random_scene(poses, towers=towers, buildings=buildings)
-    return warm_timed(lambda: replay(site, link, some, max_depth=2))
+    return warm_timed(lambda: replay(site, link, some, Search(max_depth=2)))
 
 
 def faces(count: int) -> dict[str, float]:
@@ -83,7 +85,7 @@ def faces(count: int) -> dict[str, float]:
 
     from aerpaw_cmp.propagation.arrays import Poses
     from aerpaw_cmp.propagation.bench import random_scene
-    from aerpaw_cmp.propagation.tracer import replay
+    from aerpaw_cmp.propagation.replay import replay
     from aerpaw_cmp.site.site import Building
 
     site, link, some = random_scene(100, buildings=0)
@@ -100,7 +102,7 @@ def faces(count: int) -> dict[str, float]:
             built.append(Building(f"building {number}", shape, float(height)))
     position = some.position_m * [side / 600.0, side / 600.0, 1.0]
     scene = change(site, buildings=tuple(built))
-    found = warm_timed(lambda: replay(scene, link, Poses(position, some.rotation), max_depth=2))
+    found = warm_timed(lambda: replay(scene, link, Poses(position, some.rotation), Search(max_depth=2)))
     return {**found, "faces": 1 + 5 * len(built)}
 
 

@@ -38,7 +38,7 @@ def test_using_one_name_loads_only_its_room() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["propagation.trace", "propagation.audit", "propagation.tracer", "logs.ingest", "compare.rank"]
+    "name", ["propagation.trace", "propagation.audit", "propagation.replay", "logs.ingest", "compare.rank"]
 )
 def test_no_function_hides_a_module(name: str) -> None:
     module = importlib.import_module(f"aerpaw_cmp.{name}")

@@ -8,8 +8,8 @@ from ..common.errors import UsageError
 from ..common.units import FloatArray, wavelength_m
 from ..propagation.crowns import Crowns
 from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.options import Loss
 from ..propagation.paths import PathSet
-from ..propagation.tracer import Loss
 from ..site.site import Site, Trees
 from .settings import RtSettings
 

@@ -17,11 +17,13 @@ from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.drivers.pairs import replay_pairs
 from ..propagation.effort import Estimate
 from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.moving import loss_along, moving_matrices, replay_moving
+from ..propagation.options import Engine, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet
-from ..propagation.tracer import NOT_IN_RANKS, Engine, Loss, Replay, replay
+from ..propagation.replay import NOT_IN_RANKS, Replay, replay
 from ..site.site import Site
 from .clock import ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
@@ -259,9 +261,9 @@ class _Predictions:
         track = self.track_at(times).where(known)
         poses, depth = valid_poses(track, data.settings.rt.attitude), min(data.settings.rt.max_depth, 1)
         if tower in data.nodes:
-            replayed = replay_moving(data.site, link, poses, place[track.valid], max_depth=depth)
+            replayed = replay_moving(data.site, link, poses, place[track.valid], Search(max_depth=depth))
         else:
-            replayed = replay(data.site, link, poses, engine="image", max_depth=depth)
+            replayed = replay(data.site, link, poses, Search("image", max_depth=depth))
         levels = {"rss_dbm": replayed.rss_dbm[:, 0], "rss_power_dbm": replayed.rss_power_dbm[:, 0]}
         return {name: _spread(track.valid, level) for name, level in levels.items()}
 
@@ -460,20 +462,11 @@ def replay_poses(
     if towers_m is not None:
         name = "+".join(link.tower_arrays)
         _check_moving(rt, engine, name)
-        return replay_moving(
-            site,
-            link,
-            poses,
-            towers_m,
-            max_depth=rt.max_depth,
-            loss=path_loss(site, rt, link.carrier_hz),
-            crowns=reflecting_crowns(site.trees, rt),
-            power_cut_db=rt.power_cut_db,
-            visibility=rt.visibility,
-            threads=rt.threads,
-            device=rt.device,
-            progress=share_of(progress, f"replay {name}, which moves"),
-        )
+        run = Run(threads=rt.threads, progress=share_of(progress, f"replay {name}, which moves"))
+        each = replay_pairs if rt.visibility == "pairs" else replay
+        search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt))
+        field = Field(path_loss(site, rt, link.carrier_hz))
+        return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
     whole = rt.relevance_db is not None or crowns_reflect(site.trees, rt)
     if len(poses) > BLOCK and engine == "image" and not whole:
@@ -486,29 +479,28 @@ def replay_poses(
         progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
         return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
-    replayed = replay(
-        site,
-        link,
-        poses,
-        engine=engine,
+    search = Search(
+        engine,
         max_depth=rt.max_depth,
         samples=rt.samples,
         batch=rt.batch,
-        loss=path_loss(site, rt, link.carrier_hz),
         crowns=reflecting_crowns(site.trees, rt),
-        cache_dir=None if rt.cache else "",
-        relevance_db=rt.relevance_db,
         power_cut_db=rt.power_cut_db,
         check_power_cut=check_power_cut,
-        on_estimate=lambda estimate: _tell(progress, name, estimate),
-        visibility=rt.visibility if engine == "image" else "centre",
-        threads=rt.threads,
-        device=rt.device,
         interactions=rt.interactions if others else ("reflection",),
         scattering_coefficient=rt.scattering_coefficient if others else None,
+        device=rt.device,
+    )
+    run = Run(
+        cache_dir=None if rt.cache else "",
+        threads=rt.threads,
         # the image engine is done before a bar could be seen
         progress=share_of(progress, name) if engine == "sionna" else None,
+        on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
+    field = Field(path_loss(site, rt, link.carrier_hz), rt.relevance_db)
+    each = replay_pairs if rt.visibility == "pairs" and engine == "image" else replay
+    replayed = each(site, link, poses, search, field, run)
     if rt.other_interactions and not others:
         replayed.left_out.append(NOT_IN_RANKS)
     return replayed

@@ -25,7 +25,8 @@ from ..common.units import MINIMUM_HEIGHT_M, FloatArray, IntArray
 from ..compare.rank import channel_rank
 from ..logs.writers import format_power_log, format_ri_csv, format_vehicle_out
 from ..propagation.arrays import Poses, rotation_from_aircraft
-from ..propagation.tracer import replay
+from ..propagation.options import Search
+from ..propagation.replay import replay
 from ..site.site import Site
 from .settings import FlightFile, LogSettings, PlanSettings
 
@@ -332,17 +333,15 @@ class FlightSimulator:
         links = self.settings.link
         link = links.channels.get(log.channel, links.rss).build([log.node], self.folder)
         rt = self.settings.rt
-        result = replay(
-            self.site,
-            link,
-            self._poses(time_s),
-            engine=rt.engine,
+        search = Search(
+            rt.engine,
             max_depth=rt.max_depth,
             samples=rt.samples,
             batch=rt.batch,
             interactions=rt.interactions,  # refused by the image engine
             scattering_coefficient=rt.scattering_coefficient,
         )
+        result = replay(self.site, link, self._poses(time_s), search)
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
         level = result.rss_dbm[:, 0] - offset
         level = level + correlated_noise(
@@ -371,7 +370,7 @@ class FlightSimulator:
         time_s = np.arange(0.0, self.trajectory.duration_s, plan.rank_interval_s)
         link = self.settings.link.rank.build([tower], self.folder)
         poses = self._poses(time_s)
-        result = replay(self.site, link, poses, engine=self.settings.rt.engine, max_depth=self.settings.rt.max_depth)
+        result = replay(self.site, link, poses, Search(self.settings.rt.engine, max_depth=self.settings.rt.max_depth))
         truth = channel_rank(result.h[:, 0], plan.rank_k)
         reported = self._reported(truth, min(result.h.shape[-2:]))
         latitude, longitude = self.site.frame.to_geographic(poses.position_m[:, 0], poses.position_m[:, 1])

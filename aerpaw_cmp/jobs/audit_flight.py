@@ -25,11 +25,12 @@ from ..flight.replay import Replayed, attitude_rotation, may_share, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
-from ..propagation.audit import Audit, audit
+from ..propagation.audit import Audit, Second, audit
 from ..propagation.field.sum import mean_pair_power
 from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
 from ..propagation.interactions import summary
 from ..propagation.moving import site_with_tower_at
+from ..propagation.options import Field, Run, Search
 from ..propagation.reference import (
     C_MPS,
     PATTERNS,
@@ -156,17 +157,17 @@ def _of_series(
         replayed.link,
         replayed.poses,
         replayed.replay,
+        Search(
+            max_depth=rt.max_depth,
+            samples=rt.samples,
+            batch=rt.batch,
+            crowns=reflecting_crowns(site.trees, rt),
+            power_cut_db=rt.power_cut_db,
+        ),
+        Field(loss=path_loss(site, rt, replayed.link.carrier_hz)),
+        Run(cache_dir=None if rt.cache else ""),
         links=links,
-        max_depth=rt.max_depth,
-        samples=rt.samples,
-        batch=rt.batch,
-        loss=path_loss(site, rt, replayed.link.carrier_hz),
-        crowns=reflecting_crowns(site.trees, rt),
-        cache_dir=None if rt.cache else "",
-        ks=ks,
-        expected=expected,
-        power_cut_db=rt.power_cut_db,
-        reference_links=reference_links,
+        second=Second(expected=expected, ks=ks, reference_links=reference_links),
     )
 
 

@@ -53,9 +53,10 @@ from ..propagation.arrays import Link, Poses, linear_array, single_element
 from ..propagation.crowns import Crowns
 from ..propagation.field.sum import channel_matrices, rss_dbm
 from ..propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
+from ..propagation.options import Engine, Search
 from ..propagation.paths import PathSet
+from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene
-from ..propagation.tracer import Engine, Replay, replay
 from ..report import maps_data as page
 from ..site.site import Site
 from ..site.siteyaml import load_site
@@ -221,7 +222,7 @@ class SiteChannels:
     def _all_modes(self, position_m: FloatArray) -> dict[str, Evaluation]:
         poses = Poses(self._above_ground(position_m), np.broadcast_to(np.eye(3), (len(position_m), 3, 3)))
         s = self.settings
-        replayed = replay(self.site, self.siso, poses, s.engine, max_depth=s.max_depth, samples=s.samples)
+        replayed = replay(self.site, self.siso, poses, Search(s.engine, max_depth=s.max_depth, samples=s.samples))
         self.paths += len(replayed.paths)
         siso, mimo = replayed.h, self._matrices(replayed, replayed.paths, poses, self.mimo, None)
         result = {}

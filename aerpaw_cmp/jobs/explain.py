@@ -31,7 +31,7 @@ from ..propagation.explained import (
 from ..propagation.image import planes_of
 from ..propagation.moving import site_with_tower_at
 from ..propagation.paths import joined
-from ..propagation.tracer import Replay
+from ..propagation.replay import Replay
 from ..site.site import Site
 
 MORE_SAMPLES = 10

@@ -29,7 +29,8 @@ from ..flight.training import learned_here
 from ..propagation.arrays import Link, Poses
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..propagation.moving import replay_moving
-from ..propagation.tracer import Replay, replay
+from ..propagation.options import Run, Search
+from ..propagation.replay import Replay, replay
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site
@@ -271,9 +272,9 @@ class _Climber:
             series = self._series[index]
             link, poses, sources = series.replayed.link, self._poses(series, "ignored"), self._sources(series)
             if series.replayed.tower_m is not None:
-                replayed = replay_moving(site, link, poses, sources, max_depth=depth)
+                replayed = replay_moving(site, link, poses, sources, Search(max_depth=depth))
             else:
-                replayed = replay(site, link, poses, max_depth=depth, cache_dir="")
+                replayed = replay(site, link, poses, Search(max_depth=depth), run=Run(cache_dir=""))
             self._traced[index, buildings] = replayed, time.perf_counter() - begin
         return self._traced[index, buildings]
 

@@ -21,7 +21,9 @@ from ..common.stages import Stages
 from ..flight.data import FlightData
 from ..flight.settings import FlightFile, RtSettings
 from ..propagation.arrays import Link, Poses, single_element
-from ..propagation.tracer import estimate_search, replay
+from ..propagation.engines import estimate_search
+from ..propagation.options import Search
+from ..propagation.replay import replay
 from ..site.site import Site
 from ..site.siteyaml import load_site
 
@@ -105,7 +107,7 @@ def probe() -> float:
     link = Link(3.3e9, {"LW1": single_element()}, single_element())
     line = np.linspace(50.0, 400.0, 200)
     poses = Poses(np.column_stack([line, 0.3 * line, np.full(200, 40.0)]), np.tile(np.eye(3), (200, 1, 1)))
-    return min(_cpu_seconds(lambda: replay(site, link, poses, max_depth=2)) for _ in range(5))
+    return min(_cpu_seconds(lambda: replay(site, link, poses, Search(max_depth=2))) for _ in range(5))
 
 
 def _cpu_seconds(work: Any) -> float:
@@ -243,7 +245,9 @@ def _tried(site: Site, rt: RtSettings, name: str, link: Link, poses: Poses) -> P
 def _by_first_faces(site: Site, rt: RtSettings, name: str, work: str, link: Link, poses: Poses) -> PlannedStage | None:
     """The stage of a replay among thousands of faces, from the search of the first ones; None among few."""
     start = time.process_time()
-    estimate = estimate_search(site, link, poses, max_depth=rt.max_depth, power_cut_db=rt.power_cut_db, threads=1)
+    estimate = estimate_search(
+        site, link, poses, Search(max_depth=rt.max_depth, power_cut_db=rt.power_cut_db), threads=1
+    )
     if estimate is None:
         return None
     setup = time.process_time() - start  # reading, merging and trees, which are kept for the next stage
@@ -260,7 +264,9 @@ def _map_by_first_faces(site: Site, settings: Any, heights: int) -> PlannedStage
     spots = Grid.over_area(site.area_m, settings.spacing_m).positions_m(max(settings.rss_altitudes_m))
     piece = spots[:: max(1, len(spots) // CHUNK)][:CHUNK]
     poses = Poses(piece, np.tile(np.eye(3), (len(piece), 1, 1)))
-    estimate = estimate_search(site, SiteChannels(site, settings).siso, poses, max_depth=settings.max_depth, threads=1)
+    estimate = estimate_search(
+        site, SiteChannels(site, settings).siso, poses, Search(max_depth=settings.max_depth), threads=1
+    )
     if estimate is None:
         return None
     setup, pieces = time.process_time() - start, heights * -(-len(spots) // CHUNK)

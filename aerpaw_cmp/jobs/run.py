@@ -17,6 +17,7 @@ from ..common.inputs import input_files
 from ..common.outputs import OutputFile, OutputFolder, is_sealed, sealed
 from ..common.stages import Progress, Stages, silent
 from ..flight.settings import RtSettings
+from ..propagation.options import Search
 from ..site.site import Site
 
 _KIND_OF = {"rss_db": "rss", "ri_raw": "rank"}
@@ -585,7 +586,7 @@ def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz
 
     from ..flight.losses import path_loss, reflecting_crowns
     from ..propagation.arrays import Link, Poses, single_element
-    from ..propagation.tracer import replay
+    from ..propagation.replay import replay
     from ..report.site_view import PathLine
 
     if track is None or not 0 <= pose < len(track.time):
@@ -594,7 +595,7 @@ def _paths_of_pose(rt: RtSettings, site: Site, track: Any, pose: int, carrier_hz
     # paths join the centres of the arrays: which elements they have does not matter
     link = Link(carrier_hz, dict.fromkeys(site.towers, single_element()), single_element())
     crowns, depth = reflecting_crowns(site.trees, rt), rt.max_depth
-    paths = replay(site, link, Poses(point, np.eye(3)[None]), max_depth=depth, crowns=crowns).paths
+    paths = replay(site, link, Poses(point, np.eye(3)[None]), Search(max_depth=depth, crowns=crowns)).paths
     towers = list(site.towers)
     loss = path_loss(site, rt, link.carrier_hz)
     if rt.foliage == "opaque" and loss is not None:

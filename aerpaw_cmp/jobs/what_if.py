@@ -20,7 +20,7 @@ from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
 from ..propagation.field.sum import Fields, mean_pair_power, rss_dbm
 from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
-from ..propagation.tracer import Loss
+from ..propagation.options import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
 from ..site.site import Site

@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -13,7 +11,6 @@ from ..common.units import FloatArray, IntArray
 from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Link, Poses
-from .crowns import Crowns
 from .field_audit import (
     REFERENCE_LINKS,
     Expected,
@@ -24,10 +21,10 @@ from .field_audit import (
     spread_over_paths,
 )
 from .image import planes_of
+from .options import Engine, Field, Run, Search
 from .paths import PathSet, joined
-from .samples import Samples
-from .tracer import Engine, Loss, Replay
-from .tracer import replay as run_replay
+from .replay import Replay
+from .replay import replay as run_replay
 
 FIELD_SAMPLES = 100_000
 """Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them."""
@@ -133,25 +130,40 @@ class Audit:
         }
 
 
+@dataclass(frozen=True, slots=True)
+class Second:
+    """What is asked of the second implementation.
+
+    Parameters
+    ----------
+    expected : Expected, optional
+        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.field_audit`).
+    ks : sequence of float
+        Singular-value ratios of the rank comparison.
+    reference_links : int
+        Poses that the second implementation computes.
+    complete : bool
+        Whether the replay claims to have every path.
+    """
+
+    expected: Expected | None = None
+    ks: Sequence[float] = RANK_K
+    reference_links: int = REFERENCE_LINKS
+    complete: bool = True
+
+
 def audit(
     site: Site,
     link: Link,
     poses: Poses,
     replay: Replay,
+    search: Search = Search(),  # noqa: B008 - frozen
+    field: Field = Field(),  # noqa: B008
+    run: Run = Run(),  # noqa: B008
     *,
     reference: Engine | None = None,
     links: int | None = 200,
-    max_depth: int = 2,
-    samples: Samples = "auto",
-    batch: int = 50,
-    loss: Loss | None = None,
-    crowns: Crowns | None = None,
-    cache_dir: str | Path | None = None,
-    ks: Sequence[float] = RANK_K,
-    expected: Expected | None = None,
-    reference_links: int = REFERENCE_LINKS,
-    complete: bool = True,
-    power_cut_db: float | None = None,
+    second: Second = Second(),
 ) -> Audit:
     """Check a replay by another engine, on the whole scene (nothing left out).
 
@@ -161,66 +173,42 @@ def audit(
         As given to the replay.
     replay : Replay
         The result to check.
+    search, field, run
+        As given to the replay; a power cut leaves the same paths out, and none is claimed to be complete.
     reference : {"image", "sionna"}, optional
         Default: the engine that the replay did not take.
     links : int or None
         About this many pose-tower pairs, poses evenly spread over the flight; None checks all.
-    max_depth, samples, batch, loss, crowns, cache_dir
-        As given to the replay.
-    ks : sequence of float
-        Singular-value ratios of the rank comparison.
-    expected : Expected, optional
-        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.field_audit`).
-    reference_links : int
-        Poses that the second implementation computes.
-    complete : bool
-        Whether the replay claims to have every path.
-    power_cut_db : float, optional
-        As given to the replay: the other engine leaves the same paths out, and none is claimed to be complete.
+    second : Second
+        What is checked by the second implementation, and how.
 
     Returns
     -------
     Audit
     """
-    complete = complete and power_cut_db is None
-    cut: dict[str, Any] = {"power_cut_db": power_cut_db, "check_power_cut": False}
+    complete = second.complete and search.power_cut_db is None
     replay = replay.of_reflections()  # the others have no second implementation: they are listed apart
     chosen = _spread(poses, None if links is None else -(-links // max(1, len(replay.towers))))
     other: Engine = reference or ("image" if replay.engine == "sionna" else "sionna")
+    search = replace(search, engine=other, check_power_cut=False)
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
-    checked = run_replay(
-        site,
-        link,
-        few,
-        other,
-        max_depth=max_depth,
-        samples=samples,
-        batch=batch,
-        loss=loss,
-        crowns=crowns,
-        cache_dir=cache_dir,
-        **cut,
-    )
-    rays = checked.samples or (FIELD_SAMPLES if samples == "auto" else samples)
-    field = None
+    checked = run_replay(site, link, few, search, Field(field.loss), run)
+    rays = checked.samples or (FIELD_SAMPLES if search.samples == "auto" else search.samples)
+    found, ks, expected = None, second.ks, second.expected
     if expected is not None:
-        field = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
+        found = FieldAudit(not_covered=("the second implementation: it knows prisms, no scene of triangles",))
         if site.scene is None:
-            few_kinds = spread_over_paths(replay, chosen, reference_links)
-            field = against_reference(
-                site, poses, replay, few_kinds, expected, ks=ks, max_depth=max_depth, complete=complete
+            few_kinds = spread_over_paths(replay, chosen, second.reference_links)
+            found = against_reference(
+                site, poses, replay, few_kinds, expected, ks=ks, max_depth=search.max_depth, complete=complete
             )
-        field += per_pair(
-            site, link, poses, replay, chosen, ks=ks, max_depth=max_depth, loss=loss, crowns=crowns, **cut
-        )
+        found += per_pair(site, link, poses, replay, chosen, replace(search, engine="image"), Field(field.loss), ks=ks)
         if site.scene is None:
-            field += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
-        field += against_sionna(
-            site, link, poses, replay, chosen, expected,
-            max_depth=max_depth, samples=min(rays, FIELD_SAMPLES), batch=batch, complete=complete,
-        )  # fmt: skip
+            found += impossible(site, poses, replay, extra_rows(replay, checked, chosen), expected)
+        rayed = replace(search, samples=min(rays, FIELD_SAMPLES))
+        found += against_sionna(site, link, poses, replay, chosen, expected, rayed, complete=complete)
     return Audit(
-        field=field,
+        field=found,
         engine=replay.engine,
         reference=other,
         links=len(chosen) * len(replay.towers),

@@ -21,8 +21,9 @@ from ..site.site import Building, Site, Tower
 from .arrays import Link, Poses, rotation_from_aircraft, tower_comparison_array, uav_comparison_array
 from .audit import RANK_K, Difference, compare
 from .field.sum import mean_pair_power, rss_dbm
+from .options import Run, Search
+from .replay import Replay, replay
 from .scene import Scene
-from .tracer import Replay, replay
 
 
 @dataclass(frozen=True, slots=True)
@@ -147,12 +148,12 @@ class _Runner:
         self.site, self.link, self.poses, self.depth = site, link, poses, depth
         self.ks, self.batch, self.progress = ks, batch, progress
         self.all = np.arange(len(poses))
-        self.reference = replay(site, link, poses, max_depth=depth)
+        self.reference = replay(site, link, poses, Search(max_depth=depth))
 
     def image(self, depth: int) -> Row:
         self.progress(f"image engine, depth {depth}")
         with _Memory() as memory:
-            result = replay(self.site, self.link, self.poses, max_depth=depth)
+            result = replay(self.site, self.link, self.poses, Search(max_depth=depth))
         difference = compare(result, self.reference, self.all, self.ks)
         return self._row(
             engine="image",
@@ -170,7 +171,7 @@ class _Runner:
         self.progress(f"image engine, every {step}. pose")
         chosen = self.all[::step]
         with _Memory() as memory:
-            result = replay(self.site, self.link, _take(self.poses, chosen), max_depth=self.depth)
+            result = replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=self.depth))
         nearest = np.minimum((self.all + step // 2) // step, len(chosen) - 1)
         level = np.stack([_between(self.all, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
         difference = self._difference(result.h[nearest], level, self.all)
@@ -205,10 +206,8 @@ class _Runner:
         )
 
     def _replay_sionna(self, samples: int, chosen: Any) -> Replay:
-        return replay(
-            self.site, self.link, _take(self.poses, chosen), "sionna",
-            max_depth=self.depth, samples=samples, batch=self.batch, cache_dir="",
-        )  # fmt: skip
+        search = Search("sionna", max_depth=self.depth, samples=samples, batch=self.batch)
+        return replay(self.site, self.link, _take(self.poses, chosen), search, run=Run(cache_dir=""))
 
     def own_arrays(self, samples: int, explicit: bool, most: int) -> Row:
         from .sionna import own_channels
@@ -377,8 +376,10 @@ def path_search(
     search()
     times = [search() for _ in range(repeats)]
     # compiles the kernels
-    replay(site, link, _take(some, np.arange(batch)), "sionna", samples=samples, batch=batch, cache_dir="")
-    theirs = replay(site, link, some, "sionna", samples=samples, batch=batch, cache_dir="")
+    replay(
+        site, link, _take(some, np.arange(batch)), Search("sionna", samples=samples, batch=batch), run=Run(cache_dir="")
+    )
+    theirs = replay(site, link, some, Search("sionna", samples=samples, batch=batch), run=Run(cache_dir=""))
     times += [search() for _ in range(repeats)]
     difference = compare(replay(site, link, some), theirs, np.arange(poses))
     seconds = float(np.median(times))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import hashlib
 import io
-from dataclasses import asdict, fields
+from dataclasses import fields
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -18,8 +18,9 @@ from .. import __version__
 from ..common.files import read_sealed, write_sealed
 from ..common.units import AnyArray, FloatArray
 from .interactions import OtherPaths, OtherSearch
+from .options import Search
 from .paths import PathSet
-from .scene import Scene, Settings
+from .scene import Scene
 
 LAYOUT = 4
 """Raised whenever the entries or the search change."""
@@ -53,7 +54,7 @@ class PathCache:
         scene: Scene,
         targets_m: FloatArray,
         carrier_hz: float,
-        settings: Settings,
+        search: Search,
         others: OtherSearch | None = None,
     ) -> str:
         """Digest of everything that decides the paths.
@@ -66,7 +67,7 @@ class PathCache:
             Poses [m].
         carrier_hz : float
             Counts for Sionna alone: an image path is the same at every frequency.
-        settings : Settings
+        search : Search
             Engine, depth, samples and the rest.
         others : OtherSearch, optional
             Of an entry that holds paths with these interactions.
@@ -78,12 +79,10 @@ class PathCache:
         """
         digest = hashlib.sha256()
         versions = [__version__, str(LAYOUT)]
-        if settings.engine == "sionna":
+        if search.engine == "sionna":
             versions += [metadata.version(name) for name in ("sionna-rt", "mitsuba", "drjit")]
             versions += [str(carrier_hz), *scene.faces.material]
-        text = "\n".join(
-            [*versions, *(f"{k}={v}" for k, v in sorted(asdict(settings).items()) if k not in ("threads", "device"))]
-        )
+        text = "\n".join([*versions, *(f"{k}={v}" for k, v in sorted(search.deciding.items()))])
         digest.update(text.encode())
         if others is not None:
             digest.update(f"\n{others}".encode())

@@ -29,9 +29,9 @@ from .field.sum import amplitudes, pattern_ends
 from .image import images_of, scene_tolerance_m, trace_back
 from .obstacles import first_obstacle, why_not_there
 from .paths import Faces, PathSet
+from .replay import Replay
 from .solids import Occlusion
 from .surfaces import Surfaces
-from .tracer import Replay
 
 EDGE_M = 1e-3
 """A point this near the edge of its face, or a segment this near a building, is beyond what float32 can decide."""

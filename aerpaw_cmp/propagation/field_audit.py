@@ -20,13 +20,14 @@ from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
 from ..compare.field_difference import FieldAudit
 from ..site.site import Site
 from .arrays import Array, Isotropic, Link, Poses
+from .drivers.pairs import replay_pairs
 from .field.sum import channel_matrices
 from .image import planes_of
+from .options import Field, Search
 from .paths import Faces, PathSet
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
+from .replay import Replay
 from .scene import Scene
-from .tracer import Replay
-from .tracer import replay as trace
 
 POWER_TOLERANCE_DB = 0.05
 """Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
@@ -356,10 +357,8 @@ def against_sionna(
     replay: Replay,
     chosen: IntArray,
     expected: Expected,
+    search: Search,
     *,
-    max_depth: int,
-    samples: int,
-    batch: int,
     complete: bool = True,
 ) -> FieldAudit:
     """Each path's power, phase and polarisation against what Sionna itself computes.
@@ -374,8 +373,8 @@ def against_sionna(
         Poses that are asked.
     expected : Expected
         Arrays and loss as the settings say, read a second time.
-    max_depth, samples, batch : int
-        Of Sionna's search.
+    search : Search
+        Depth, rays and batch of Sionna's search.
     complete : bool
         Ask for the explicit arrays at short range, too.
 
@@ -395,7 +394,7 @@ def against_sionna(
     )
     theirs = own_coefficients(
         scene.faces, scene.sources_m, few, probe, turns, usable=scene.usable, excluded=scene.excluded,
-        max_depth=max_depth, samples=samples, batch=batch, surfaces=scene.surfaces,
+        max_depth=search.max_depth, samples=int(search.samples), batch=search.batch, surfaces=scene.surfaces,
     )  # fmt: skip
     place = np.full(int(max(len(poses), 1)), -1, dtype=np.int64)
     place[chosen] = np.arange(len(chosen))
@@ -410,7 +409,15 @@ def against_sionna(
 
 
 def per_pair(
-    site: Site, link: Link, poses: Poses, replay: Replay, chosen: IntArray, *, ks: Sequence[float], **settings: Any
+    site: Site,
+    link: Link,
+    poses: Poses,
+    replay: Replay,
+    chosen: IntArray,
+    search: Search,
+    field: Field = Field(),  # noqa: B008 - frozen
+    *,
+    ks: Sequence[float],
 ) -> FieldAudit:
     """What one set of paths per array centre leaves out: the audited links with each element pair's own paths.
 
@@ -418,9 +425,9 @@ def per_pair(
     ----------
     site, link, poses, replay, chosen
         As in :func:`against_sionna`.
+    search, field
+        Of the replay, engine ``image``.
     ks : sequence of float
-    settings
-        ``max_depth``, ``loss``, ``crowns`` of the replay.
 
     Returns
     -------
@@ -433,7 +440,7 @@ def per_pair(
     if not any(np.any(array.positions_m) for array in arrays):
         return FieldAudit()  # the centre is the only pair
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
-    pairs = trace(site, link, few, "image", visibility="pairs", **settings)
+    pairs = replay_pairs(site, link, few, search, field)
     change = np.abs(pairs.rss_dbm - replay.rss_dbm[chosen])
     ranks = [channel_rank(pairs.h, k) != channel_rank(replay.h[chosen], k) for k in ks]
     size = np.abs(pairs.h).max(axis=(2, 3)) + np.abs(replay.h[chosen]).max(axis=(2, 3))
@@ -444,7 +451,7 @@ def per_pair(
         pairs_rss_max_db=float(np.nanmax(change, initial=0.0)),
         pairs_rank_differs=int(np.any(ranks, axis=0).sum()),
     )
-    return audit + _explicit(site, link, few, int(settings["max_depth"]))
+    return audit + _explicit(site, link, few, search.max_depth)
 
 
 EXPLICIT_POSES, EXPLICIT_RANGE_M = 10, 150.0
@@ -477,7 +484,7 @@ def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
         explicit=True, max_depth=max_depth, samples=EXPLICIT_SAMPLES, batch=EXPLICIT_POSES, usable=scene.usable,
         surfaces=scene.surfaces,
     )  # fmt: skip
-    ours = trace(site, link, some, "image", max_depth=max_depth, visibility="pairs").h  # without foliage
+    ours = replay_pairs(site, link, some, Search(max_depth=max_depth)).h  # without foliage
     size = np.abs(ours).max(axis=(2, 3))
     error = np.sort(np.abs(theirs - ours).max(axis=(2, 3))[size > 0] / size[size > 0])
     worst = float(error[: (len(error) + 1) // 2].max(initial=0.0))

@@ -19,8 +19,9 @@ from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArr
 from ..site.site import Site, Tower
 from .arrays import Link, Poses
 from .field.sum import Fields, channel_matrices
+from .options import Field, Loss, Run, Search, Whole
 from .paths import Faces, PathSet
-from .tracer import Loss, Replay, Whole, replay
+from .replay import Replay, replay
 
 PLACES_AT_ONCE = 64
 """Places of a node in one block: H of a block has this many times the links that count."""
@@ -90,9 +91,11 @@ def replay_moving(
     link: Link,
     poses: Poses,
     sources_m: FloatArray,
+    search: Search = Search(),  # noqa: B008 - frozen
+    field: Field = Field(),  # noqa: B008
+    run: Run = Run(),  # noqa: B008
     *,
-    progress: Callable[[float], None] | None = None,
-    **options: Any,
+    each: Callable[[Site, Link, Poses, Search, Field, Run], Replay] = replay,
 ) -> Replay:
     """Replay a flight against one tower that has a place of its own at every pose.
 
@@ -104,10 +107,10 @@ def replay_moving(
     poses : Poses
     sources_m : (poses, 3)
         Centre of the tower's array at each pose, east, north, up [m].
-    progress : callable, optional
-        Called with the share done.
-    **options
-        Of :func:`aerpaw_cmp.propagation.tracer.replay`, engine ``image``.
+    search, field, run
+        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+    each : callable
+        How a block is replayed: by array centres, or :func:`aerpaw_cmp.propagation.drivers.pairs.replay_pairs`.
 
     Returns
     -------
@@ -124,25 +127,28 @@ def replay_moving(
     Exact: each pose is traced from its own place. Paths and fields are those of a fixed tower there.
     """
     (name,) = _one_tower(link)
-    if options.get("engine", "image") != "image":
+    if search.engine != "image":
         raise UsageError(
-            f"tower {name!r} moves and the engine is {options['engine']!r}",
+            f"tower {name!r} moves and the engine is {search.engine!r}",
             expected="rt.engine: image (or --engine image)",
             cause="Sionna takes towers that stand still; each place of the node would be a scene of its own",
         )
+    progress, run = run.progress, replace(run, progress=None)
     parts: list[Replay] = []
     blocks = list(_blocks(sources_m))
+    if not blocks:
+        return each(site, link, poses, search, field, run)
     if len(blocks) > 1:
-        options["whole"] = _whole(link, poses, sources_m)
+        run = replace(run, whole=_whole(link, poses, sources_m))
     done = 0
     for block in blocks:
-        parts.append(_replay_block(site, link, name, poses, block, options))
-        options["check_power_cut"] = False  # one block tells what a cut costs
+        here, several, some, links = _scene_of(site, link, name, poses, block)
+        part = each(here, several, some, replace(search, links=links), field, run)
+        parts.append(_of_one_tower(part, name, block))
+        search = replace(search, check_power_cut=False)  # one block tells what a cut costs
         done += len(block.rows)
         if progress is not None:
             progress(done / max(len(poses), 1))
-    if not parts:
-        return replay(site, link, poses, **options)
     return _put_together(parts, [block.rows for block in blocks], name)
 
 
@@ -162,16 +168,21 @@ def _one_tower(link: Link) -> tuple[str, ...]:
     return tuple(link.tower_arrays)
 
 
-def _replay_block(site: Site, link: Link, name: str, poses: Poses, block: _Block, options: dict[str, Any]) -> Replay:
-    """Replay of the poses of a block, as of one tower."""
+def _scene_of(
+    site: Site, link: Link, name: str, poses: Poses, block: _Block
+) -> tuple[Site, Link, Poses, BoolArray | None]:
+    """Site, link and poses of a block, each place a tower; which links count."""
     names = [name] if len(block.places_m) == 1 else [f"{name}@{i}" for i in range(len(block.places_m))]
     towers = {n: _moved(site, site.towers[name], n, at) for n, at in zip(names, block.places_m, strict=True)}
     here = replace(site, towers={**{n: t for n, t in site.towers.items() if n != name}, **towers})
     several = replace(link, tower_arrays=dict.fromkeys(names, link.tower_arrays[name]))
     some = Poses(poses.position_m[block.rows], poses.rotation[block.rows])
-    only = np.arange(len(names))[:, None] == block.own[None, :]
-    replayed = replay(here, several, some, only=None if len(names) == 1 else only, **options)
-    row = np.arange(len(some))
+    return here, several, some, None if len(names) == 1 else np.arange(len(names))[:, None] == block.own[None, :]
+
+
+def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
+    """Replay of a block as of one tower, which had its own place at each pose."""
+    row = np.arange(len(block.rows))
 
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])

@@ -1,4 +1,4 @@
-"""Geometry of a replay, and what decides its paths besides."""
+"""Geometry of a replay."""
 
 from __future__ import annotations
 
@@ -23,19 +23,6 @@ from .surfaces import Surfaces
 
 
 @dataclass(frozen=True, slots=True)
-class Settings:
-    """What decides the paths besides the scene."""
-
-    engine: str
-    max_depth: int = 2
-    samples: int = 1_000_000
-    batch: int = 50
-    variant: str | None = None
-    threads: int | None = None
-    power_cut_db: float | None = None
-
-
-@dataclass(frozen=True, slots=True)
 class Scene:
     """Geometry of a replay.
 
@@ -47,10 +34,6 @@ class Scene:
         Faces that reflect for each tower.
     excluded : (towers, poses) bool
         Links without a path: an end inside a building or under the ground.
-    extent_m : (points, 3), optional
-        Points that set the tolerance of the path search in place of the poses.
-    pairs : int
-        Element pairs of all links of the replay that this scene is a part of; 0 where it is the whole.
     surfaces : Surfaces or None
         Of a site with a scene of triangles: what its faces are made of. They stand in for ground planes.
     """
@@ -60,8 +43,6 @@ class Scene:
     usable: BoolArray
     excluded: BoolArray
     surfaces: Surfaces | None = None
-    extent_m: FloatArray | None = None
-    pairs: int = 0
 
     @classmethod
     def of(cls, site: Site, link: Link, poses: Poses) -> Scene:
@@ -146,3 +127,51 @@ def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
     from .merging import merged  # compiled: loaded where there is a scene
 
     return merged(scene, merge_m)
+
+
+REACH_M = 100_000.0
+"""Poses further than this from every tower [m] are no poses of the site."""
+
+
+def within_reach(site: Site, poses: Poses) -> tuple[Poses, list[str]]:
+    """Poses with those that cannot be replayed as unknown (NaN): each alone, so that the others keep their paths.
+
+    Tolerances grow with the size of the scene: one pose at 1e12 m would change the paths of all. A pose without a
+    rotation has no field.
+    """
+    towers = np.array([tower.position_m for tower in site.towers.values()]).reshape(-1, 3)
+    if len(poses) and len(towers) and np.isfinite(poses.position_m).all() and np.isfinite(poses.rotation).all():
+        low, high = poses.position_m.min(axis=0), poses.position_m.max(axis=0)
+        if (np.maximum(np.abs(low - towers), np.abs(high - towers)) <= REACH_M).all(axis=1).any():
+            return poses, []  # the usual flight, decided by its box
+    known = np.isfinite(poses.position_m).all(axis=1)
+    turned = np.isfinite(poses.rotation).all(axis=(1, 2))
+    with np.errstate(over="ignore", invalid="ignore"):
+        far = np.ones(len(poses), dtype=np.bool_)
+        for place in towers:
+            far &= ~(np.abs(poses.position_m - place).max(axis=1) <= REACH_M)
+    far &= known
+    bad = far | ~turned
+    if not bad.any():
+        return poses, []
+    reasons = [
+        (far, f"poses further than {REACH_M / 1000:g} km from every tower"),
+        (known & ~far & ~turned, "poses without a rotation"),
+    ]
+    lines = [f"{int(mask.sum())} {what}: no path was searched for them" for mask, what in reasons if mask.any()]
+    position = np.where(bad[:, None], np.nan, poses.position_m)
+    rotation = np.where(bad[:, None, None], np.eye(3), poses.rotation)
+    return Poses(position, rotation), lines
+
+
+def buried_towers(site: Site, link: Link) -> list[str]:
+    """Towers whose antenna is inside a building, said so: a wrong footprint would look like a dead tower."""
+    lines = []
+    names = list(link.tower_arrays)
+    places = np.array([site.towers[name].position_m for name in names]).reshape(-1, 3)
+    for number in np.flatnonzero(inside_solids(site, places)):
+        name = names[number]
+        for building in site.buildings:
+            if inside_solids(replace(site, buildings=(building,)), places[number : number + 1]).any():
+                lines.append(f"{name}: its antenna is inside {building.name}, so it has no path at all")
+    return lines

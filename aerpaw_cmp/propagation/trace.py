@@ -12,8 +12,9 @@ from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
 from .crowns import Crowns
+from .options import Engine, Field, Loss, Search
+from .replay import Replay, replay
 from .samples import Samples
-from .tracer import Engine, Loss, Replay, replay
 
 
 def trace(
@@ -72,16 +73,8 @@ def trace(
     (1, 1)
     """
     place = site if isinstance(site, Site) else load_site(site)
-    return replay(
-        place,
-        link,
-        poses if isinstance(poses, Poses) else _level(poses),
-        engine,
-        max_depth=max_depth,
-        loss=loss,
-        crowns=crowns,
-        samples=samples,
-    )
+    search = Search(engine, max_depth=max_depth, samples=samples, crowns=crowns)
+    return replay(place, link, poses if isinstance(poses, Poses) else _level(poses), search, Field(loss))
 
 
 def _level(position_m: ArrayLike) -> Poses:

@@ -23,7 +23,8 @@ from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
 from aerpaw_cmp.propagation.crowns import Crowns
 from aerpaw_cmp.propagation.foliage import CrownIndex, Opaque, foliage_loss_db
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from tests.jobs.sent_by_pickle import SentByPickle
@@ -73,7 +74,7 @@ def test_every_mode_is_what_a_replay_with_its_loss_says(site):
 
         link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
         one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
-        expected, siso = (replay(site, wanted, poses, loss=loss) for wanted in (link, one))
+        expected, siso = (replay(site, wanted, poses, field=Field(loss=loss)) for wanted in (link, one))
         got = found[mode] = channels.of(mode)(position, ("A", "B"))
         np.testing.assert_allclose(got.rss_siso_dbm, siso.rss_dbm, atol=1e-9)
         for k in (10.0, 1000.0):
@@ -105,7 +106,9 @@ def test_opaque_crowns_reflect_as_a_replay_with_them_says(site):
         found[on] = {mode: channels.of(mode)(position, ("A", "B")) for mode in mapping.FOLIAGE}
         link = Link(CARRIER_HZ, dict.fromkeys(site.towers, line), line, 40.0, uav_transmits=False)
         one = Link(CARRIER_HZ, dict.fromkeys(site.towers, single_element()), single_element(), 40.0)
-        many, siso = (replay(site, w, poses, loss=loss, crowns=crowns if on else None) for w in (link, one))
+        many, siso = (
+            replay(site, w, poses, Search(crowns=crowns if on else None), Field(loss=loss)) for w in (link, one)
+        )
         np.testing.assert_allclose(found[on]["opaque"].rss_siso_dbm, siso.rss_dbm, atol=1e-9)
         rank = rank_of_singular_values(found[on]["opaque"].singular_values, [100.0])[..., 0]
         np.testing.assert_array_equal(rank, channel_rank(many.h, 100.0))
@@ -125,7 +128,7 @@ def test_paths_of_infinite_loss_are_no_paths(site):
     def loss(paths, source, target):
         return foliage_loss_db(source[paths.tower], paths.vertices_m, target[paths.pose], site.trees, Opaque())
 
-    result = replay(site, one, poses, loss=loss)
+    result = replay(site, one, poses, field=Field(loss=loss))
     assert result.has_path[:, 0].tolist() == [False, True]
     assert np.isnan(result.rss_dbm[0, 0])
     assert np.isnan(result.rss_power_dbm[0, 0])

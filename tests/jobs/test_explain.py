@@ -15,7 +15,7 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.flight import simulate
 from aerpaw_cmp.jobs import explain
 from aerpaw_cmp.jobs.explain import run_explain
-from aerpaw_cmp.propagation import tracer
+from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.field.sum import mean_pair_power
 
 ANTENNA = {"layout": "single", "antenna": {"model": "dipole"}}
@@ -156,7 +156,7 @@ def test_other_interactions_are_counted_beside_the_reflections(flown, monkeypatc
         found = true(site, rt.model_copy(update={"interactions": ["reflection"]}), link, pose, engine="image")
         power = 0.5 * mean_pair_power(found.h)
         kinds = {"diffraction": 2, "reflection + diffraction": 1}
-        added = tracer._with_others(found, link, ("reflection", "diffraction"), power, np.array([[3]]), kinds)
+        added = replay_module._with_others(found, link, ("reflection", "diffraction"), power, np.array([[3]]), kinds)
         return dataclasses.replace(added, engine="sionna")
 
     monkeypatch.setattr(explain, "replay_poses", replay_poses)

@@ -21,7 +21,8 @@ from aerpaw_cmp.jobs.live_twin import LiveTwin
 from aerpaw_cmp.live.simulator import ModemSimSettings, ModemSimulator
 from aerpaw_cmp.logs.writers import format_vehicle_out
 from aerpaw_cmp.propagation.arrays import Poses
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 
 ROOT = Path(__file__).parents[2]
 FLIGHT = ROOT / "sample_logs" / "flight.yaml"
@@ -40,7 +41,7 @@ def test_prediction_follows_a_growing_log(tmp_path: Path) -> None:
     for second in (20, 60, 61, 150, 300):
         log.write_bytes(b"".join(lines[: second + 1]) + lines[second + 1][:20])
         position = np.maximum(trajectory.position_at(np.array([float(second)])), [-np.inf, -np.inf, 0.5])
-        expected = replay(site, link, Poses(position, np.eye(3)[None]), max_depth=2)
+        expected = replay(site, link, Poses(position, np.eye(3)[None]), Search(max_depth=2))
         sigma = np.linalg.svd(expected.h[0, 0], compute_uv=False)
         if np.min(np.abs(sigma / sigma[0] * 100 - 1)) < 0.05:
             continue  # written positions are rounded to a centimetre: a singular value near the threshold may flip

@@ -17,7 +17,8 @@ from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_seri
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.jobs.ladder import flight_ladder
 from aerpaw_cmp.propagation.baselines import two_ray_dbm
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report import explorer
 from aerpaw_cmp.report.build import rank_panel, rss_panel
 from aerpaw_cmp.report.data import tower_way
@@ -138,7 +139,7 @@ def test_the_audit_takes_moments_at_which_the_rover_stands_where_it_was(case):
     for site, moment, _expected in moments:
         at = int(np.argmin(np.linalg.norm(one.poses.position_m - moment.poses.position_m, axis=1)))
         np.testing.assert_allclose(site.towers["ROVER"].position_m, one.tower_m[at], atol=1e-9)
-        again = replay(site, moment.link, moment.poses, max_depth=1)
+        again = replay(site, moment.link, moment.poses, Search(max_depth=1))
         assert again.rss_dbm[0, 0] == pytest.approx(moment.replay.rss_dbm[0, 0], abs=1e-9)
         assert len(again.paths) == len(moment.replay.paths)
 

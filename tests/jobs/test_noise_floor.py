@@ -12,7 +12,8 @@ from aerpaw_cmp.common.units import noise_floor_dbm
 from aerpaw_cmp.flight.settings import LinkSettings
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Poses, single_element
 from aerpaw_cmp.propagation.baselines import free_space_dbm
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = dataclasses.replace(load_site("lake_wheeler"), buildings=())
@@ -29,7 +30,7 @@ def flown(floor_dbm: float | None = None, power_dbm: float = 0.0, loss_db: float
     link = Link(3.3e9, {"LW1": element}, element, transmit_power_dbm=power_dbm, **more)
     loss = (lambda paths, *_: np.full(len(paths), loss_db)) if loss_db else None
     expected = free_space_dbm(place[None], position, 3.3e9, power_dbm)[:, 0] - loss_db
-    return replay(SITE, link, poses, max_depth=0, loss=loss), expected
+    return replay(SITE, link, poses, Search(max_depth=0), Field(loss=loss)), expected
 
 
 def test_links_below_the_floor_have_no_level_no_channel_and_no_rank():

@@ -14,7 +14,7 @@ from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs.site_scene import is_scene, run_scene_import, run_site_export
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.siteyaml import load_site
 
 ROOM = """<scene version="2.1.0">

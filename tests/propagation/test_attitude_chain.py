@@ -20,7 +20,8 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 
 
 class Witness:
@@ -89,7 +90,12 @@ def test_from_where_the_uav_antenna_sees_the_tower(scenes, attitude, mount, expe
     for rotation in (logged, rotation_from_aircraft(roll, pitch, yaw)[None]):  # of the report, and of simulate and tap
         witness = Witness()
         uav = Array(np.zeros((1, 3)), np.zeros(1), (witness,), mount_of(**mount))
-        replay(site, scenes.link(site, uav_array=uav), Poses(np.array([[-100.0, 0.0, 10.0]]), rotation), max_depth=0)
+        replay(
+            site,
+            scenes.link(site, uav_array=uav),
+            Poses(np.array([[-100.0, 0.0, 10.0]]), rotation),
+            Search(max_depth=0),
+        )
         [asked] = [directions for directions in witness.asked if len(directions)]
         np.testing.assert_allclose(asked[0], expected, atol=1e-6)
 
@@ -104,7 +110,7 @@ def test_from_where_the_tower_sees_the_uav(scenes):
         witness = Witness()
         tower = Array(np.zeros((1, 3)), np.zeros(1), (witness,), mount_of(**mount))
         poses = scenes.poses([[0.0, 100.0, 10.0]], rotation_from_aircraft(20.0, 10.0, 200.0)[None])
-        replay(site, scenes.link(site, tower), poses, max_depth=0)
+        replay(site, scenes.link(site, tower), poses, Search(max_depth=0))
         [asked] = [directions for directions in witness.asked if len(directions)]
         np.testing.assert_allclose(asked[0], expected, atol=1e-6)
 
@@ -113,7 +119,9 @@ def test_each_port_has_its_own_pattern(scenes):
     site = scenes.site()
     gains = (1.0, 2.0, 3.0, 0.5)
     each = Array(np.zeros((4, 3)), np.zeros(4), tuple(Fixed(g) for g in gains))
-    one = replay(site, scenes.link(site, uav_array=each), scenes.poses([[80.0, 0.0, 10.0]]), max_depth=0).h[0, 0]
+    one = replay(site, scenes.link(site, uav_array=each), scenes.poses([[80.0, 0.0, 10.0]]), Search(max_depth=0)).h[
+        0, 0
+    ]
     assert (one / one[0, 0]).real.ravel() == pytest.approx(gains)
 
 
@@ -126,9 +134,9 @@ def test_each_tower_has_its_own_array(scenes, tmp_path):
         "towers": {"LW2": {"antenna": {"model": "tr38901"}, "yaw_deg": 180, "slant_deg": 60}},
     })  # fmt: skip
     link: Link = settings.build(["LW1", "LW2"], tmp_path)
-    east = replay(site, link, scenes.poses([[100.0, 0.0, 10.0]]), max_depth=0).h[0, :, 0, 0]
+    east = replay(site, link, scenes.poses([[100.0, 0.0, 10.0]]), Search(max_depth=0)).h[0, :, 0, 0]
     ahead = Link(link.carrier_hz, {"LW1": single_element(), "LW2": single_element()}, single_element())
-    free = abs(replay(site, ahead, scenes.poses([[100.0, 0.0, 10.0]]), max_depth=0).h[0, 0, 0, 0])
+    free = abs(replay(site, ahead, scenes.poses([[100.0, 0.0, 10.0]]), Search(max_depth=0)).h[0, 0, 0, 0])
     assert 20 * np.log10(abs(east[0]) / free) == pytest.approx(8.0, abs=1e-6)
     assert 20 * np.log10(abs(east[1]) / free) == pytest.approx(8.0 - 30.0 + 20 * np.log10(0.5), abs=1e-6)
 

@@ -24,7 +24,8 @@ from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field import sum as field_module
 from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.materials import material
 
 _spec = importlib.util.spec_from_file_location("replay_reference", Path(__file__).with_name("reference.py"))
@@ -139,7 +140,7 @@ def test_matches_50_digits_with_two_reflections_up_to_3_km(scenes):
 def test_line_of_sight_is_friis_with_the_right_phase(scenes, place, length):
     site = scenes.site()
     poses = scenes.poses([place])
-    result = replay(site, scenes.link(site), poses, max_depth=0)
+    result = replay(site, scenes.link(site), poses, Search(max_depth=0))
     lam = wavelength_m(scenes.carrier_hz)
     expected = lam / (4 * np.pi * length) * np.exp(-2j * np.pi * length / lam)
     assert result.h[0, 0, 0, 0] == pytest.approx(expected, rel=1e-10)
@@ -216,7 +217,7 @@ def test_slant_follows_tr_38_901_model_2(scenes):
     def gain(tower_deg, uav_deg):
         tower = Array(np.zeros((1, 3)), np.radians([tower_deg]))
         uav = Array(np.zeros((1, 3)), np.radians([uav_deg]), mount=facing)
-        h = replay(site, scenes.link(site, tower, uav), poses, max_depth=0).h[0, 0, 0, 0]
+        h = replay(site, scenes.link(site, tower, uav), poses, Search(max_depth=0)).h[0, 0, 0, 0]
         return abs(h) / (wavelength_m(scenes.carrier_hz) / (4 * np.pi * 100.0))
 
     assert gain(0, 0) == pytest.approx(1.0)
@@ -302,15 +303,17 @@ def test_loss_is_applied_per_path(scenes):
         assert targets_m.shape == (2, 3)
         return np.where(paths.depth == 0, 0.0, 400.0)
 
-    lossy = replay(site, scenes.link(site), poses, loss=only_line_of_sight)
-    direct = replay(site, scenes.link(site), poses, max_depth=0)
+    lossy = replay(site, scenes.link(site), poses, field=Field(loss=only_line_of_sight))
+    direct = replay(site, scenes.link(site), poses, Search(max_depth=0))
     assert lossy.rss_dbm == pytest.approx(direct.rss_dbm, abs=1e-9)
 
 
 def test_infinite_loss_is_no_path(scenes):
     site = scenes.site()
     poses = scenes.poses([[80.0, 30.0, 40.0], [60.0, 0.0, 20.0]])
-    result = replay(site, scenes.link(site), poses, loss=lambda paths, *_: np.where(paths.pose == 0, np.inf, 0.0))
+    result = replay(
+        site, scenes.link(site), poses, field=Field(loss=lambda paths, *_: np.where(paths.pose == 0, np.inf, 0.0))
+    )
     assert result.has_path[:, 0].tolist() == [False, True]
     assert np.isnan(result.rss_dbm[:, 0]).tolist() == [True, False]
     assert (result.h[0] == 0).all()

@@ -21,13 +21,15 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import compiled, image, prisms, tracer
+from aerpaw_cmp.propagation import compiled, engines, image, prisms
+from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.field import sum as field_sum
+from aerpaw_cmp.propagation.options import Run
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.mitsuba import TriangleScene
@@ -270,10 +272,10 @@ def test_a_replay_on_three_threads_is_that_on_one_bit_by_bit(monkeypatch, case, 
     """Search, joining of its pieces, field and levels, below the noise floor too."""
     monkeypatch.setenv(compiled.SWITCH, mode)
     monkeypatch.setattr(field_sum, "PATHS_PER_PART", 7)
-    monkeypatch.setattr(tracer, "LEVELS_AT_ONCE", 7)
+    monkeypatch.setattr(replay_module, "LEVELS_AT_ONCE", 7)
     site, link, poses, _ = case
     link = dataclasses.replace(link, noise_floor_dbm=-58.0)
-    one, three = (replay(site, link, poses, threads=threads) for threads in (1, 3))
+    one, three = (replay(site, link, poses, run=Run(threads=threads)) for threads in (1, 3))
     assert 0 < np.isnan(one.rss_dbm).sum() < one.rss_dbm.size
     np.testing.assert_array_equal(one.has_path, np.isfinite(one.rss_dbm))
     assert not one.h[~one.has_path].any()
@@ -411,7 +413,7 @@ def test_every_compiled_module_runs_where_nothing_can_be_written():
 def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
     """Prisms fall back to the image engine, a broken numba told once; a scene of triangles is one message."""
     site, link, poses, paths = case
-    monkeypatch.setattr(tracer, "MANY_FACES", 5)
+    monkeypatch.setattr(engines, "MANY_FACES", 5)
 
     def broken():
         raise EOFError
@@ -419,7 +421,7 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
     growth = types.ModuleType("growth")
     growth.try_out = broken
     monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.growth", growth)
-    for module in (compiled, tracer):
+    for module in (compiled, engines):
         monkeypatch.setattr(module, "find_spec", lambda _: True)
     monkeypatch.setenv(compiled.SWITCH, "never" if way == "never" else "auto")
     with warnings.catch_warnings(record=True) as told:

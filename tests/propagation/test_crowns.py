@@ -15,7 +15,8 @@ from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.antennas import Isotropic
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.materials import VEGETATION
@@ -49,7 +50,8 @@ def opaque(crowns):
 def opaque_replay(scenes, site, position, array=None, **settings):
     crowns = Crowns(site.trees)
     poses = scenes.poses(position)
-    return replay(site, scenes.link(site, array, array), poses, crowns=crowns, loss=opaque(crowns), **settings)
+    search = Search(crowns=crowns, **settings)
+    return replay(site, scenes.link(site, array, array), poses, search, Field(loss=opaque(crowns)))
 
 
 def bounces(scenes, site, position, **settings):
@@ -407,7 +409,9 @@ def test_without_bounces_everything_stays_as_it_was(scenes):
     site = scenes.site((Building("barn", box(20, 20, 45, 40), 9.0),), trees=stand)
     position = np.column_stack([rng.uniform(-150, 150, (200, 2)), rng.uniform(2, 90, 200)])
     link, poses, crowns = scenes.link(site), scenes.poses(position), Crowns(stand)
-    blocking, reflecting = (replay(site, link, poses, loss=opaque(crowns), crowns=given_) for given_ in (None, crowns))
+    blocking, reflecting = (
+        replay(site, link, poses, Search(crowns=given_), Field(loss=opaque(crowns))) for given_ in (None, crowns)
+    )
     off = reflecting.paths.off_crown
     assert off.sum() > 5
     kept = reflecting.paths.select(~off)
@@ -422,7 +426,7 @@ def test_without_bounces_everything_stays_as_it_was(scenes):
             stand, east_m=stand.east_m + 1e5, height_m=stand.height_m * 0 + 1, crown_base_m=stand.height_m * 0 + 0.9
         )
     )
-    same = replay(site, link, poses, loss=opaque(crowns), crowns=far)
+    same = replay(site, link, poses, Search(crowns=far), Field(loss=opaque(crowns)))
     np.testing.assert_array_equal(same.h, blocking.h)
     assert same.faces is not None
     assert len(same.faces) == len(blocking.faces)
@@ -437,8 +441,8 @@ def test_the_audit_compares_paths_over_crowns(scenes):
     )
     found = opaque_replay(scenes, site, position)
     crowns, link, poses = Crowns(stand), scenes.link(site), scenes.poses(position)
-    settings = {"reference": "image", "loss": opaque(crowns), "links": 40}
-    same = audit(site, link, poses, found, crowns=crowns, **settings).difference
+    settings = {"field": Field(loss=opaque(crowns)), "reference": "image", "links": 40}
+    same = audit(site, link, poses, found, Search(crowns=crowns), **settings).difference
     # the reference has other facets than the whole replay, so that their numbers differ
     assert (same.missing_paths, same.extra_paths, same.rss_max_error_db) == (0, 0, 0.0)
     without = audit(site, link, poses, found, **settings).difference

@@ -8,7 +8,8 @@ import pytest
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.geometries import basis_fields, every_geometry, singular_values_of
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower
 
 CARRIER_HZ = 3.4e9
@@ -47,7 +48,7 @@ def test_equal_to_the_replay_with_those_arrays():
             slanted = dataclasses.replace(slanted, mount=rotation_from_yaw_pitch_roll(*turn))
         link = Link(CARRIER_HZ, {"T": tower_comparison_array(slant_deg=geometry.tower_slant_deg)}, slanted,
                     uav_transmits=False)  # fmt: skip
-        h = replay(site, link, at, max_depth=1).h[:, 0]
+        h = replay(site, link, at, Search(max_depth=1)).h[:, 0]
         np.testing.assert_allclose(sigma, np.linalg.svd(h, compute_uv=False), rtol=1e-8, atol=1e-15)
 
 

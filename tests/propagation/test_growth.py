@@ -12,12 +12,14 @@ pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation import image, power_cut, prisms
+from aerpaw_cmp.propagation.engines import estimate_search
 from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
 from aerpaw_cmp.propagation.merging import merged
 from aerpaw_cmp.propagation.obstacles import why_not_there
+from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.paths import path_lengths
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import estimate_search, replay
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene
@@ -210,7 +212,7 @@ def test_the_estimate_of_a_search_comes_without_the_search(scenes):
     site = scenes.site(buildings, ((0.0, 0.0, 30.0), (50.0, 0.0, 30.0)))
     poses = scenes.poses(rng.uniform([-200, -200, 20], [200, 200, 60], (20, 3)))
     told = []
-    replay(site, scenes.link(site), poses, on_estimate=told.append)
+    replay(site, scenes.link(site), poses, run=Run(on_estimate=told.append))
     before = estimate_search(site, scenes.link(site), poses)
     assert [one.first_faces for one in told] == [before.first_faces]
     assert before.first_faces > 500
@@ -248,10 +250,10 @@ def test_a_site_of_prisms_as_a_scene_has_the_paths_of_the_prism_engine(scenes, t
     )
     site = scenes.site(buildings, ((0.0, 0.0, 10.0),), area_m=(-200.0, 200.0, -200.0, 200.0))
     poses = scenes.poses(rng.uniform([-90, -90, 1], [90, 90, 40], (60, 3)))
-    prisms = replay(site, scenes.link(site), poses, max_depth=2)
+    prisms = replay(site, scenes.link(site), poses, Search(max_depth=2))
     export_scene(site, tmp_path, trees=False)
     open_site = replace(site, buildings=(), scene=placed_scene(tmp_path / "scene.xml"))
-    surfaces = replay(open_site, scenes.link(open_site), poses, max_depth=2)
+    surfaces = replay(open_site, scenes.link(open_site), poses, Search(max_depth=2))
     outside = ~Scene.of(site, scenes.link(site), poses).excluded[0]
     counts = [np.bincount(r.paths.pose, minlength=60)[outside] for r in (prisms, surfaces)]
     assert prisms.paths.depth.max() == 2
@@ -328,7 +330,7 @@ def test_every_path_of_pathsolver_is_found(scenes, sionna):
     spots = np.column_stack([rng.uniform(-40, 40, 25), rng.uniform(-8, 8, 25), rng.uniform(1, 30, 25)])
     poses, link = scenes.poses(spots), scenes.link(site)
     ours = replay(site, link, poses).paths
-    theirs = replay(site, link, poses, "sionna", samples=100_000, batch=25, cache_dir="").paths
+    theirs = replay(site, link, poses, Search("sionna", samples=100_000, batch=25), run=Run(cache_dir="")).paths
     keys = [{(p, *f) for p, f in zip(x.pose.tolist(), x.faces.tolist(), strict=True)} for x in (ours, theirs)]
     assert keys[1] <= keys[0]
     assert len(keys[1]) >= 0.97 * len(keys[0])

@@ -16,7 +16,7 @@ from aerpaw_cmp.propagation.arrays import (
 )
 from aerpaw_cmp.propagation.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.faces import site_faces
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.replay import replay
 
 SOURCES = np.array([[0.0, 0.0, 10.0]])
 TARGETS = np.array([[100.0, 0.0, 10.0], [0.0, 50.0, 10.0]])

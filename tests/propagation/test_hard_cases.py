@@ -19,7 +19,8 @@ from aerpaw_cmp.propagation.arrays import (
     single_element,
     tower_comparison_array,
 )
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.materials import material
 from aerpaw_cmp.site.site import Building
 
@@ -70,7 +71,10 @@ def test_line_of_sight_with_sigma_2_within_1e_6_of_the_limit(scenes, k):
 
     def ratio(distance):
         h = replay(
-            site, scenes.link(site, tower, uav, uav_transmits=False), scenes.poses([[distance, 0.0, 10.0]]), max_depth=0
+            site,
+            scenes.link(site, tower, uav, uav_transmits=False),
+            scenes.poses([[distance, 0.0, 10.0]]),
+            Search(max_depth=0),
         ).h
         s = np.linalg.svd(h[0, 0], compute_uv=False)
         return s[1] / s[0]
@@ -88,7 +92,9 @@ def test_line_of_sight_with_sigma_2_within_1e_6_of_the_limit(scenes, k):
         assert 1e-8 < abs(true_ratio * k - 1) < 1e-6
         assert true_ratio == pytest.approx(ratio(distance), abs=1e-9)
         assert sum(s > sigma[0] / k for s in sigma) == expected
-        h = replay(site, scenes.link(site, tower, uav, uav_transmits=False), scenes.poses([target]), max_depth=0).h
+        h = replay(
+            site, scenes.link(site, tower, uav, uav_transmits=False), scenes.poses([target]), Search(max_depth=0)
+        ).h
         assert channel_rank(h, k).item() == expected
 
 
@@ -98,7 +104,7 @@ def test_sionna_note_links_have_the_exact_ranks(scenes):
     distance = np.geomspace(20, 1500, 60)
     poses = scenes.poses(np.column_stack([distance, 0.1 * distance, np.full(60, 30.0)]))
     tower = tower_comparison_array(yaw_deg=0.0, slant_deg=VERTICAL)
-    h = replay(site, scenes.link(site, tower, uav_square(), uav_transmits=False), poses, max_depth=0).h[:, 0]
+    h = replay(site, scenes.link(site, tower, uav_square(), uav_transmits=False), poses, Search(max_depth=0)).h[:, 0]
     rank = channel_rank(h, 1000)
     assert rank.max() == 2
     assert 0 < (rank == 1).sum() < 60
@@ -149,7 +155,7 @@ def test_crossed_arrays_are_null_to_the_depth_of_the_pattern(scenes):
     rolled = rotation_from_yaw_pitch_roll(np.pi, 0.0, np.pi / 2)
     exactly_opposite = scenes.poses([[500.0, 0.0, 10.0]])
     single = replay(
-        site, scenes.link(site, single_element(), single_element(mount=rolled)), exactly_opposite, max_depth=0
+        site, scenes.link(site, single_element(), single_element(mount=rolled)), exactly_opposite, Search(max_depth=0)
     )
     free = LAMBDA / (4 * np.pi * 500.0)
     assert abs(single.h[0, 0, 0, 0]) < 1e-15 * free * 10
@@ -157,7 +163,7 @@ def test_crossed_arrays_are_null_to_the_depth_of_the_pattern(scenes):
     uav = uav_square(mount=rolled)
     # far below thermal noise: no receiver's floor here
     link = dataclasses.replace(scenes.link(site, tower, uav, uav_transmits=False), noise_floor_dbm=-np.inf)
-    crossed = replay(site, link, exactly_opposite, max_depth=0)
+    crossed = replay(site, link, exactly_opposite, Search(max_depth=0))
     sigma = exact_line_of_sight(tower, site.towers["LW1"].position_m, uav, exactly_opposite.position_m[0])
     ours = np.linalg.svd(crossed.h[0, 0], compute_uv=False)
     ratio = [float(s / sigma[0]) for s in sigma]
@@ -173,7 +179,7 @@ def test_rank_4_where_ports_are_crossed_in_pairs(scenes):
     tower = tower_comparison_array(yaw_deg=0.0)
     uav = uav_square((45.0, -45.0, -45.0, 45.0), rotation_from_yaw_pitch_roll(np.pi, 0.0, 0.0))
     h = replay(
-        site, scenes.link(site, tower, uav, uav_transmits=False), scenes.poses([[60.0, 5.0, 30.0]]), max_depth=0
+        site, scenes.link(site, tower, uav, uav_transmits=False), scenes.poses([[60.0, 5.0, 30.0]]), Search(max_depth=0)
     ).h
     assert channel_rank(h[0, 0], 10) == 2
     assert channel_rank(h[0, 0], 1000) == 4
@@ -239,7 +245,7 @@ def test_elements_of_two_arrays_at_the_same_point(scenes):
     site = scenes.site()
     one = Array(np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0]]), np.zeros(2))
     other = Array(np.array([[0.0, 0.0, 0.0], [-1.0, 0.0, 0.0]]), np.zeros(2))
-    result = replay(site, scenes.link(site, one, other), scenes.poses([[1.0, 0.0, 10.0]]), max_depth=0)
+    result = replay(site, scenes.link(site, one, other), scenes.poses([[1.0, 0.0, 10.0]]), Search(max_depth=0))
     assert np.isfinite(result.h).all()
     assert np.abs(result.h).max() <= 1.0
 
@@ -255,7 +261,7 @@ def test_fully_hidden_flight_has_no_path(scenes):
     ring = box(-30, -30, 30, 30).difference(box(-20, -20, 20, 20))
     site = scenes.site([Building("ring", ring, 40.0)])
     poses = scenes.poses([[60.0, 0.0, 10.0], [0.0, 90.0, 20.0]])
-    result = replay(site, scenes.link(site), poses, max_depth=3)
+    result = replay(site, scenes.link(site), poses, Search(max_depth=3))
     assert not result.has_path.any()
     assert np.isnan(result.rss_power_dbm).all()
 
@@ -282,7 +288,7 @@ def test_scaled_scene_and_wavelength_give_the_same_channel(scenes, scale):
 def test_path_3_km_long_to_a_millionth_of_a_wavelength(scenes):
     site = scenes.site()
     target = np.array([2999.0, 123.456, 97.3])
-    result = replay(site, scenes.link(site), scenes.poses([target]), max_depth=0)
+    result = replay(site, scenes.link(site), scenes.poses([target]), Search(max_depth=0))
     with mp.workdps(reference.DIGITS):
         offset = reference.minus(reference.vec(target), reference.vec([0.0, 0.0, 10.0]))
         length = mp.sqrt(reference.dot(offset, offset))

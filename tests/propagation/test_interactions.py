@@ -21,13 +21,15 @@ from aerpaw_cmp.propagation.arrays import (
 from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.interactions import OtherPaths, other_searches, path_powers, summary
+from aerpaw_cmp.propagation.options import Run, Search
+from aerpaw_cmp.propagation.replay import NOT_IN_RANKS, replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import NOT_IN_RANKS, replay
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.materials import material
 from aerpaw_cmp.site.site import Building
 
-SEARCH = {"samples": 20_000, "batch": 10, "cache_dir": ""}
+RAYS = {"samples": 20_000, "batch": 10}
+QUIET = Run(cache_dir="")
 ROOF_M, EDGE_M = 12.0, 50.0
 
 
@@ -67,7 +69,7 @@ def test_patterns_slants_and_attitude_around_a_coefficient_are_those_of_h(scenes
     tower = replace(tower_comparison_array(), patterns=(TR38901(),))
     link = scenes.link(site, tower, uav_comparison_array(wavelength_m(scenes.carrier_hz)))
     paths = line_of_sight(scenes, site, poses, link)
-    direct = replay(site, link, poses, max_depth=0)
+    direct = replay(site, link, poses, Search(max_depth=0))
     scene = Scene.of(site, link, poses)
     exact = channel_matrices(direct.paths, scene.faces, scene.sources_m, poses, link).path_power
     # plane waves against spherical ones over 1.8 m
@@ -97,9 +99,11 @@ def test_only_sionna_knows_other_interactions(scenes):
     site = scenes.site()
     poses = scenes.poses([[9.0, 0, 20]])
     with pytest.raises(UsageError, match="diffraction with engine 'image'"):
-        replay(site, scenes.link(site), poses, interactions=("reflection", "diffraction"))
+        replay(site, scenes.link(site), poses, Search(interactions=("reflection", "diffraction")))
     with pytest.raises(UsageError, match="max_depth 0"):
-        replay(site, scenes.link(site), poses, "sionna", max_depth=0, interactions=("reflection", "diffraction"))
+        replay(
+            site, scenes.link(site), poses, Search("sionna", max_depth=0, interactions=("reflection", "diffraction"))
+        )
     with pytest.raises(UsageError, match="unknown interaction 'bounce'"):
         other_searches(("bounce",), None)
     with pytest.raises(UsageError, match="scattering_coefficient"):
@@ -179,7 +183,7 @@ def test_diffraction_behind_a_roof_is_that_of_a_wedge(sionna, scenes, name):
         link = scenes.link(site)
         arrays = {tower: replace(a, slant_rad=np.array([slant])) for tower, a in link.tower_arrays.items()}
         link = replace(link, tower_arrays=arrays, uav_array=replace(link.uav_array, slant_rad=np.array([slant])))
-        found = replay(site, link, poses, "sionna", max_depth=1, interactions=asked, **SEARCH)
+        found = replay(site, link, poses, Search("sionna", max_depth=1, interactions=asked, **RAYS), run=QUIET)
         assert found.has_path.all()
         assert not found.other.has_path.any()
         assert found.other.kinds == {"diffraction": 5}
@@ -204,7 +208,7 @@ def test_sionnas_coefficients_of_reflections_have_the_power_of_h(sionna, scenes,
     link = scenes.link(site, one, replace(single_element(), slant_rad=np.array([-0.9])))
     plain = replay(site, link, poses)
     assert (np.bincount(plain.paths.pose) > 2).sum() > 7
-    found = replay(site, link, poses, "sionna", interactions=("reflection", "refraction"), **SEARCH)
+    found = replay(site, link, poses, Search("sionna", interactions=("reflection", "refraction"), **RAYS), run=QUIET)
     assert found.other.paths.sum() == len(plain.paths)
     level = 10 * np.log10(found.other.power) + link.transmit_power_dbm
     assert level == pytest.approx(plain.rss_power_dbm, abs=0.02)
@@ -223,9 +227,9 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
     site = hall(scenes, "plywood", towers=((0.0, 0.0, 6.0),))
     poses = scenes.poses([[90.0, 0.0, 6.0], [70.0, 0.0, 6.0], [80.0, 0.0, 30.0]])
     link, asked = scenes.link(site), ("reflection", "refraction")
-    search = SEARCH | {"cache_dir": str(tmp_path)}
-    plain = replay(site, link, poses, "sionna", **search)
-    found = replay(site, link, poses, "sionna", interactions=asked, **search)
+    kept = Run(cache_dir=str(tmp_path))
+    plain = replay(site, link, poses, Search("sionna", **RAYS), run=kept)
+    found = replay(site, link, poses, Search("sionna", interactions=asked, **RAYS), run=kept)
     assert plain.has_path[:, 0].tolist() == [False, False, True]
     assert found.has_path.all()
     through = slab_transmission("plywood", scenes.carrier_hz) ** 4
@@ -241,7 +245,7 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
     assert np.array_equal(back.rss_dbm, plain.rss_dbm, equal_nan=True)
     assert np.array_equal(back.has_path, plain.has_path)
     # the audit is of the reflections
-    report = audit(site, link, poses, found, reference="image", links=None, cache_dir="")
+    report = audit(site, link, poses, found, run=Run(cache_dir=""), reference="image", links=None)
     assert (report.missing_paths, report.extra_paths, report.difference.coverage_differs) == (0, 0, 0)
     assert report.rss_max_error_db < 0.01
     counted = summary([(np.abs(found.h[..., 0, 0]) ** 2, found.other)])
@@ -252,10 +256,10 @@ def test_refraction_through_two_walls_loses_what_two_slabs_lose(sionna, scenes, 
         raise AssertionError("traced again")
 
     monkeypatch.setattr(sionna, "find_others", fail)
-    again = replay(site, link, poses, "sionna", interactions=asked, **search)
+    again = replay(site, link, poses, Search("sionna", interactions=asked, **RAYS), run=kept)
     assert (again.other.power == found.other.power).all()
     with pytest.raises(AssertionError, match="traced again"):
-        replay(site, link, poses, "sionna", interactions=("reflection", "diffraction"), **search)
+        replay(site, link, poses, Search("sionna", interactions=("reflection", "diffraction"), **RAYS), run=kept)
 
 
 @pytest.mark.sionna
@@ -264,11 +268,15 @@ def test_scattered_power_grows_with_the_square_of_the_coefficient(sionna, scenes
     site = scenes.site()
     poses = scenes.poses([[60.0, 0.0, 30.0], [0.0, 80.0, 40.0]])
     link, asked = scenes.link(site), ("reflection", "scattering")
-    plain = replay(site, link, poses, "sionna", max_depth=1, **SEARCH)
+    plain = replay(site, link, poses, Search("sionna", max_depth=1, **RAYS), run=QUIET)
     power = {}
     for coefficient in (0.2, 0.4):
         found = replay(
-            site, link, poses, "sionna", max_depth=1, interactions=asked, scattering_coefficient=coefficient, **SEARCH
+            site,
+            link,
+            poses,
+            Search("sionna", max_depth=1, interactions=asked, scattering_coefficient=coefficient, **RAYS),
+            run=QUIET,
         )
         power[coefficient] = found.other.power[:, 0]
         assert set(found.other.kinds) == {"scattering"}

@@ -8,9 +8,11 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import power_cut, tracer
+from aerpaw_cmp.propagation import engines, power_cut, samples
+from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
 CUT_DB = 6.0
@@ -32,10 +34,10 @@ def case(scenes):
 def test_every_path_left_out_is_as_weak_as_the_cut_says(monkeypatch, case, beams):
     if beams:
         pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
-        monkeypatch.setattr(tracer, "MANY_FACES", 10)
+        monkeypatch.setattr(engines, "MANY_FACES", 10)
     site, link, poses = case
     whole = replay(site, link, poses)
-    cut = replay(site, link, poses, power_cut_db=CUT_DB)
+    cut = replay(site, link, poses, Search(power_cut_db=CUT_DB))
     kept = {(p, t, *f) for p, t, f in zip(cut.paths.pose, cut.paths.tower, cut.paths.faces.tolist(), strict=True)}
     key = [(p, t, *f) for p, t, f in zip(whole.paths.pose, whole.paths.tower, whole.paths.faces.tolist(), strict=True)]
     gone = np.array([k not in kept for k in key])
@@ -53,10 +55,10 @@ def test_every_path_left_out_is_as_weak_as_the_cut_says(monkeypatch, case, beams
 
 def test_what_it_costs_is_checked_by_a_full_search(case):
     site, link, poses = case
-    whole, cut = replay(site, link, poses), replay(site, link, poses, power_cut_db=CUT_DB)
+    whole, cut = replay(site, link, poses), replay(site, link, poses, Search(power_cut_db=CUT_DB))
     (words,) = [text for text in cut.left_out if text.startswith("rt.power_cut_db 6")]
     found = re.search(r"search of (\d+) poses: (\d+) of (\d+) paths, RSS changed by ([0-9.]+) dB", words)
-    some = tracer.spread(np.arange(len(poses)), power_cut.CHECKED_POSES)
+    some = samples.spread(np.arange(len(poses)), power_cut.CHECKED_POSES)
     count = [int(np.isin(r.paths.pose, some).sum()) for r in (whole, cut)]
     assert [int(found[1]), int(found[2]), int(found[3])] == [len(some), count[0] - count[1], count[0]]
     change = np.nanmax(np.abs(whole.rss_dbm[some] - cut.rss_dbm[some]))
@@ -70,19 +72,19 @@ def test_what_it_costs_is_checked_by_a_full_search(case):
 
 def test_a_cut_beyond_every_path_changes_nothing(case):
     site, link, poses = case
-    whole, cut = replay(site, link, poses), replay(site, link, poses, power_cut_db=80.0)
+    whole, cut = replay(site, link, poses), replay(site, link, poses, Search(power_cut_db=80.0))
     np.testing.assert_array_equal(whole.h, cut.h)
     assert ": 0 of " in cut.left_out[-1]
 
 
 def test_pairs_are_cut_alike(case):
     site, link, poses = case
-    whole = replay(site, link, poses, power_cut_db=CUT_DB)
-    pairs = replay(site, link, poses, power_cut_db=CUT_DB, visibility="pairs")
+    whole = replay(site, link, poses, Search(power_cut_db=CUT_DB))
+    pairs = replay_pairs(site, link, poses, Search(power_cut_db=CUT_DB))
     np.testing.assert_allclose(pairs.h, whole.h, atol=1e-12)  # one element at each end: its centre
 
 
 @pytest.mark.parametrize("value", [0.0, -3.0, np.nan])
 def test_a_cut_that_is_none_is_refused(case, value):
     with pytest.raises(UsageError, match="power_cut_db"):
-        replay(*case, power_cut_db=value)
+        replay(*case, search=Search(power_cut_db=value))

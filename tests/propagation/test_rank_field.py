@@ -11,7 +11,8 @@ from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
 from aerpaw_cmp.propagation.arrays import tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower
 
 pytestmark = pytest.mark.field
@@ -41,7 +42,7 @@ def shares(logs, scenes, flight, k, tower_slant=ALTERNATE, uav_slant=None):
     uav = uav_comparison_array(wavelength_m(3.4e9), **({} if uav_slant is None else {"slant_deg": uav_slant}))
     link = scenes.link(site, tower_comparison_array(slant_deg=tower_slant), uav, uav_transmits=False)
     poses = scenes.poses(np.column_stack([east, north, log.alt_m]))
-    rank = channel_rank(replay(site, link, poses, max_depth=1).h[:, 0], k)
+    rank = channel_rank(replay(site, link, poses, Search(max_depth=1)).h[:, 0], k)
     return measured, np.bincount(rank, minlength=5)[1:5] / len(log)
 
 

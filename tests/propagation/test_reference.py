@@ -17,7 +17,8 @@ from aerpaw_cmp.propagation.arrays import (
 from aerpaw_cmp.propagation.crowns import Crowns
 from aerpaw_cmp.propagation.field import dyads, sum
 from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Field, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.materials import MATERIALS, VEGETATION, material
 from aerpaw_cmp.site.site import Trees
@@ -74,7 +75,7 @@ def test_foliage_equals_the_second_implementation(scenes, case, name, in_leaf):
     site = replace(site, trees=stand())
     model = foliage_model(name, scenes.carrier_hz, in_leaf=in_leaf)
     crowns = Crowns(site.trees) if name == "opaque" else None
-    result = replay(site, link, poses, loss=loss_of(site.trees, model), crowns=crowns)
+    result = replay(site, link, poses, Search(crowns=crowns), Field(loss=loss_of(site.trees, model)))
     found = audited(site, link, poses, result, reference.ExpectedLoss(name, in_leaf=in_leaf))
     assert found.failures == ()
     bare = replay(site, link, poses)

@@ -7,8 +7,9 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, uav_comparison_array
 from aerpaw_cmp.propagation.field.sum import channel_matrices, mean_pair_power
+from aerpaw_cmp.propagation.options import Field
 from aerpaw_cmp.propagation.relevance import idle_objects
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
 NEAR = Building("near", box(25, -10, 30, 10), 12.0)
@@ -31,7 +32,7 @@ def test_no_link_moves_by_more_than_stated_without_the_reflections_of_those_name
     site = scenes.site([NEAR, FAR, *scenes.buildings(np.random.default_rng(52), 5, spread_m=120.0)])
     poses = flight(scenes)
     link = scenes.link(site, uav_array=uav_comparison_array(0.0882))
-    whole = replay(site, link, poses, relevance_db=relevance_db)
+    whole = replay(site, link, poses, field=Field(relevance_db=relevance_db))
     assert np.array_equal(whole.rss_dbm, replay(site, link, poses).rss_dbm)
     sources = np.array([t.position_m for t in site.towers.values()])
     fields = channel_matrices(whole.paths, whole.faces, sources, poses, link)
@@ -48,11 +49,11 @@ def test_no_link_moves_by_more_than_stated_without_the_reflections_of_those_name
 
 def test_a_far_barn_is_named_and_the_near_one_is_not(scenes):
     site = scenes.site([NEAR, FAR])
-    reduced = replay(site, scenes.link(site), flight(scenes), relevance_db=1.0)
+    reduced = replay(site, scenes.link(site), flight(scenes), field=Field(relevance_db=1.0))
     (line,) = [text for text in reduced.left_out if "no RSS would move" in text]
     assert line.startswith("far: ")
     site = scenes.site([NEAR])
-    (line,) = replay(site, scenes.link(site), flight(scenes), relevance_db=0.001).left_out
+    (line,) = replay(site, scenes.link(site), flight(scenes), field=Field(relevance_db=0.001)).left_out
     assert line == "every building moves the RSS of some link by more than 0.001 dB"
 
 
@@ -60,4 +61,4 @@ def test_usage(scenes):
     site = scenes.site()
     link, poses = scenes.link(site), scenes.poses([[30.0, 0.0, 20.0]])
     with pytest.raises(UsageError, match="positive"):
-        replay(site, link, poses, relevance_db=0.0)
+        replay(site, link, poses, field=Field(relevance_db=0.0))

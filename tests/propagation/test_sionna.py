@@ -14,8 +14,9 @@ from aerpaw_cmp.propagation.audit import audit
 from aerpaw_cmp.propagation.crowns import Crowns
 from aerpaw_cmp.propagation.field import dyads
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
+from aerpaw_cmp.propagation.options import Run, Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
-from aerpaw_cmp.propagation.tracer import replay
 from aerpaw_cmp.site.site import Building, Trees
 
 pytestmark = pytest.mark.sionna
@@ -49,20 +50,22 @@ def test_both_engines_find_the_same_paths_and_fields(sionna, scenes, case):
     link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
     exact = replay(site, link, poses)
     seen = []
-    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="", progress=seen.append)
+    traced = replay(
+        site, link, poses, Search("sionna", samples=SAMPLES, batch=BATCH), run=Run(cache_dir="", progress=seen.append)
+    )
     assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
     assert np.nanmax(np.abs(traced.rss_dbm - exact.rss_dbm)) < 0.01
     assert traced.paths.vertices_m == pytest.approx(exact.paths.vertices_m, abs=1e-9, nan_ok=True)
     assert exact.paths.depth.max() == 2
     assert seen[-1] == 1.0
-    report = audit(site, link, poses, exact, links=75, samples=SAMPLES, batch=BATCH, cache_dir="")
+    report = audit(site, link, poses, exact, Search(samples=SAMPLES, batch=BATCH), run=Run(cache_dir=""), links=75)
     assert (report.reference, report.missing_paths, report.extra_paths) == ("sionna", 0, 0)
 
 
 def test_too_few_samples_lose_paths_and_the_audit_says_so(sionna, scenes, lone):
     site, poses = lone
     link = scenes.link(site)
-    few = replay(site, link, poses, "sionna", samples=100, batch=BATCH, cache_dir="")
+    few = replay(site, link, poses, Search("sionna", samples=100, batch=BATCH), run=Run(cache_dir=""))
     report = audit(site, link, poses, few, links=None)
     assert report.reference == "image"
     assert report.missing_paths > 0
@@ -80,8 +83,9 @@ def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, mo
     monkeypatch.setattr(sionna, "own_coefficients", lambda *a, **k: known.setdefault(0, known.get(0) or ask(*a, **k)))
 
     def audited():
-        rows, settings = np.arange(BATCH), {"max_depth": 2, "samples": SAMPLES, "batch": BATCH}
-        return field_audit.against_sionna(site, link, few, replay(site, link, few), rows, expected, **settings)
+        search = Search("sionna", samples=SAMPLES, batch=BATCH)
+        rows = np.arange(BATCH)
+        return field_audit.against_sionna(site, link, few, replay(site, link, few), rows, expected, search)
 
     clean = audited()
     assert clean.failures == ()
@@ -104,7 +108,7 @@ def test_audit_of_the_field_by_sionnas_own_coefficients(sionna, scenes, lone, mo
 
 def test_rays_chosen_by_pilots_find_every_path(sionna, scenes, lone):
     site, poses = lone
-    traced = replay(site, scenes.link(site), poses, "sionna", batch=BATCH, cache_dir="")
+    traced = replay(site, scenes.link(site), poses, Search("sionna", batch=BATCH), run=Run(cache_dir=""))
     assert scenes.keys(traced.paths) == scenes.keys(replay(site, scenes.link(site), poses).paths)
     assert traced.samples in (40_000, 160_000, 640_000)
     assert "rays a tower found the same" in traced.samples_reason
@@ -117,8 +121,10 @@ def test_paths_over_crowns_join_those_that_sionna_finds(sionna, scenes, lone):
     like = np.ones(60)
     stand = Trees(*near, 0 * like, 18 * like, 9 * like, 5 * like, 0.4 * like)
     link, crowns = scenes.link(site), Crowns(stand)
-    exact = replay(site, link, poses, crowns=crowns)
-    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="", crowns=crowns)
+    exact = replay(site, link, poses, Search(crowns=crowns))
+    traced = replay(
+        site, link, poses, Search("sionna", samples=SAMPLES, batch=BATCH, crowns=crowns), run=Run(cache_dir="")
+    )
     assert scenes.keys(traced.paths) == scenes.keys(exact.paths)
     assert exact.paths.off_crown.sum() == traced.paths.off_crown.sum() > 3
 
@@ -127,16 +133,16 @@ def test_second_replay_traces_nothing(sionna, scenes, lone, tmp_path, monkeypatc
     site, poses = lone
     link = scenes.link(site)
     monkeypatch.setenv("AERPAW_CMP_CACHE", str(tmp_path))  # the sionna engine caches unless told not to
-    first = replay(site, link, poses, "sionna", samples=1000, batch=BATCH)
+    first = replay(site, link, poses, Search("sionna", samples=1000, batch=BATCH))
 
     def fail(*args, **settings):
         raise AssertionError("traced again")
 
     monkeypatch.setattr(sionna, "find_paths", fail)
-    second = replay(site, link, poses, "sionna", samples=1000, batch=BATCH)
+    second = replay(site, link, poses, Search("sionna", samples=1000, batch=BATCH))
     assert (second.h == first.h).all()
     with pytest.raises(AssertionError, match="traced again"):
-        replay(site, link, poses, "sionna", samples=1001, batch=BATCH)
+        replay(site, link, poses, Search("sionna", samples=1001, batch=BATCH))
 
 
 def test_h_equals_sionnas_explicit_arrays_at_short_range(sionna, scenes, lone):
@@ -191,7 +197,7 @@ def test_plane_waves_make_every_line_of_sight_rank_1(sionna, scenes):
         uav_transmits=False,
     )
     scene = Scene.of(site, link, poses)
-    exact = channel_rank(replay(site, link, poses, max_depth=0).h[:, 0], 1000)
+    exact = channel_rank(replay(site, link, poses, Search(max_depth=0)).h[:, 0], 1000)
     ranks = {}
     for explicit in (False, True):
         h = sionna.own_channels(
@@ -210,7 +216,7 @@ def test_positions_without_a_path(sionna, scenes):
         [[40.0, 0, 4], [40.0, 0, -1], [np.nan, 0, 5], [0.0, 0, 10], [52.0, 0, 1.0], [0.0, 0, 30.0], [20.0, 0.0, 0.0]]
     )
     link = scenes.link(site)
-    traced = replay(site, link, poses, "sionna", samples=SAMPLES, batch=BATCH, cache_dir="")
+    traced = replay(site, link, poses, Search("sionna", samples=SAMPLES, batch=BATCH), run=Run(cache_dir=""))
     exact = replay(site, link, poses)
     assert traced.has_path[:, 0].tolist() == exact.has_path[:, 0].tolist()
     assert traced.has_path[:, 0].tolist() == [False, False, False, False, False, True, True]
@@ -219,7 +225,9 @@ def test_positions_without_a_path(sionna, scenes):
 def test_batch_beyond_the_hash_table_is_refused(sionna, scenes):
     site = scenes.site()
     with pytest.raises(UsageError, match="batch 500"):
-        replay(site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), "sionna", batch=500, cache_dir="")
+        replay(
+            site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), Search("sionna", batch=500), run=Run(cache_dir="")
+        )
 
 
 def test_versions_name_the_device(sionna):
@@ -274,10 +282,8 @@ def test_scenes_are_freed(sionna, scenes, lone):
             replace(site, buildings=(barn,)),
             scenes.link(site),
             poses,
-            "sionna",
-            samples=1000,
-            batch=BATCH,
-            cache_dir="",
+            Search("sionna", samples=1000, batch=BATCH),
+            run=Run(cache_dir=""),
         )
     gc.collect()
     assert not [item for item in gc.get_objects() if isinstance(item, Scene)]

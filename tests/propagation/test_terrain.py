@@ -10,7 +10,8 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower
 
@@ -29,7 +30,7 @@ def site() -> Site:
 
 def levels(site: Site, east: float, up: float) -> tuple[bool, int]:
     link = Link(3.3e9, {"T": single_element()}, single_element())
-    result = replay(site, link, Poses(np.array([[east, 0.0, up]]), np.eye(3)[None]), max_depth=2)
+    result = replay(site, link, Poses(np.array([[east, 0.0, up]]), np.eye(3)[None]), Search(max_depth=2))
     return bool(result.has_path[0, 0]), len(result.paths)
 
 
@@ -48,5 +49,5 @@ def test_a_wall_can_still_be_seen_when_the_direct_line_is_blocked(site: Site) ->
     link = Link(3.3e9, {"T": single_element()}, single_element())
     here = Poses(np.array([[200.0, 0.0, 40.0]]), np.eye(3)[None])
     there = Poses(np.array([[900.0, 0.0, 80.0]]), np.eye(3)[None])
-    assert (replay(open_site, link, here, max_depth=1).paths.depth == 1).sum() == 2, "ground and wall"
-    assert len(replay(open_site, link, there, max_depth=1).paths) == 0
+    assert (replay(open_site, link, here, Search(max_depth=1)).paths.depth == 1).sum() == 2, "ground and wall"
+    assert len(replay(open_site, link, there, Search(max_depth=1)).paths) == 0

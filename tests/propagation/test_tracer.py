@@ -7,7 +7,8 @@ import pytest
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import Link, single_element
 from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Run, Search
+from aerpaw_cmp.propagation.replay import replay
 
 
 @pytest.fixture
@@ -19,9 +20,9 @@ def case(scenes):
 
 
 def test_the_function_is_where_the_contract_says(case):
-    from aerpaw_cmp.propagation.tracer import Replay
+    from aerpaw_cmp.propagation.replay import Replay
 
-    result = replay(*case, engine="image")
+    result = replay(*case, search=Search("image"))
     assert isinstance(result, Replay)
     assert result.h.dtype == np.complex128
     assert result.h.shape == (40, 2, 1, 1)
@@ -39,7 +40,7 @@ def test_unknown_tower_and_engine(case, scenes):
     with pytest.raises(UsageError, match="no tower 'LW9'"):
         replay(site, Link(3.4e9, {"LW9": single_element()}, single_element()), poses)
     with pytest.raises(UsageError, match="unknown engine 'magic'"):
-        replay(site, link, poses, engine="magic")
+        replay(site, link, poses, Search("magic"))
 
 
 def test_each_tower_reflects_on_its_own_ground(case):
@@ -50,14 +51,14 @@ def test_each_tower_reflects_on_its_own_ground(case):
 
 
 def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
-    first = replay(*case, cache_dir=tmp_path)
+    first = replay(*case, run=Run(cache_dir=tmp_path))
     assert len(list(tmp_path.glob("*.npz"))) == 1
 
     def fail(*args, **settings):
         raise AssertionError("searched again")
 
     monkeypatch.setattr("aerpaw_cmp.propagation.image.find_paths", fail)
-    second = replay(*case, cache_dir=tmp_path)
+    second = replay(*case, run=Run(cache_dir=tmp_path))
     assert second.from_cache
     assert not first.from_cache
     assert second.search_seconds == first.search_seconds > 0
@@ -65,28 +66,28 @@ def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
     assert (second.paths.faces == first.paths.faces).all()
     # other arrays and attitudes use the same paths
     site, link, poses = case
-    replay(site, Link(3.5e9, link.tower_arrays, link.uav_array, 10.0), poses, cache_dir=tmp_path)
+    replay(site, Link(3.5e9, link.tower_arrays, link.uav_array, 10.0), poses, run=Run(cache_dir=tmp_path))
     with pytest.raises(AssertionError, match="searched again"):
-        replay(*case, cache_dir=tmp_path, max_depth=1)
+        replay(*case, search=Search(max_depth=1), run=Run(cache_dir=tmp_path))
 
 
 def test_anything_that_decides_paths_changes_the_key(case, tmp_path, scenes):
     site, link, poses = case
-    replay(site, link, poses, cache_dir=tmp_path)
+    replay(site, link, poses, run=Run(cache_dir=tmp_path))
     moved = scenes.poses(poses.position_m + np.array([0.0, 0.0, 1e-9]))
-    replay(site, link, moved, cache_dir=tmp_path)
+    replay(site, link, moved, run=Run(cache_dir=tmp_path))
     from dataclasses import replace
 
     taller = replace(site, buildings=(replace(site.buildings[0], height_m=99.0), *site.buildings[1:]))
-    replay(taller, link, poses, cache_dir=tmp_path)
+    replay(taller, link, poses, run=Run(cache_dir=tmp_path))
     assert len(list(tmp_path.glob("*.npz"))) >= 3
 
 
 def test_damaged_entry_is_searched_again(case, tmp_path):
-    first = replay(*case, cache_dir=tmp_path)
+    first = replay(*case, run=Run(cache_dir=tmp_path))
     entry = next(tmp_path.glob("*.npz"))
     entry.write_bytes(entry.read_bytes()[:100])
-    again = replay(*case, cache_dir=tmp_path)
+    again = replay(*case, run=Run(cache_dir=tmp_path))
     assert (again.h == first.h).all()
     assert entry.stat().st_size > 100
     assert not list(tmp_path.glob("*.part"))
@@ -95,12 +96,12 @@ def test_damaged_entry_is_searched_again(case, tmp_path):
 def test_unwritable_cache_is_no_error(case, tmp_path):
     blocked = tmp_path / "file"
     blocked.write_text("not a folder")
-    assert len(replay(*case, cache_dir=blocked).paths)
+    assert len(replay(*case, run=Run(cache_dir=blocked)).paths)
 
 
 def test_progress_reaches_one(case):
     seen = []
-    replay(*case, progress=seen.append)
+    replay(*case, run=Run(progress=seen.append))
     assert seen == sorted(seen)
     assert seen[-1] == 1.0
 
@@ -118,31 +119,31 @@ def test_audit_by_the_same_engine_sees_no_difference(case):
 
 def test_audit_sees_what_a_shallow_replay_lacks(case):
     site, link, poses = case
-    shallow = replay(site, link, poses, max_depth=0)
-    deep = replay(site, link, poses, max_depth=2)
+    shallow = replay(site, link, poses, Search(max_depth=0))
+    deep = replay(site, link, poses, Search(max_depth=2))
     report = audit(site, link, poses, shallow, reference="image", links=None)
     assert report.links == 80
     assert report.missing_paths == (deep.paths.depth > 0).sum()
     assert report.extra_paths == 0
     assert report.rss_max_error_db > 0.5
-    turned = audit(site, link, poses, deep, reference="image", links=None, max_depth=0)
+    turned = audit(site, link, poses, deep, Search(max_depth=0), reference="image", links=None)
     assert turned.extra_paths == report.missing_paths
 
 
 def test_every_damage_of_an_entry_is_seen_and_told(case, tmp_path):
-    first = replay(*case, cache_dir=tmp_path)
+    first = replay(*case, run=Run(cache_dir=tmp_path))
     (entry,) = tmp_path.glob("*.npz")
     whole = entry.read_bytes()
     generator = np.random.default_rng(3)
     for at in generator.integers(0, len(whole), 60).tolist():
         entry.write_bytes(whole[:at] + bytes([whole[at] ^ int(generator.integers(1, 256))]) + whole[at + 1 :])
-        again = replay(*case, cache_dir=tmp_path)
+        again = replay(*case, run=Run(cache_dir=tmp_path))
         assert not again.from_cache, at
         assert any("damaged entry of the path cache" in line for line in again.left_out)
         assert np.array_equal(again.rss_dbm, first.rss_dbm, equal_nan=True)
     entry.write_bytes(whole[:-1])
-    assert any("damaged entry" in line for line in replay(*case, cache_dir=tmp_path).left_out)
-    assert replay(*case, cache_dir=tmp_path).from_cache, "mended by the last search"
+    assert any("damaged entry" in line for line in replay(*case, run=Run(cache_dir=tmp_path)).left_out)
+    assert replay(*case, run=Run(cache_dir=tmp_path)).from_cache, "mended by the last search"
 
 
 @pytest.mark.parametrize("fault", ["far", "far_nan_turn", "no_turn"])

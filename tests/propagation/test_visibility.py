@@ -8,8 +8,10 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Array, linear_array, tower_comparison_array, uav_comparison_array
 from aerpaw_cmp.propagation.bench import random_scene
+from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field_audit import per_pair
-from aerpaw_cmp.propagation.tracer import replay
+from aerpaw_cmp.propagation.options import Search
+from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 
 
@@ -19,7 +21,7 @@ def test_open_field_does_not_care(scenes, uav_transmits):
     uav = uav_comparison_array(wavelength_m(scenes.carrier_hz))
     link = scenes.link(site, tower_comparison_array(), uav, uav_transmits=uav_transmits)
     poses = scenes.poses(np.random.default_rng(1).uniform([-90, -90, 5], [90, 90, 40], (20, 3)))
-    centre, pairs = (replay(site, link, poses, visibility=v) for v in ("centre", "pairs"))
+    centre, pairs = replay(site, link, poses), replay_pairs(site, link, poses)
     assert not pairs.pairs_differ.any()
     assert pairs.h == pytest.approx(centre.h, rel=1e-12)
     assert pairs.rss_power_dbm == pytest.approx(centre.rss_power_dbm, abs=1e-12)
@@ -31,19 +33,22 @@ def test_wall_that_ends_between_two_elements_hides_one_of_them(scenes):
     two = Array(np.array([[0.0, 0.5, 0.0], [0.0, -0.5, 0.0]]), np.zeros(2))
     link = scenes.link(site, uav_array=two, uav_transmits=False)
     pose = scenes.poses([[40.0, 0.0, 10.0]])
-    h = replay(site, link, pose, visibility="pairs", max_depth=0).h[0, 0, :, 0]
+    h = replay_pairs(site, link, pose, Search(max_depth=0)).h[0, 0, :, 0]
     assert h[0] == 0
     assert abs(h[1]) == pytest.approx(wavelength_m(scenes.carrier_hz) / (4 * np.pi * np.hypot(40, 0.5)), rel=1e-12)
-    centre = replay(site, link, pose, max_depth=0).h[0, 0, :, 0]
+    centre = replay(site, link, pose, Search(max_depth=0)).h[0, 0, :, 0]
     assert (centre != 0).all()  # along the wall's side, so the centre sees the tower
 
 
 def test_single_elements_in_the_centre_change_nothing_bit_by_bit(scenes):
     site = scenes.site(scenes.buildings(np.random.default_rng(3), 4, spread_m=60.0))
     poses = scenes.poses(np.random.default_rng(4).uniform([-80, -80, 12], [80, 80, 40], (20, 3)))
-    centre, pairs = (replay(site, scenes.link(site), poses, visibility=v) for v in ("centre", "pairs"))
+    centre, pairs = (each(site, scenes.link(site), poses) for each in (replay, replay_pairs))
     assert (pairs.h == centre.h).all()
-    assert per_pair(site, scenes.link(site), poses, centre, np.arange(20), ks=(10.0,), max_depth=2).pairs_links == 0
+    assert (
+        per_pair(site, scenes.link(site), poses, centre, np.arange(20), Search(max_depth=2), ks=(10.0,)).pairs_links
+        == 0
+    )
 
 
 def test_transposing_the_link_transposes_h(scenes):
@@ -52,16 +57,16 @@ def test_transposing_the_link_transposes_h(scenes):
     here, there = (0.0, 0.0, 10.0), (30.0, 10.0, 12.0)
     one, two = linear_array(3, 2.0, 20.0), linear_array(2, 3.0, 70.0)
     site = scenes.site(building, (here,))
-    forth = replay(site, scenes.link(site, one, two, uav_transmits=False), scenes.poses([there]), visibility="pairs")
+    forth = replay_pairs(site, scenes.link(site, one, two, uav_transmits=False), scenes.poses([there]))
     site = scenes.site(building, (there,))
-    back = replay(site, scenes.link(site, two, one, uav_transmits=False), scenes.poses([here]), visibility="pairs")
+    back = replay_pairs(site, scenes.link(site, two, one, uav_transmits=False), scenes.poses([here]))
     assert forth.h[0, 0] == pytest.approx(back.h[0, 0].T, rel=1e-9)
     assert 0 < (forth.h != 0).sum() < 6
 
 
 def test_few_links_of_the_bench_scene_differ():
     site, link, poses = random_scene(200)
-    pairs = replay(site, link, poses, visibility="pairs")
+    pairs = replay_pairs(site, link, poses)
     assert 0 < pairs.pairs_differ.mean() < 0.1
     centre = replay(site, link, poses)
     same = ~pairs.pairs_differ
@@ -71,4 +76,4 @@ def test_few_links_of_the_bench_scene_differ():
 def test_pairs_need_the_image_engine(scenes):
     site = scenes.site()
     with pytest.raises(UsageError, match="visibility 'pairs' with engine 'sionna'"):
-        replay(site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), "sionna", visibility="pairs")
+        replay_pairs(site, scenes.link(site), scenes.poses([[9.0, 0, 20]]), Search("sionna"))

@@ -1,0 +1,98 @@
+"""Element pairs with paths of their own: every tower element is a source, every UAV element a pose."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from ...common.errors import UsageError
+from ...site.site import Site
+from ..arrays import Array, Link, Poses
+from ..engines import search_paths
+from ..field.sum import channel_matrices, mean_pair_power, rss_dbm
+from ..options import Field, Run, Search
+from ..replay import Replay, passed, replay
+from ..scene import Scene, within_reach
+
+PAIRS_DIFFER = 1e-9
+"""Of the root of a link's power: more than rounding between H of the centres' paths and of each pair's own."""
+
+
+def replay_pairs(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    search: Search = Search(),  # noqa: B008 - frozen
+    field: Field = Field(),  # noqa: B008
+    run: Run = Run(),  # noqa: B008
+) -> Replay:
+    """Replay with paths of each element pair; as many searches as the UAV has elements.
+
+    Parameters
+    ----------
+    site, link, poses, search, field, run
+        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+
+    Returns
+    -------
+    Replay
+        H and levels of the pairs' own paths; ``paths`` are those of the array centres, and ``pairs_differ`` says which
+        links they do not serve.
+
+    Raises
+    ------
+    UsageError
+        Another engine than ``image``; what :func:`replay` raises.
+    """
+    if search.engine != "image":
+        raise UsageError(
+            "visibility 'pairs' with engine 'sionna'",
+            expected="engine 'image', or visibility 'centre'",
+            cause="each element pair is searched for its own paths",
+        )
+    centre = replay(site, link, poses, search, field, run)
+    poses, _ = within_reach(site, poses)
+    arrays, uav = list(link.tower_arrays.values()), link.uav_array
+    ports, towers = len(arrays[0]), len(arrays)
+    singles = {f"{n} {p}": _single(array, p) for n, array in link.tower_arrays.items() for p in range(ports)}
+    scene = Scene.of(site, link, poses)
+    excluded = scene.excluded if search.links is None else scene.excluded | ~search.links
+    offsets = np.concatenate([array.positions_m @ array.mount.T for array in arrays])
+    several = replace(
+        scene,
+        sources_m=np.repeat(scene.sources_m, ports, axis=0) + offsets,
+        usable=np.repeat(scene.usable, ports, axis=0),
+        excluded=np.repeat(excluded, ports, axis=0),
+    )
+    h = np.zeros((len(poses), towers, len(uav), ports), dtype=np.complex128)
+    power = np.zeros((len(poses), towers))
+    turn, quiet = poses.rotation @ uav.mount, replace(run, progress=None, on_estimate=None)
+    for element in range(len(uav)):
+        spots = Poses(poses.position_m + turn @ uav.positions_m[element], poses.rotation)
+        single = replace(link, tower_arrays=singles, uav_array=_single(uav, element), uav_transmits=False)
+        paths = search_paths(several, single, spots, search, quiet)
+        geometry, paths, _ = passed(site, several, spots, paths, search)
+        loss_db = field.loss_db(paths, geometry.sources_m, spots.position_m)
+        fields = channel_matrices(paths, geometry.faces, geometry.sources_m, spots, single, loss_db)
+        h[:, :, element] = fields.h[..., 0, 0].reshape(len(poses), towers, ports)
+        power += fields.power.reshape(len(poses), towers, ports).sum(axis=2) / (ports * len(uav))
+    h = np.ascontiguousarray(h.swapaxes(2, 3)) if link.uav_transmits else h
+    level = rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm)
+    covered = np.isfinite(level)
+    h = np.where(covered[:, :, None, None], h, 0.0)
+    size = np.sqrt(np.maximum(mean_pair_power(h), mean_pair_power(centre.h)))
+    return replace(
+        centre,
+        rss_dbm=level,
+        rss_power_dbm=rss_dbm(power, link.transmit_power_dbm, link.noise_floor_dbm),
+        h=h,
+        has_path=covered,
+        pairs_differ=np.abs(h - centre.h).max(axis=(2, 3)) > PAIRS_DIFFER * size,
+    )
+
+
+def _single(array: Array, element: int) -> Array:
+    """One element of an array, in the centre of its own."""
+    pattern = array.patterns[element if len(array.patterns) > 1 else 0]
+    return Array(np.zeros((1, 3)), array.slant_rad[element : element + 1], (pattern,), array.mount)

@@ -1,0 +1,258 @@
+"""Paths by the engine that is asked for, read from the cache where they were searched before."""
+
+from __future__ import annotations
+
+import os
+import time
+import warnings
+from collections.abc import Iterator
+from dataclasses import replace
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..site.site import Site
+from . import image
+from .arrays import Link, Poses
+from .cache import PathCache
+from .compiled import beams, switch, warn_once
+from .effort import Estimate
+from .interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
+from .options import Run, Search
+from .paths import PathSet
+from .power_cut import ROUNDING, longest_m, within_cut
+from .samples import Choice, enough_samples, spread
+from .scene import Scene, within_reach
+
+LONG_SEARCH_S = 60.0
+"""A search that will take longer is a warning where nobody asked to be told."""
+
+MANY_FACES = 400
+"""Faces beyond which sequences of two reflections are found by compiled beams; the paths are the same."""
+
+
+def path_cache(search: Search, run: Run) -> PathCache | None:
+    """Cache of a replay, None where there is none."""
+    folder = run.cache_dir
+    if folder is None:
+        if search.engine != "sionna":
+            return None
+        folder = os.environ.get("AERPAW_CMP_CACHE") or Path.home() / ".cache" / "aerpaw-cmp"
+    return PathCache(Path(folder)) if str(folder) else None
+
+
+def chosen_samples(scene: Scene, link: Link, poses: Poses, search: Search, cache: PathCache | None) -> Choice | None:
+    """Rays per tower at which two pilots on a batch of poses, spread over the flight, find the same paths.
+
+    Parameters
+    ----------
+    scene, link, poses, search
+        As for :func:`search_or_read`.
+    cache : PathCache or None
+
+    Returns
+    -------
+    Choice or None
+        None where the number is given, or no rays are cast.
+    """
+    if search.engine != "sionna" or search.samples != "auto":
+        return None
+    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), search.batch)
+    part = replace(scene, excluded=scene.excluded[:, some])
+    few = Poses(poses.position_m[some], poses.rotation[some])
+
+    def pilot(samples: int) -> PathSet:
+        return search_or_read(part, link, few, replace(search, samples=samples), Run(), cache)[0]
+
+    return enough_samples(pilot, scene.faces, len(some))
+
+
+def search_or_read(
+    scene: Scene, link: Link, poses: Poses, search: Search, run: Run, cache: PathCache | None
+) -> tuple[PathSet, float, bool]:
+    """Paths, the seconds of their search, and whether they were read from the cache.
+
+    Parameters
+    ----------
+    scene : Scene
+    link : Link
+    poses : Poses
+    search : Search
+        With a number of samples, where rays are cast.
+    run : Run
+    cache : PathCache or None
+
+    Returns
+    -------
+    paths : PathSet
+    seconds : float
+    from_cache : bool
+    """
+    key = cache.key(scene, poses.position_m, link.carrier_hz, search) if cache else ""
+    kept = cache.load(key) if cache else None
+    if kept:
+        return *kept, True
+    started = time.perf_counter()
+    paths = search_paths(scene, link, poses, search, run)
+    seconds = time.perf_counter() - started
+    if cache:
+        cache.save(key, paths, seconds)
+    return paths, seconds, False
+
+
+def search_paths(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
+    """Paths by the engine of ``search``, those left out that the power cut does.
+
+    Parameters
+    ----------
+    scene, link, poses, search, run
+        As for :func:`search_or_read`.
+
+    Returns
+    -------
+    PathSet
+    """
+    paths = _by_engine(scene, link, poses, search, run)
+    if search.power_cut_db is None:
+        return paths
+    return within_cut(paths, scene.sources_m, poses.position_m, search.power_cut_db)
+
+
+def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run) -> PathSet:
+    common: dict[str, Any] = {"usable": scene.usable, "excluded": scene.excluded, "progress": run.progress}
+    common |= {"max_depth": search.max_depth}
+    ends = scene.sources_m, poses.position_m
+    extent = None if run.whole is None else run.whole.extent_m
+    if by_beams(scene, search):
+        from . import growth, prisms  # compiled: loaded where there are many faces
+
+        common |= {"longest_m": _longest_m(scene, poses, search), "threads": run.threads}
+        common |= {"on_estimate": run.on_estimate or _long_search}
+        if scene.surfaces is not None:
+            return growth.grow_paths(scene.surfaces, *ends, **common)[0]
+        return prisms.find_paths(scene.faces, *ends, extent_m=extent, **common)[0]
+    if search.engine == "image":
+        return image.find_paths(scene.faces, *ends, extent_m=extent, **common)
+    from . import sionna
+
+    return sionna.find_paths(scene.faces, *ends, **(common | _rays(scene, link, search)))
+
+
+def _rays(scene: Scene, link: Link, search: Search) -> dict[str, Any]:
+    """What Sionna is asked with besides the ends."""
+    return {
+        "carrier_hz": link.carrier_hz,
+        "samples": search.samples,
+        "batch": search.batch,
+        "surfaces": scene.surfaces,
+        "variant": search.variant,
+    }
+
+
+def other_paths(
+    scene: Scene, link: Link, poses: Poses, search: Search, other: OtherSearch, cache: PathCache | None
+) -> Iterator[OtherPaths]:
+    """Paths with other interactions, batch by batch; scattered ones, of which a link has hundreds, are not cached.
+
+    Parameters
+    ----------
+    scene, link, poses, search, cache
+        As for :func:`search_or_read`.
+    other : OtherSearch
+
+    Yields
+    ------
+    OtherPaths
+    """
+    cache = None if other.scattering else cache
+    key = cache.key(scene, poses.position_m, link.carrier_hz, search, other) if cache else ""
+    kept = cache.load_others(key) if cache else None
+    if kept is not None:
+        yield kept
+        return
+    from . import sionna
+
+    rays = _rays(scene, link, search)
+    if other.scattering:
+        rays["samples"] = min(rays["samples"], SCATTERING_SAMPLES)
+    batches = sionna.find_others(
+        scene.faces,
+        scene.sources_m,
+        poses.position_m,
+        search=other,
+        max_depth=search.max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        **rays,
+    )
+    if cache is None:
+        yield from batches
+        return
+    joined = OtherPaths.joined(batches, search.max_depth)
+    cache.save_others(key, joined)
+    yield joined
+
+
+def by_beams(scene: Scene, search: Search) -> bool:
+    """Whether the image engine searches by compiled beams: a scene of triangles, or many faces."""
+    if search.engine != "image":
+        return False
+    if scene.surfaces is not None:
+        return True
+    if search.max_depth < 2 or len(scene.faces) <= MANY_FACES or find_spec("numba") is None:
+        return False
+    state = beams()
+    if state.kernels is None and switch() != "never":
+        warn_once(state.reason)
+    return state.kernels is not None
+
+
+def _longest_m(scene: Scene, poses: Poses, search: Search) -> float | FloatArray:
+    """Longest path that need be searched for, a little more than counts."""
+    if search.power_cut_db is None:
+        return float(np.inf)
+    return longest_m(scene.sources_m, poses.position_m, search.power_cut_db) * (1.0 + ROUNDING)
+
+
+def _long_search(estimate: Estimate) -> None:
+    if estimate.seconds > LONG_SEARCH_S:
+        warnings.warn(f"the path search takes {estimate}", RuntimeWarning, stacklevel=2)
+
+
+def estimate_search(
+    site: Site, link: Link, poses: Poses, search: Search | None = None, *, threads: int | None = None
+) -> Estimate | None:
+    """What the path search of the image engine will take, from its first faces.
+
+    Parameters
+    ----------
+    site, link, poses, search
+        As for :func:`aerpaw_cmp.propagation.replay.replay`.
+    threads : int, optional
+
+    Returns
+    -------
+    Estimate or None
+        None where there are few faces: a replay of some poses tells it.
+    """
+    poses, _ = within_reach(site, poses)
+    scene, search = Scene.of(site, link, poses), replace(search or Search(), engine="image")
+    if not by_beams(scene, search):
+        return None
+    from . import growth, prisms  # compiled: loaded where there are many faces
+
+    solids = scene.surfaces is None
+    return growth.estimate(
+        scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
+        scene.sources_m,
+        poses.position_m,
+        max_depth=search.max_depth,
+        usable=scene.usable,
+        excluded=scene.excluded,
+        longest_m=_longest_m(scene, poses, search),
+        threads=threads,
+        solids=solids,
+    )

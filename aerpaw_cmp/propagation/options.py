@@ -1,0 +1,172 @@
+"""What a replay is asked for, beside site, link and poses: how to search, what a path loses, how to run."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, FloatArray
+from .crowns import Crowns
+from .effort import OnEstimate
+from .interactions import OtherSearch, other_searches
+from .paths import PathSet
+from .samples import Samples
+
+Engine = Literal["image", "sionna"]
+Device = Literal["auto", "cpu", "cuda"]
+Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
+"""``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
+
+
+@dataclass(frozen=True, slots=True)
+class Search:
+    """What decides the paths besides the scene.
+
+    Parameters
+    ----------
+    engine : {"image", "sionna"}
+        Exhaustive image method, or Sionna's PathSolver as path finder.
+    max_depth : int
+        Largest number of reflections, 0 to 3.
+    samples : int or "auto"
+        ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
+        (:mod:`aerpaw_cmp.propagation.samples`).
+    batch : int
+        ``sionna`` only: poses per call.
+    crowns : Crowns, optional
+        Crowns that reflect: their paths are added to those of the engine, whichever it is. What crowns stop is the
+        business of :class:`Field`.
+    power_cut_db : float, optional
+        Leave out paths at least this much weaker than free space over their link by their length alone
+        (:mod:`aerpaw_cmp.propagation.power_cut`).
+    check_power_cut : bool
+        Search a few poses without the cut and say in ``left_out`` what it costs.
+    interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
+        ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
+        (:mod:`aerpaw_cmp.propagation.interactions`).
+    scattering_coefficient : float, optional
+        Of every material, where "scattering" is asked for.
+    device : {"auto", "cpu", "cuda"}
+        Of Sionna's search; "auto" is a GPU where Dr.Jit finds one.
+    links : (towers, poses) bool, optional
+        Links that count; the others have no path and are not searched for.
+    """
+
+    engine: Engine = "image"
+    max_depth: int = 2
+    samples: Samples = "auto"
+    batch: int = 50
+    crowns: Crowns | None = None
+    power_cut_db: float | None = None
+    check_power_cut: bool = True
+    interactions: Sequence[str] = ("reflection",)
+    scattering_coefficient: float | None = None
+    device: Device = "auto"
+    links: BoolArray | None = None
+
+    @property
+    def variant(self) -> str | None:
+        """Mitsuba's name of the device."""
+        return {"cpu": "llvm", "cuda": "cuda"}.get(self.device)
+
+    @property
+    def deciding(self) -> dict[str, object]:
+        """What an entry of the path cache depends on."""
+        names = ("engine", "max_depth", "samples", "batch", "power_cut_db", "variant")
+        return {name: getattr(self, name) for name in names}
+
+    def others(self) -> tuple[OtherSearch, ...]:
+        """Searches for other interactions than reflections.
+
+        Raises
+        ------
+        UsageError
+            An unknown engine or interaction, other interactions than reflections with ``image``, a ``power_cut_db``
+            that is not positive.
+        """
+        if self.engine not in ("image", "sionna"):
+            raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
+        _check_positive("power_cut_db", self.power_cut_db)
+        searches = other_searches(self.interactions, self.scattering_coefficient)
+        if searches and (self.engine != "sionna" or self.max_depth == 0):
+            raise UsageError(
+                f"interactions {', '.join(self.interactions)} with "
+                + (f"engine {self.engine!r}" if self.engine != "sionna" else "max_depth 0"),
+                expected="engine 'sionna' and a max_depth of 1 or more, or reflections alone",
+                cause="the image engine knows reflections; every interaction counts in max_depth",
+            )
+        return searches
+
+
+@dataclass(frozen=True, slots=True)
+class Field:
+    """What decides the field of the paths besides arrays and materials.
+
+    Parameters
+    ----------
+    loss : callable, optional
+        Further loss per path [dB], such as foliage; infinite where nothing gets through.
+    relevance_db : float, optional
+        Say in ``left_out`` which buildings move no RSS by more than this (:mod:`aerpaw_cmp.propagation.relevance`).
+    """
+
+    loss: Loss | None = None
+    relevance_db: float | None = None
+
+    def __post_init__(self) -> None:
+        _check_positive("relevance_db", self.relevance_db)
+
+    def loss_db(self, paths: PathSet, sources_m: FloatArray, targets_m: FloatArray) -> FloatArray | None:
+        """Further loss (paths,) [dB] between sources (towers, 3) and targets (poses, 3); None where none is lost."""
+        return None if self.loss is None else self.loss(paths, sources_m, targets_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Whole:
+    """What a part of a replay must know of the others, so that it is the same as in one piece.
+
+    Parameters
+    ----------
+    extent_m : (points, 3)
+        Points that span all poses: they set the tolerance of the path search.
+    pairs : int
+        Element pairs of all links: they decide whether compiled code is worth loading.
+    """
+
+    extent_m: FloatArray
+    pairs: int
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """How a replay is run; nothing here changes a number.
+
+    Parameters
+    ----------
+    cache_dir : path, optional
+        Keep paths here, ``""`` for no cache. Default: ``AERPAW_CMP_CACHE``, else ``~/.cache/aerpaw-cmp``, for the
+        ``sionna`` engine; the ``image`` engine is faster than a cache unless one is named.
+    threads : int, optional
+        Of compiled code (default: the cores this process may use).
+    whole : Whole, optional
+        What the poses are a part of.
+    progress : callable, optional
+        Called with the share done.
+    on_estimate : callable, optional
+        Called before a search among thousands of faces with what it will take; without one, a long search is a
+        warning.
+    """
+
+    cache_dir: str | Path | None = None
+    threads: int | None = None
+    whole: Whole | None = None
+    progress: Callable[[float], None] | None = None
+    on_estimate: OnEstimate | None = None
+
+
+def _check_positive(name: str, value: float | None) -> None:
+    if value is not None and not value > 0.0:
+        raise UsageError(f"{name} {value:g}", expected="a positive number of dB")

@@ -1,0 +1,388 @@
+"""The replay of a flight, stage by stage: scene, paths, what lets them pass, field, levels."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from ..common.errors import UsageError
+from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
+from ..site.site import Site
+from . import image
+from .arrays import Link, Poses
+from .cache import PathCache
+from .engines import chosen_samples, other_paths, path_cache, search_or_read
+from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
+from .interactions import OtherInteractions, OtherSearch, path_powers
+from .options import Field, Run, Search
+from .paths import Faces, PathSet
+from .power_cut import CHECKED_POSES, loss_in_words, within_cut
+from .relevance import idle_objects, in_words
+from .samples import spread
+from .scene import Scene, buried_towers, within_reach
+from .surfaces import Surfaces
+
+LEVELS_AT_ONCE = 1024
+"""Poses of which levels are made at once."""
+
+NOT_IN_RANKS = "other interactions than reflections in H and ranks: their power is added to RSS alone"
+
+
+@dataclass(frozen=True, slots=True, repr=False)
+class Replay:
+    """What a replay found.
+
+    Parameters
+    ----------
+    rss_dbm : (poses, towers)
+        Coherent: from ``|H|^2``, see :func:`aerpaw_cmp.propagation.field.sum.rss_dbm`. NaN without a path.
+    rss_power_dbm : (poses, towers)
+        From the sum of the paths' powers.
+    h : (poses, towers, n_rx, n_tx) complex128
+        Zero without a path.
+    has_path : (poses, towers) bool
+    paths : PathSet
+    faces : Faces
+    seconds : float
+        Of this call: path search (or reading the cache) and fields.
+    search_seconds : float
+        Of the path search alone, when it was made: an entry of the cache remembers it.
+    engine : str
+    left_out : list of str
+        What was not modelled, for the report.
+    towers : tuple of str
+        Order of the tower axis.
+    from_cache : bool
+        Nothing was searched.
+    samples : int
+        Rays per tower; 0 for an engine without rays.
+    samples_reason : str
+        Why so many, where the number was found by pilots.
+    pairs_differ : (poses, towers) bool, optional
+        Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
+    surfaces : Surfaces, optional
+        What the faces are made of, where the site is a scene of triangles.
+    other : OtherInteractions, optional
+        What diffraction, scattering and refraction add to both levels and to ``has_path``, where they were asked for;
+        ``h`` and ``paths`` are of reflections alone.
+    """
+
+    rss_dbm: FloatArray
+    rss_power_dbm: FloatArray
+    h: ComplexArray
+    has_path: BoolArray
+    paths: PathSet
+    faces: Faces
+    seconds: float
+    search_seconds: float
+    engine: str
+    towers: tuple[str, ...]
+    left_out: list[str] = field(default_factory=list)
+    from_cache: bool = False
+    samples: int = 0
+    samples_reason: str = ""
+    pairs_differ: BoolArray | None = None
+    surfaces: Surfaces | None = None
+    other: OtherInteractions | None = None
+
+    def of_reflections(self) -> Replay:
+        """The replay without what other interactions add: what its paths and H are."""
+        other = self.other
+        if other is None:
+            return self
+        return replace(
+            self, rss_dbm=other.rss_dbm, rss_power_dbm=other.rss_power_dbm, has_path=other.has_path, other=None
+        )
+
+    def __repr__(self) -> str:
+        """One line: the arrays are too large to be shown."""
+        return (
+            f"Replay({len(self.has_path)} poses, towers {', '.join(self.towers)}, engine {self.engine!r}, "
+            f"{len(self.paths)} paths, coverage {100 * self.has_path.mean():.0f} %, {self.seconds:.2f} s)"
+        )
+
+    def to_xarray(self) -> Any:
+        """The replay as an ``xarray.Dataset`` with dimensions pose, tower, n_rx, n_tx.
+
+        Returns
+        -------
+        xarray.Dataset
+            ``rss_dbm``, ``rss_power_dbm``, ``has_path``, ``h_real`` and ``h_imag`` with units as attributes.
+
+        Raises
+        ------
+        UsageError
+            If xarray is not installed.
+        """
+        try:
+            import xarray
+        except ImportError:
+            raise UsageError(
+                "xarray is not installed", expected="pip install 'aerpaw-cmp[geo]'", cause="to_xarray() needs it"
+            ) from None
+        level = {"units": "dBm", "long_name": "received power, coherent sum of the paths"}
+        power = {"units": "dBm", "long_name": "received power, sum of the paths' powers"}
+        ports = ("pose", "tower", "n_rx", "n_tx")
+        return xarray.Dataset(
+            {
+                "rss_dbm": (("pose", "tower"), self.rss_dbm, level),
+                "rss_power_dbm": (("pose", "tower"), self.rss_power_dbm, power),
+                "has_path": (("pose", "tower"), self.has_path),
+                "h_real": (ports, self.h.real, {"units": "1"}),
+                "h_imag": (ports, self.h.imag, {"units": "1"}),
+            },
+            coords={"tower": list(self.towers)},
+            attrs={"engine": self.engine, "seconds": self.seconds},
+        )
+
+
+def replay(
+    site: Site,
+    link: Link,
+    poses: Poses,
+    search: Search = Search(),  # noqa: B008 - frozen
+    field: Field = Field(),  # noqa: B008
+    run: Run = Run(),  # noqa: B008
+) -> Replay:
+    """Replay a flight.
+
+    Parameters
+    ----------
+    site : Site
+    link : Link
+        Its ``tower_arrays`` name towers of the site.
+    poses : Poses
+    search : Search
+        Engine, depth and what else decides the paths.
+    field : Field
+        Further losses of the paths.
+    run : Run
+        Cache, threads, progress.
+
+    Returns
+    -------
+    Replay
+
+    Raises
+    ------
+    UsageError
+        Unknown tower or engine, a scene too large for ``image``, other interactions than reflections with ``image``.
+    """
+    started, searches = time.perf_counter(), search.others()
+    poses, notes = within_reach(site, poses)
+    scene = Scene.of(site, link, poses)
+    if search.links is not None:
+        scene = replace(scene, excluded=scene.excluded | ~search.links)
+    notes += buried_towers(site, link)
+    cache = path_cache(search, run)
+    choice = chosen_samples(scene, link, poses, search, cache)
+    search = search if choice is None else replace(search, samples=choice.samples)
+    paths, search_seconds, from_cache = search_or_read(scene, link, poses, search, run, cache)
+    notes += cache.warnings if cache else []
+    notes += _checked_cut(site, scene, link, poses, search, field, cache)
+    scene, paths, stopped = passed(site, scene, poses, paths, search)
+    result, idle = _evaluated(scene, link, poses, paths, search, field, run)
+    notes += stopped
+    if searches:
+        power = _other_powers(site, scene, link, poses, search, searches, field, cache)
+        result = _with_others(result, link, tuple(search.interactions), *power)
+        notes.append(NOT_IN_RANKS)
+    return replace(
+        result,
+        seconds=time.perf_counter() - started,
+        search_seconds=search_seconds,
+        left_out=[*notes, *idle],
+        from_cache=from_cache,
+        samples=int(search.samples) if search.engine == "sionna" else 0,
+        samples_reason=choice.reason if choice else "",
+    )
+
+
+def passed(site: Site, scene: Scene, poses: Poses, paths: PathSet, search: Search) -> tuple[Scene, PathSet, list[str]]:
+    """Paths that terrain lets through, with those that bounce off crowns.
+
+    Parameters
+    ----------
+    site, scene, poses, search
+        As for :func:`replay`.
+    paths : PathSet
+        Of the engine.
+
+    Returns
+    -------
+    scene : Scene
+        With the facets of crowns that a path meets.
+    paths : PathSet
+    notes : list of str
+        What was stopped or left out.
+    """
+    clear = _clear_of_terrain(site, scene, poses, paths)
+    lost = int((~clear).sum())
+    notes = [f"{lost} of {len(paths)} paths end at the terrain of the elevation model"] if lost else []
+    paths = paths.select(clear) if lost else paths
+    if search.crowns is None:
+        return scene, paths, notes
+    if scene.surfaces is not None:
+        return scene, paths, [*notes, "reflections off crowns: they are not searched in a scene of triangles"]
+    scene, bounces = scene.with_bounces(site, poses, search.crowns, search.max_depth)
+    if search.power_cut_db is not None:
+        bounces = within_cut(bounces, scene.sources_m, poses.position_m, search.power_cut_db)
+    if search.max_depth > 1:
+        notes = [*notes, "paths over a crown and a building, or over two crowns"]
+    return scene, image.merge([paths, bounces], search.max_depth, None), notes
+
+
+def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:
+    """Paths (paths,) that the elevation model lets through.
+
+    The traced ground is a plane per tower; the terrain only blocks. It is asked on the direct line between the ends,
+    whose shadow a ground reflection shares; a path over walls alone is asked on each of its segments.
+    """
+    if site.dem is None or len(paths) == 0:
+        return np.ones(len(paths), dtype=np.bool_)
+    source, target = scene.sources_m[paths.tower], poses.position_m[paths.pose]
+    ground = np.append(scene.faces.solid < 0, False)  # the last entry stands for "no face"
+    over_ground = ground[paths.faces].any(axis=1)
+    straight = (paths.depth == 0) | over_ground
+    clear = np.ones(len(paths), dtype=np.bool_)
+    clear[straight] = site.dem.clear(source[straight], target[straight])
+    rows = np.flatnonzero(~straight)
+    start = source[rows]
+    for step in range(paths.vertices_m.shape[1] + 1):
+        last = step == paths.vertices_m.shape[1]
+        corner = target[rows] if last else paths.vertices_m[rows, step]
+        end = np.where(np.isfinite(corner), corner, target[rows])
+        clear[rows] &= site.dem.clear(start, end)
+        start = end
+    return clear
+
+
+def _checked_cut(
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field, cache: PathCache | None
+) -> list[str]:
+    """What the power cut costs at a few poses, spread over the flight, that are searched without it."""
+    some = spread(np.flatnonzero(np.isfinite(poses.position_m).all(axis=1)), CHECKED_POSES)
+    cut_db = search.power_cut_db
+    if not len(some) or cut_db is None or not search.check_power_cut:
+        return []
+    few = Poses(poses.position_m[some], poses.rotation[some])
+    part = replace(scene, excluded=scene.excluded[:, some])
+    full, _, _ = search_or_read(part, link, few, replace(search, power_cut_db=None), Run(), cache)
+    full = full.select(_clear_of_terrain(site, part, few, full))
+    left = within_cut(full, scene.sources_m, few.position_m, cut_db)
+    level = []
+    for paths in (full, left):
+        loss_db = field.loss_db(paths, scene.sources_m, few.position_m)
+        h = channel_matrices(paths, scene.faces, scene.sources_m, few, link, loss_db).h
+        level.append(rss_dbm(mean_pair_power(h), link.transmit_power_dbm, link.noise_floor_dbm))
+    both = np.isfinite(level[0]) & np.isfinite(level[1])
+    lost = int((np.isfinite(level[0]) & ~np.isfinite(level[1])).sum())
+    return [loss_in_words(cut_db, len(full), len(full) - len(left), len(some), level[1][both] - level[0][both], lost)]
+
+
+def _evaluated(
+    scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search, field: Field, run: Run
+) -> tuple[Replay, list[str]]:
+    """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
+    loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
+    work = None if run.whole is None else run.whole.pairs
+    fields = channel_matrices(paths, scene.faces, scene.sources_m, poses, link, loss_db, threads=run.threads, work=work)
+    has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
+    open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
+    has_path[paths.pose[open_], paths.tower[open_]] = True
+    idle: list[str] = []
+    if field.relevance_db is not None:
+        power = mean_pair_power(fields.h)
+        labels, _ = idle_objects(paths, scene.faces, fields.path_power, power, field.relevance_db)
+        idle = in_words(labels, field.relevance_db)
+    level_dbm, power_dbm = _levels(fields, has_path, link)
+    return Replay(
+        rss_dbm=level_dbm,
+        rss_power_dbm=power_dbm,
+        h=fields.h,
+        has_path=has_path,
+        paths=paths,
+        faces=scene.faces,
+        seconds=0.0,
+        search_seconds=0.0,
+        engine=search.engine,
+        towers=tuple(link.tower_arrays),
+        surfaces=scene.surfaces,
+    ), idle
+
+
+def _levels(fields: Fields, has_path: BoolArray, link: Link) -> tuple[FloatArray, FloatArray]:
+    """Levels (poses, towers) of H and of the summed powers; below the noise floor H and ``has_path`` become nothing."""
+    h, sent, floor = fields.h, link.transmit_power_dbm, link.noise_floor_dbm
+    level_dbm, power_dbm = np.empty(has_path.shape), np.empty(has_path.shape)
+    for first in range(0, len(h), LEVELS_AT_ONCE):  # in the cache; a second thread would gain nothing
+        part = slice(first, first + LEVELS_AT_ONCE)
+        level_dbm[part] = rss_dbm(mean_pair_power(h[part]), sent, floor)
+        power_dbm[part] = rss_dbm(fields.power[part], sent, floor)
+        above_floor = np.isfinite(level_dbm[part])
+        if not above_floor.all():
+            h[part][~above_floor] = 0.0
+        has_path[part] &= above_floor
+    return level_dbm, power_dbm
+
+
+def _other_powers(
+    site: Site,
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    search: Search,
+    searches: tuple[OtherSearch, ...],
+    field: Field,
+    cache: PathCache | None,
+) -> tuple[FloatArray, IntArray, dict[str, int]]:
+    """Power and number (poses, towers) of the paths with other interactions, and what they are made of."""
+    shape = (len(poses), len(scene.sources_m))
+    power, count, kinds = np.zeros(shape), np.zeros(shape, dtype=np.int64), Counter[str]()
+    for others in (o for one in searches for o in other_paths(scene, link, poses, search, one, cache)):
+        paths = others.select(_clear_of_terrain(site, scene, poses, others.geometry))
+        loss_db = field.loss_db(paths.reflections, scene.sources_m, poses.position_m)
+        if loss_db is not None:
+            paths, loss_db = paths.select(np.isfinite(loss_db)), loss_db[np.isfinite(loss_db)]
+        np.add.at(power, (paths.pose, paths.tower), path_powers(paths, link, poses, loss_db))
+        np.add.at(count, (paths.pose, paths.tower), 1)
+        kinds.update(paths.named())
+    return power, count, dict(sorted(kinds.items()))
+
+
+def _with_others(
+    result: Replay,
+    link: Link,
+    asked: tuple[str, ...],
+    power: FloatArray,
+    count: IntArray,
+    kinds: dict[str, int],
+) -> Replay:
+    """Levels with the power of other interactions: a level never falls by it."""
+    other = OtherInteractions(
+        asked=asked,
+        power=power,
+        paths=count,
+        kinds=kinds,
+        rss_dbm=result.rss_dbm,
+        rss_power_dbm=result.rss_power_dbm,
+        has_path=result.has_path,
+    )
+
+    def raised(known: FloatArray) -> FloatArray:
+        own = np.where(np.isfinite(known), power_from_db(np.nan_to_num(known) - link.transmit_power_dbm), 0.0)
+        summed = rss_dbm(own + power, link.transmit_power_dbm, link.noise_floor_dbm)
+        return np.asarray(np.where(power > 0.0, summed, known))
+
+    level = raised(result.rss_dbm)
+    return replace(
+        result,
+        rss_dbm=level,
+        rss_power_dbm=raised(result.rss_power_dbm),
+        has_path=result.has_path | np.isfinite(level),
+        other=other,
+    )

@@ -21,6 +21,7 @@ import json
 import mmap
 import multiprocessing
 import os
+import pickle
 import re
 import resource
 import signal
@@ -31,9 +32,9 @@ import time
 import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -42,9 +43,10 @@ sys.path[:0] = [str(ROOT), str(ROOT / "parsers")]
 
 import numpy as np  # noqa: E402
 
+from aerpaw_cmp.common import native  # noqa: E402
 from aerpaw_cmp.common.errors import AerpawCmpError  # noqa: E402
 from aerpaw_cmp.common.geodesy import SiteFrame  # noqa: E402
-from aerpaw_cmp.logs import hdf5_arrays, limits  # noqa: E402
+from aerpaw_cmp.logs import limits  # noqa: E402
 from aerpaw_cmp.logs.chunks import whole_lines  # noqa: E402
 from aerpaw_cmp.logs.readers import HEAD_BYTES, Reader, ReadOptions, catalogue  # noqa: E402
 from aerpaw_cmp.logs.records import ReadResult  # noqa: E402
@@ -582,37 +584,28 @@ def targets() -> list[Target]:
     return out
 
 
-def _hdf5_in_a_fork(data: bytes) -> dict[str, Any]:
-    """``hdf5_arrays.read`` with the same child, forked in place of started: a new interpreter costs 0.3 s an input."""
-    receive, send = multiprocessing.get_context("fork").Pipe(duplex=False)
-    child = multiprocessing.get_context("fork").Process(target=_hdf5_child, args=(data, send))
-    child.start()
-    send.close()
-    try:
-        if not receive.poll(hdf5_arrays.SECONDS):
-            child.kill()
-            raise ValueError("HDF5 did not come back")
-        said = receive.recv()
-    except EOFError:
-        child.join()
-        raise ValueError(f"HDF5 ended with code {child.exitcode}") from None
-    finally:
-        child.join()
-        receive.close()
-    if isinstance(said, str):
-        raise ValueError(said)
-    with np.load(io.BytesIO(said), allow_pickle=False) as book:
-        return {name: book[name] for name in book.files}
+def _in_a_fork(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
+    """``native._in_child`` with the same child, forked in place of started: a new interpreter costs 0.3 s an input."""
+    reader = _native_reader(kind)
+    with tempfile.TemporaryFile() as said:
+        process = os.fork()
+        if process == 0:
+            try:
+                native.give_up_rights()
+                pickle.dump(native.answer(reader, data), said)
+                said.flush()
+            finally:
+                os._exit(1)
+        code = os.waitstatus_to_exitcode(os.waitpid(process, 0)[1])
+        said.seek(0)
+        with suppress(EOFError):
+            return pickle.load(said)
+        return code, b"", b""
 
 
-def _hdf5_child(data: bytes, send: Any) -> None:
-    """What ``python -m aerpaw_cmp.logs.hdf5_arrays`` does, with a pipe for an answer."""
-    answer = io.BytesIO()
-    try:
-        np.savez(answer, allow_pickle=False, **hdf5_arrays._arrays(data))
-        send.send(answer.getvalue())
-    except Exception as error:  # as there
-        send.send(f"{type(error).__name__}: {error}")
+@cache
+def _native_reader(kind: str) -> native.Read:
+    return native.READERS[kind]()
 
 
 # --- one input -------------------------------------------------------------------------------------------------------
@@ -666,7 +659,10 @@ def one_input(target: Target, seed: int, index: int, *, bounded: bool = True) ->
 def _block(target: Target, seed: int, start: int, stop: int, place: mmap.mmap, send: Any) -> None:
     warnings.simplefilter("ignore")
     sys.stderr = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, PTH123 - native libraries talk there
-    hdf5_arrays.read = _hdf5_in_a_fork
+    native._in_child = _in_a_fork
+    for kind in native.READERS:
+        with suppress(ImportError):
+            _native_reader(kind)
     gc.freeze()
     counts = {"read": 0, "refused": 0, "violation": 0}
     violations: list[dict[str, Any]] = []

@@ -22,7 +22,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, BinaryIO
@@ -33,6 +33,8 @@ from .records import ReadResult, RejectedLine, RejectedReason, Stream
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from ..common.units import AnyArray
 
 FORMAT = "aerpaw-cmp flight"
 VERSION = 1
@@ -110,14 +112,12 @@ def _digest(book: BinaryIO, size: int) -> bytes:
     return digest.digest()
 
 
-def _refuse_changed(book: BinaryIO, path: str | Path) -> None:
+def _refuse_changed(content: bytes, path: str | Path) -> None:
     """InputError if the file ends with a seal that its content does not have."""
-    content = book.seek(0, os.SEEK_END) - len(_SEAL) - _DIGEST_BYTES
-    if content <= 0:
+    size = len(content) - len(_SEAL) - _DIGEST_BYTES
+    if size <= 0 or content[size:-_DIGEST_BYTES] != _SEAL:
         return
-    book.seek(content)
-    seal = book.read()
-    if seal.startswith(_SEAL) and seal[len(_SEAL) :] != _digest(book, content):
+    if hashlib.sha256(memoryview(content)[:size]).digest() != content[-_DIGEST_BYTES:]:
         raise InputError(
             "the flight file is damaged (its content does not have the SHA-256 written with it)",
             expected="the bytes that 'aerpaw-cmp ingest -o' wrote",
@@ -199,32 +199,29 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
     InputError
         If the file is missing, no flight file, of a newer version, or damaged.
     """
-    import h5py
+    from ..common import native
 
-    place = Path(path)
     try:
-        with place.open("rb") as probe:
-            magic = probe.read(len(_MAGIC))
-            if magic == _MAGIC:
-                _refuse_changed(probe, path)
+        content = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"cannot be read ({error.strerror or error})", expected="a flight file", path=path) from error
-    if magic != _MAGIC:
+    if not content.startswith(_MAGIC):
         raise InputError("no HDF5 file", expected="a flight file of 'aerpaw-cmp ingest -o'", path=path)
+    _refuse_changed(content, path)
     try:
-        with h5py.File(place, "r") as book:
-            form, version = book.attrs.get("format"), book.attrs.get("version")
-            if form != FORMAT:
-                raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
-            if version != VERSION:
-                raise InputError(
-                    f"flight file of version {version}", expected=f"version {VERSION}", cause="a newer tool", path=path
-                )
-            shelf = book["files"]
-            return [_read_file(shelf[name]) for name in sorted(shelf)]
-    except InputError:
-        raise
-    except Exception as error:  # h5py raises OSError, KeyError, RuntimeError, ... on damage, all meaning the same
+        items, notes = native.read("hdf5", content)
+    except InputError as error:
+        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from error
+    form, version = notes["attributes"].get("format"), notes["attributes"].get("version")
+    if form != FORMAT:
+        raise InputError("an HDF5 file of another kind", expected="a flight file", path=path)
+    if version != VERSION:
+        raise InputError(
+            f"flight file of version {version}", expected=f"version {VERSION}", cause="a newer tool", path=path
+        )
+    try:
+        return [_read_file(items, name) for name in _numbered(items, "files/")]
+    except (KeyError, ValueError, TypeError, IndexError, OverflowError) as error:
         raise InputError(
             f"the flight file is damaged ({type(error).__name__}: {error})",
             cause="a cut copy: ingest the logs again",
@@ -232,13 +229,18 @@ def read_flight(path: str | Path) -> list[IngestedFile]:
         ) from error
 
 
-def _read_file(group: Any) -> IngestedFile:
-    meta = _read_json(group, "meta")
-    rejected = tuple(RejectedLine(*entry) for entry in _read_json(group, "rejected"))
+def _numbered(items: Mapping[str, AnyArray], shelf: str) -> list[str]:
+    """Groups on a shelf, as paths that end with a slash."""
+    return sorted({shelf + name[len(shelf) :].split("/")[0] + "/" for name in items if name.startswith(shelf)})
+
+
+def _read_file(items: Mapping[str, AnyArray], group: str) -> IngestedFile:
+    meta = _read_json(items[f"{group}meta"])
+    rejected = tuple(RejectedLine(*entry) for entry in _read_json(items[f"{group}rejected"]))
     # files of version 0.3 hold every rejected line, and no reasons
-    reasons = tuple(RejectedReason(*entry) for entry in _read_json(group, "reasons")) if "reasons" in group else ()
-    shelf = group["streams"]
-    streams = tuple(_read_stream(shelf[name]) for name in sorted(shelf))
+    account = items.get(f"{group}reasons")
+    reasons = () if account is None else tuple(RejectedReason(*entry) for entry in _read_json(account))
+    streams = tuple(_read_stream(items, name) for name in _numbered(items, f"{group}streams/"))
     result = ReadResult(
         reader=meta["reader"],
         streams=streams,
@@ -252,28 +254,29 @@ def _read_file(group: Any) -> IngestedFile:
     return IngestedFile(meta["path"], meta["sha256"], result)
 
 
-def _read_stream(group: Any) -> Stream:
+def _read_stream(items: Mapping[str, AnyArray], group: str) -> Stream:
     import pandas as pd
 
-    meta = _read_json(group, "meta")
+    meta = _read_json(items[f"{group}meta"])
     columns = {
-        column["name"]: _read_column(group, f"C{i:05d}", column["type"]) for i, column in enumerate(meta["columns"])
+        column["name"]: _read_column(items, f"{group}C{i:05d}", column["type"])
+        for i, column in enumerate(meta["columns"])
     }
     return Stream(meta["kind"], meta["name"], pd.DataFrame(columns), meta["attributes"])
 
 
-def _read_column(group: Any, name: str, kind: str) -> Any:
+def _read_column(items: Mapping[str, AnyArray], name: str, kind: str) -> Any:
     import numpy as np
     import pandas as pd
 
-    values = group[name][()]
+    values = items[name]
     if kind == "time":
         return values.astype("datetime64[ns]")
     if kind != "text":
         return values
-    words = np.array([*_read_json(group, f"{name}.words"), None], dtype=object)
+    words = np.array([*_read_json(items[f"{name}.words"]), None], dtype=object)
     return pd.Series(words[values], dtype=object)
 
 
-def _read_json(group: Any, name: str) -> Any:
-    return json.loads(group[name][()].tobytes())
+def _read_json(content: AnyArray) -> Any:
+    return json.loads(content.tobytes())

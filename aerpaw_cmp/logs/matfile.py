@@ -24,6 +24,9 @@ MAGIC_73 = b"MATLAB 7.3 MAT-file"
 """First bytes of a version 7.3 file: HDF5 behind a block of 512 bytes."""
 MOST_BYTES = 1 << 30
 """Of one variable after decompression."""
+MOST_RATIO = 100
+FREE_BYTES = 1 << 28
+"""All compressed variables together unpack to at most so many bytes and ``MOST_RATIO`` times the file's size."""
 
 _COMPRESSED, _MATRIX, _INT8, _INT32, _UINT32 = 15, 14, 1, 5, 6
 _STORED = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
@@ -78,8 +81,10 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
     if order is None:
         raise _damaged("no byte order")
     found: dict[str, AnyArray] = {}
+    left = FREE_BYTES + MOST_RATIO * len(data)
     for element in _elements(data, 128, order, padded=False):
-        one = _inflated(element, order) if element.kind == _COMPRESSED else element
+        one = _inflated(element, order, min(left, MOST_BYTES)) if element.kind == _COMPRESSED else element
+        left -= len(one.body) if element.kind == _COMPRESSED else 0
         if one.kind != _MATRIX:
             raise _damaged(f"element of type {one.kind} where a variable was expected")
         name, array = _variable(one.body, order, wanted)
@@ -90,13 +95,18 @@ def read_arrays(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArr
 
 def _read_hdf5(data: bytes, wanted: Collection[str] | None) -> dict[str, AnyArray]:
     """The wanted variables of a version 7.3 file, read in a process of its own."""
-    from .hdf5_arrays import read
+    from ..common.native import read
 
-    try:
-        found = read(data)
-    except ValueError as error:
-        raise _damaged(f"HDF5: {error}") from None
-    return {name: values for name, values in found.items() if wanted is None or name in wanted}
+    variables, notes = read("matlab", data)
+    kept = {name: values.T for name, values in variables.items() if wanted is None or name in wanted}
+    text = {name for name, kind in notes["classes"].items() if kind == "char" and name in kept and kept[name].ndim == 2}
+    return {name: _letters(values) if name in text else values for name, values in kept.items()}
+
+
+def _letters(codes: AnyArray) -> AnyArray:
+    """Rows of a matrix of character codes as text, trailing blanks removed."""
+    rows = codes.astype(np.uint16).tolist()
+    return np.array(["".join(map(chr, row)).rstrip() for row in rows] or [""], dtype=np.str_)[: len(codes)]
 
 
 def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_Element]:
@@ -120,14 +130,18 @@ def _elements(data: bytes, at: int, order: str, *, padded: bool) -> Iterator[_El
         at += 8 + (-(-size // 8) * 8 if padded else size)
 
 
-def _inflated(element: _Element, order: str) -> _Element:
+def _inflated(element: _Element, order: str, most: int) -> _Element:
     machine = zlib.decompressobj()
     try:
-        plain = machine.decompress(element.body, MOST_BYTES)
+        plain = machine.decompress(element.body, max(most, 1))
     except zlib.error as error:
         raise _damaged(str(error)) from None
     if machine.unconsumed_tail:
-        raise InputError("a variable of the MATLAB file is too large", expected=f"at most {MOST_BYTES >> 20} MiB")
+        raise InputError(
+            f"the variables of the MATLAB file unpack to more than {most} bytes more",
+            expected=f"at most {MOST_BYTES >> 20} MiB each, in all {MOST_RATIO} times the file",
+            cause="a file made to fill the memory",
+        )
     if not machine.eof:
         raise _damaged("a compressed variable is cut")
     if len(plain) < 8:

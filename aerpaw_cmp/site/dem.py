@@ -6,7 +6,7 @@ stands on it and cuts lines of sight.
 
 from __future__ import annotations
 
-import warnings
+import importlib.util
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -266,37 +266,28 @@ def _plausible(height_m: FloatArray, path: Path, line: int | None = None) -> Flo
 
 
 def _read_geotiff(path: Path, frame: SiteFrame) -> Dem:
-    try:
-        import rasterio
-    except ImportError:
+    from ..common.native import read
+
+    if importlib.util.find_spec("rasterio") is None:
         raise UsageError(
             "a GeoTIFF needs rasterio", expected="pip install 'aerpaw-cmp[geo]', or an ASCII grid (.asc)", path=path
-        ) from None
+        )
     try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # our own message says it
-            with rasterio.open(path) as image:
-                if image.count != 1:
-                    raise InputError(
-                        f"{image.count} bands",
-                        expected="one band of heights",
-                        cause="a picture, not heights",
-                        path=path,
-                    )
-                band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
-                transform, crs, unit = image.transform, image.crs, str(image.units[0] or "").lower()
-    except rasterio.errors.RasterioError as error:
-        raise InputError(f"not a GeoTIFF ({error})", path=path) from None
-    if crs is None or transform.b or transform.d or transform.a <= 0 or transform.e >= 0:
+        arrays, notes = read("geotiff", read_bounded(path, MAX_BYTES))
+    except InputError as error:
+        raise InputError(error.found, expected=error.expected, cause=error.cause, path=path) from None
+    band, unit = arrays["band"], notes["unit"]
+    step_east, shear_east, west, shear_north, step_north, north = notes["transform"]
+    if notes["crs"] is None or shear_east or shear_north or step_east <= 0 or step_north >= 0:
         raise InputError("the GeoTIFF is not georeferenced north-up", cause="gdalwarp makes it so", path=path)
     if unit.startswith(("f", "us survey f")):
         raise InputError(
             f"heights in '{unit}'", expected="metres", cause="gdal_calc or gdal_translate converts", path=path
         )
     band = _plausible(band, path)
-    west = transform.c + transform.a / 2
-    south = transform.f + transform.e * (band.shape[0] - 0.5)
-    return _placed(path, Dem, band[::-1], west, south, transform.a, -transform.e, crs.to_string(), frame)
+    west += step_east / 2
+    south = north + step_north * (band.shape[0] - 0.5)
+    return _placed(path, Dem, band[::-1], west, south, step_east, -step_north, notes["crs"], frame)
 
 
 def _placed(path: Path, make: type[Dem], *arguments: Any) -> Dem:

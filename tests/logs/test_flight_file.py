@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import stat
+from collections.abc import Iterator
 from pathlib import Path
 
 import h5py
@@ -14,6 +15,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from aerpaw_cmp.common import native
 from aerpaw_cmp.common.errors import InputError, OutputError, UsageError
 from aerpaw_cmp.logs.flight_file import IngestedFile, read_flight, write_flight
 from aerpaw_cmp.logs.ingest import ingest
@@ -21,6 +23,17 @@ from aerpaw_cmp.logs.records import COLUMNS, ReadResult, RejectedLine, Stream
 from tests.frames import assert_same_frame
 from tests.parsers import samples
 from tests.parsers.samples import OPTIONS, SAMPLES
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _no_child() -> Iterator[None]:
+    """The reader without its process: that one is asked by test_native.py, and costs 0.3 s a file."""
+    reader = native.READERS["hdf5"]()
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(native, "_in_child", lambda _kind, data: native.answer(reader, data))
+        yield
+
 
 TEXT = st.text(st.characters(exclude_categories=("Cs",)), max_size=12)  # NUL included: torn logs have it
 FLOAT = st.floats(allow_nan=True, allow_infinity=True, width=64)

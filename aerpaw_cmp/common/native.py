@@ -1,0 +1,255 @@
+"""Strangers' files of native formats (HDF5, GeoTIFF), read in a child process that can open nothing.
+
+Libraries of these formats are C code that follows the file: to other files that it names (external storage and links,
+virtual data sets, VRT), into endless loops, and sometimes over the end of a buffer. The child gets the bytes of the
+file, loads its library, and then gives up the right to any further descriptor (RLIMIT_NOFILE 0: no file, socket or
+process pipe can be opened, by whatever code), to more than ``MOST_MEMORY`` and to more than ``SECONDS`` of processor
+time. Only then does it look at the bytes. What comes back is a list of plain arrays.
+
+Where there is no ``resource`` module (Windows) the limits do not hold; what a file may contain is checked all the same.
+"""
+
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from .errors import InputError, one_line
+from .units import AnyArray
+
+MOST_BYTES = 1 << 30
+"""Of all arrays of a file together."""
+MOST_RATIO = 200
+FREE_BYTES = 1 << 26
+"""A file may declare so many bytes, and ``MOST_RATIO`` times its own size: text compresses to a hundredth."""
+MOST_ITEMS = 100_000
+MOST_MEMORY = 4 << 30
+SECONDS = 60
+_REFUSED = 3
+_NAMES = {"hdf5": "HDF5", "matlab": "MATLAB 7.3", "geotiff": "GeoTIFF"}
+
+_CHILD = "import sys; sys.path[:] = sys.argv[2:]; from aerpaw_cmp.common.native import main; main(sys.argv[1])"
+
+
+def read(kind: str, data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+    """Arrays of a file, and what else is known of them.
+
+    Parameters
+    ----------
+    kind : str
+        ``hdf5`` (numeric data sets by their path; notes: ``attributes`` of the root, ``classes`` of MATLAB variables),
+        ``matlab`` (the same of the root group alone) or ``geotiff`` (``band``; notes: ``transform crs unit``).
+    data : bytes
+        The file.
+
+    Returns
+    -------
+    dict of str to ndarray, dict
+
+    Raises
+    ------
+    InputError
+        If it is damaged, declares too much, or holds something that lies in another file.
+    """
+    code, out, err = _in_child(kind, data)
+    if code == 0:
+        return _unpacked(out)
+    said = err.decode("utf-8", "replace").strip().splitlines()
+    if code == _REFUSED and said:
+        raise InputError(**json.loads(said[-1]))
+    reason = said[-1] if said else f"its library ended with code {code}"
+    raise InputError(f"no {_NAMES[kind]} file, or a damaged one ({reason})", cause="a cut download")
+
+
+def _in_child(kind: str, data: bytes) -> tuple[int, bytes, bytes]:
+    """Exit code, standard output and standard error of the child."""
+    # isolated, and with the paths of this process: the working folder may be a stranger's, with a numpy.py in it
+    command = [sys.executable, "-I", "-c", _CHILD, kind, *(path for path in sys.path if path)]
+    try:
+        child = subprocess.run(command, input=data, capture_output=True, timeout=2 * SECONDS, check=False, env=_ENVIRON)
+    except subprocess.TimeoutExpired:
+        raise InputError(f"the file cannot be read within {2 * SECONDS} s", cause="a damaged file") from None
+    return child.returncode, child.stdout, child.stderr
+
+
+_ENVIRON = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "GDAL_DISABLE_READDIR_ON_OPEN": "EMPTY_DIR"}
+"""All that the child sees of the environment: no HDF5_PLUGIN_PATH, no GDAL_DRIVER_PATH; threads cost memory limits."""
+
+
+def _unpacked(content: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+    with np.load(io.BytesIO(content), allow_pickle=False) as book:
+        head = json.loads(book["arr_0"].tobytes())
+        return {name: book[f"arr_{i}"] for i, name in enumerate(head["names"], 1)}, head["notes"]
+
+
+# --- the child --------------------------------------------------------------------------------------
+
+
+def main(kind: str) -> None:
+    """Read a file from standard input and write its arrays to standard output."""
+    reader = READERS[kind]()
+    data = sys.stdin.buffer.read()
+    give_up_rights()
+    code, out, err = answer(reader, data)
+    sys.stdout.buffer.write(out)
+    sys.stderr.buffer.write(err)
+    sys.exit(code)
+
+
+def answer(reader: Read, data: bytes) -> tuple[int, bytes, bytes]:
+    """Exit code, the arrays of a file for standard output, and why there are none for standard error."""
+    try:
+        arrays, notes = reader(data)
+    except InputError as error:
+        refusal = {"found": error.found, "expected": error.expected, "cause": error.cause}
+        return _REFUSED, b"", json.dumps(refusal).encode()
+    except Exception as error:  # libraries raise OSError, KeyError, RuntimeError, ... on damage, all meaning the same
+        return 1, b"", f"{type(error).__name__}: {one_line(str(error))}".encode()
+    head = json.dumps({"names": list(arrays), "notes": notes}).encode()
+    out = io.BytesIO()
+    # by position: as keywords, names such as 'file' and 'allow_pickle' would be savez's own
+    np.savez(out, np.frombuffer(head, dtype=np.uint8), *arrays.values())
+    return 0, out.getvalue(), b""
+
+
+def give_up_rights() -> None:
+    """From here on this process opens nothing, and gets little memory and time."""
+    try:
+        import resource
+    except ImportError:
+        return
+    limits = (("RLIMIT_NOFILE", 0), ("RLIMIT_AS", MOST_MEMORY), ("RLIMIT_CPU", SECONDS), ("RLIMIT_CORE", 0))
+    for name, most in limits:
+        resource.setrlimit(getattr(resource, name), (most, most))
+
+
+Read = Callable[[bytes], tuple[dict[str, AnyArray], dict[str, Any]]]
+
+
+def _hdf5(depth: int) -> Read:
+    """The reader of HDF5 files, with all loaded that it needs."""
+    import encodings.ascii
+    import encodings.latin_1
+    import encodings.utf_16  # noqa: F401  Python loads them when a text needs them
+
+    import h5py
+
+    def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+        with h5py.File(h5py.h5f.open_file_image(data)) as book:
+            items = _Items(book, depth)
+            most = min(MOST_BYTES, MOST_RATIO * len(data) + FREE_BYTES)
+            total = sum(item.nbytes for item in items.data_sets.values())
+            if total > most:
+                raise InputError(
+                    f"the file of {len(data)} bytes declares {total} bytes of data",
+                    expected=f"at most {most}",
+                    cause="a file made to fill the memory",
+                )
+            classes = {name: _text(item.attrs.get("MATLAB_class", b"")) for name, item in items.data_sets.items()}
+            attributes = {name: _text(value) for name, value in book.attrs.items() if np.ndim(value) == 0}
+            notes = {"attributes": attributes, "classes": {name: word for name, word in classes.items() if word}}
+            return {name: np.asarray(item[()]) for name, item in items.data_sets.items()}, notes
+
+    with h5py.File("warm", "w", driver="core", backing_store=False) as book:
+        book.create_dataset("x", data=np.arange(300.0), compression="gzip", shuffle=True)
+        book["y"] = np.ones(3, dtype=np.bool_)
+        for name, value in (("version", 1), ("text", "a"), ("MATLAB_class", np.bytes_(b"double"))):
+            book["x"].attrs[name] = book.attrs[name] = value
+        book.flush()
+        read(book.id.get_file_image())  # loads what h5py and NumPy load late: later they cannot
+    np.savez(io.BytesIO(), np.zeros(1))
+    return read
+
+
+def _text(value: Any) -> str | int:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace")
+    return int(value) if isinstance(value, (int, np.integer)) else str(value)
+
+
+class _Items:
+    """Numeric data sets below a group by their path, none of which lies outside of the file."""
+
+    def __init__(self, book: Any, depth: int) -> None:
+        import h5py
+
+        self._h5py = h5py
+        self._seen: set[Any] = set()
+        self.data_sets: dict[str, Any] = {}
+        self._walk(book, "", depth)
+
+    def _walk(self, group: Any, path: str, depth: int) -> None:
+        h5py = self._h5py
+        for name in group:
+            place = f"{path}{name}"
+            link = group.get(name, getlink=True)
+            if not isinstance(link, h5py.HardLink):
+                raise _lies_elsewhere(f"{place!r} is a link, not data")
+            item = group[name]
+            if len(self._seen) > MOST_ITEMS:
+                raise InputError(f"the file has more than {MOST_ITEMS} items", expected="a log", cause="no log")
+            address = h5py.h5o.get_info(item.id).addr
+            if address in self._seen:
+                continue  # a second name, or a circle
+            self._seen.add(address)
+            if isinstance(item, h5py.Group) and depth > 1:
+                self._walk(item, f"{place}/", depth - 1)
+            elif isinstance(item, h5py.Dataset):
+                self._take(place, item)
+
+    def _take(self, place: str, item: Any) -> None:
+        if item.is_virtual or item.external:
+            raise _lies_elsewhere(f"the data of {place!r} lie in other files")
+        if item.dtype.kind in "fiub":
+            self.data_sets[place] = item
+
+
+def _lies_elsewhere(found: str) -> InputError:
+    return InputError(
+        found,
+        expected="a file that holds its own data",
+        cause="a file made to read other files of this machine, or a set in several files: make it one (h5repack)",
+    )
+
+
+def _geotiff() -> Read:
+    """The reader of GeoTIFF files, with all loaded that it needs."""
+    import warnings
+
+    import rasterio
+    from rasterio.io import MemoryFile
+
+    warnings.simplefilter("ignore", rasterio.errors.NotGeoreferencedWarning)  # the caller's message says it
+
+    def read(data: bytes) -> tuple[dict[str, AnyArray], dict[str, Any]]:
+        # by its driver: GDAL takes a text that begins with <VRTDataset> for a list of other files
+        with MemoryFile(data) as file, file.open(driver="GTiff") as image:
+            if image.count != 1:
+                raise InputError(f"{image.count} bands", expected="one band of heights", cause="a picture, not heights")
+            if image.width * image.height * 8 > MOST_BYTES:
+                raise InputError(
+                    f"{image.width} x {image.height} cells", expected=f"at most {MOST_BYTES >> 23} million cells"
+                )
+            band = image.read(1, masked=True).astype(np.float64).filled(np.nan)
+            crs = None if image.crs is None else image.crs.to_string()
+            transform = list(image.transform)[:6]
+            return {"band": band}, {"transform": transform, "crs": crs, "unit": str(image.units[0] or "").lower()}
+
+    with MemoryFile() as file:
+        with file.open(driver="GTiff", width=2, height=2, count=1, dtype="float32", crs="EPSG:32617") as image:
+            image.write(np.ones((1, 2, 2), dtype=np.float32))
+        read(file.read())  # opens the data base of coordinate systems, and loads what is loaded late
+    return read
+
+
+READERS: dict[str, Callable[[], Read]] = {
+    "hdf5": lambda: _hdf5(32),
+    "matlab": lambda: _hdf5(1),
+    "geotiff": _geotiff,
+}

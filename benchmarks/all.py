@@ -73,6 +73,7 @@ SMALLEST: dict[str, list[str]] = {
     "clock_verdict": ["--flights", "1"],
     "compare": ["--quick"],
     "coverage_of_intervals": ["--flights", "20", "--replicates", "100"],
+    "drafts": ["sample_logs"],
     "estimate": [],
     "exports": ["--samples", "20000"],
     "fabricated": [],

@@ -493,10 +493,10 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
         if known == 0:
             why = (
                 "no log holds telemetry"
-                if pose is None
+                if pose is None or data.track is None
                 else "the telemetry holds no attitude: level flight along the course stands in"
                 if pose.valid.any()
-                else "the telemetry covers none of its instants (relative times want 'time_origin')"
+                else data.track.why_not(pose)
             )
             messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():

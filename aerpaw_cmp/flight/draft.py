@@ -15,10 +15,11 @@ import yaml
 
 from ..common.errors import UsageError, one_line
 from ..common.yamlfile import parse_yaml
-from ..logs.ingest import IngestedFile
+from ..logs.ingest import IngestedFile, read_log
 from ..logs.records import Stream, has_wall_clock
 from ..site.siteyaml import load_site
 from .data import is_ratio
+from .dry_run import DryRun, dry_run
 from .grouping import flights
 from .heights import height_in_name, lacks_height
 from .node import (
@@ -44,11 +45,6 @@ LINK = (
 )
 NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
-LATER = "report: {audit: later}  # 'aerpaw-cmp audit' then fills in what costs more than so short a report\n"
-
-AUDIT_NOW_FROM = 50_000
-"""With so many samples a report costs more than its audit, which does not grow with the flight."""
-
 
 SITE = "lake_wheeler"
 
@@ -89,6 +85,7 @@ def draft(
     flown = _flown(files)
     entries = _Entries(
         folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}),
+        positioned=any(_has_positions(s) for file in files for s in file.result.streams),
         placer=_placer(files, flown), locks=may_lose_lock(s for file in files for s in file.result.streams),
     )  # fmt: skip
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
@@ -113,11 +110,26 @@ def draft(
     parts += [LINK] if "rss" in entries.kinds else []
     parts += [RANK] if "rank" in entries.kinds else []
     parts += _settings(entries)
-    parts += [LATER] if entries.samples < AUDIT_NOW_FROM else []
     text = "".join(parts)
-    parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    proof = _proof(text, folder, {file.path: file for file in files}, list(entries.lines))
+    if proof.reason:
+        text = text.replace(HEAD, f"{HEAD}# No sample of this draft can be compared: {proof.reason}.\n", 1)
     asked = [f"check: {line.lstrip(' #-')}" for line in text.splitlines()[1:] if line.endswith("?")]
-    return text, asked + [f"left out: {remark}" for remark in entries.out]
+    proved = [f"no sample of this draft can be compared: {proof.reason}"]
+    if not proof.reason:
+        proved = [f"{proof.samples} samples can be compared", *proof.lost]
+    return text, proved + asked + [f"left out: {remark}" for remark in entries.out]
+
+
+def _proof(text: str, folder: Path, files: Mapping[str, IngestedFile], paths: Sequence[str]) -> DryRun:
+    """What a report of the draft would score; logs whose times the draft moves are read again."""
+    settings = parse_yaml(text, FlightFile)  # a draft that its own reader refuses is a fault of ours
+    read = []
+    for log, path in zip(settings.logs, paths, strict=True):
+        moved = log.time_origin is not None and any("clock" in s.attributes for s in files[path].result.streams)
+        again = read_log(folder, log.path, log.options(settings.timezone), reader=log.reader) if moved else files[path]
+        read.append(again)
+    return dry_run(settings, folder, read)
 
 
 @dataclass(frozen=True, slots=True)
@@ -284,8 +296,8 @@ class _Entries:
     """By tower, kind and channel: when, and from which log."""
     contents: dict[str, str] = field(default_factory=dict)
     """Path by SHA-256."""
-    samples: int = 0
-    """Of RSS and rank, in all logs."""
+    positioned: bool = False
+    """Some log to compare has positions of its own."""
     placer: Placer | None = None
     locks: bool = False
     """The receiver is a sounder that loses its lock."""
@@ -364,7 +376,6 @@ class _Entries:
         if self.placer is not None:
             self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
         self.kinds |= {s.kind for s in kept}
-        self.samples += sum(len(s.frame) for s in kept if s.kind in ("rss", "rank"))
         self.without_track |= self.flown is None and not all(_has_positions(s) for s in kept)
 
     def _place(self, entry: dict[str, Any], asked: str, levels: Sequence[Stream], placer: Placer) -> str:
@@ -440,6 +451,8 @@ class _Entries:
             if relative and has_wall_clock(self.flown[1][0]):
                 return "the track is that of other telemetry"
             return "the track is that of other telemetry" if _meet(span, self.flown[1]) else _late(span, self.flown[1])
+        if self.flown is None and self.positioned and not _has_positions(stream):
+            return "it has no positions, and no telemetry is here"
         beside = self.flown is not None and not has_wall_clock(self.flown[1][0])  # the track counts as the log does
         if relative and not (dated or beside or _has_positions(stream)):
             return "its times are relative; read it again with --time-origin"

@@ -331,6 +331,16 @@ class Track:
         names = [one.name for one in dataclasses.fields(TrackPoses)]
         return TrackPoses(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
+    def why_not(self, pose: TrackPoses) -> str:
+        """Reason for most of the instants that have no pose."""
+        reason = REASONS[int(np.bincount(pose.reason_code[~pose.valid], minlength=len(REASONS)).argmax())]
+        if reason != "telemetry gap":
+            return f"its samples have no position: {reason}" if reason else "it has no samples"
+        return (
+            f"the telemetry has a fix every {np.median(np.diff(self._time_s)):.0f} s; gaps above "
+            f"{self.maximum_gap_s:g} s (rt.maximum_gap_s) are not interpolated"
+        )
+
     def _pose_at(self, instant: AnyArray) -> TrackPoses:
         """Poses at instants (n,) [ns since 1970]."""
         timed = instant != NO_TIME

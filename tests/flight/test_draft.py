@@ -6,6 +6,7 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from aerpaw_cmp.__main__ import main
@@ -141,9 +142,9 @@ def test_relative_ranks_with_positions_need_no_origin(logs: Path) -> None:
     (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
     frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
     nemo.write_bytes(format_nemo_csv(frame, "2025-06-01T14:00:00Z"))
-    text, remarks = draft(ingest(nemo), logs)
+    text, _ = draft(ingest(nemo), logs)
     assert "time_origin" not in text
-    assert not any("telemetry" in remark for remark in remarks)  # its positions are its own
+    assert "no telemetry here" not in text  # its positions are its own
     origin = "2025-06-01T14:00:00Z"
     text, _ = draft(ingest(nemo, options=ReadOptions(time_origin=origin)), logs, time_origin=origin)
     (logs / "flight.yaml").write_text(text)
@@ -172,6 +173,59 @@ def test_a_ratio_is_kept_where_nothing_else_is(logs: Path) -> None:
     text, remarks = draft(files, logs, timezone=ZONE)
     assert "LW1/x_quality_log.txt" in text
     assert any(r.endswith("a ratio to the noise as a level?") for r in remarks)
+
+
+def test_sparse_telemetry_is_named_as_the_reason_why_nothing_is_compared(
+    logs: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    telemetry = next(logs.glob("UAV/*vehicleOut.txt"))
+    rows = telemetry.read_text().splitlines(keepends=True)
+    step_s = 14
+    per_s = round((len(rows) - 1) / float(np.ptp([_seconds(row) for row in (rows[1], rows[-2])])))
+    thin = [row.replace(".000000,", ".313000,") for row in rows[:: step_s * per_s]]  # and no sample is at a fix
+    telemetry.write_text("".join(thin))
+    target = logs.parent / "flight.yaml"
+    call = ["ingest", str(telemetry), str(logs / "LW1"), "--timezone", ZONE, "--draft", str(target)]
+    assert main(call) == 0
+    said = capsys.readouterr().err
+    assert "no sample of this draft can be compared" in said
+    assert "the telemetry has a fix every 14 s" in said
+    assert "time_origin" not in said
+    assert "No sample of this draft can be compared" in target.read_text()
+
+
+def _seconds(row: str) -> float:
+    hours, minutes, seconds = (float(part) for part in row.split(",")[-3].split(" ")[-1].split(":"))
+    return 3600.0 * hours + 60.0 * minutes + seconds
+
+
+def test_a_draft_says_how_many_samples_it_compares(logs: Path) -> None:
+    text, remarks = draft(ingest(logs, options=OPTIONS), logs, timezone=ZONE)
+    (counted,) = (remark for remark in remarks if remark.endswith("can be compared"))
+    settings = parse_yaml(text, FlightFile)
+    data = gather(settings, logs, read_logs(settings, logs))
+    low = settings.rss.minimum_height_m or 0.0
+    by_hand = 0
+    for series in [*data.rss, *data.rank]:
+        pose = data.poses_at(series.time)
+        value = series.measured_db if hasattr(series, "measured_db") else series.rank
+        by_hand += sum(
+            bool(ok and height >= low and np.isfinite(v))
+            for ok, height, v in zip(pose.valid, pose.position_m[:, 2], value, strict=True)
+        )
+    assert by_hand > 5000
+    assert counted == f"{by_hand} samples can be compared"
+
+
+def test_levels_without_positions_do_not_spoil_ranks_that_have_them(logs: Path) -> None:
+    (rank,) = ingest(logs / "UAV/modem_ri.csv", options=OPTIONS)
+    frame = rank.result.streams[0].frame.assign(rsrp_dbm=-80.0, cqi=9.0)
+    (logs / "nemo.csv").write_bytes(format_nemo_csv(frame, "2025-06-01T14:00:00Z"))
+    files = [*ingest(logs / "nemo.csv"), *ingest(logs / "LW1", options=OPTIONS)]
+    text, remarks = draft(files, logs, timezone=ZONE)
+    assert [log.path for log in parse_yaml(text, FlightFile).logs] == ["nemo.csv"]
+    assert any(remark.endswith("samples can be compared") and not remark.startswith("0") for remark in remarks)
+    assert any("USRP1_power_log.txt: it has no positions, and no telemetry is here" in remark for remark in remarks)
 
 
 def test_nothing_to_compare_is_said(logs: Path) -> None:

@@ -52,7 +52,7 @@ def run(samples: int, towers: int, replicates: int) -> dict[str, float]:
             measured, simulated = levels(route, tower, rng)
             baselines = {"free_space": simulated + 1, "two_ray": simulated + rng.normal(size=samples)}
             begin = time.perf_counter()
-            found = compare_rss(route["time"], measured, simulated, baselines=baselines, replicates=replicates)
+            found = compare_rss(route["time"], measured, simulated, baselines=baselines)
             spent["rss_s"] += time.perf_counter() - begin
             begin = time.perf_counter()
             grid_offset(measured, simulated)

@@ -107,7 +107,7 @@ def bootstrap(series: int) -> None:
                 4.0 * lfilter([np.sqrt(1 - keep**2)], [1, -keep], random.standard_normal(3000 + 10 * tau))[10 * tau :]
             )
             begin = time.process_time()
-            low, high = error_intervals(error, np.zeros(3000), replicates=400).rmse_db
+            low, high = error_intervals(error, np.zeros(3000)).rmse_db
             ours_ms += 1e3 * (time.process_time() - begin) / series
             given, inside = given + bool(np.isfinite(low)), inside + bool(low <= 4.0 <= high)
             if arch is None:

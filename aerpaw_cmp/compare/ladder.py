@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray
-from .statistics import NO_INTERVAL, REPLICATES, Interval, PairedDifference, paired_difference
+from .statistics import NO_INTERVAL, Interval, PairedDifference, paired_difference
 
 BLOCKS = 8
 """Places or stretches that a flight is cut into."""
@@ -131,7 +131,7 @@ def _halves(cell: IntArray, position_m: FloatArray) -> tuple[IntArray, IntArray]
 
 def climb(
     measured_db: Sequence[FloatArray], time_s: Sequence[FloatArray], rungs: Sequence[Rung], *, blocks: int = BLOCKS,
-    position_m: Sequence[FloatArray] | None = None, replicates: int = REPLICATES,
+    position_m: Sequence[FloatArray] | None = None,
 ) -> Ladder:  # fmt: skip
     """Score the rungs of a ladder, given from the simplest to the most complex model.
 
@@ -147,8 +147,6 @@ def climb(
         Places or stretches, of equally many samples.
     position_m : sequence of (n, 3), optional
         Where each sample was taken: places are left out (:func:`places_of`). Without, stretches of time.
-    replicates : int
-        Of the paired differences.
 
     Returns
     -------
@@ -176,19 +174,19 @@ def climb(
     replays = [i for i, rung in enumerate(rungs) if rung.regressor_db is None and np.isfinite(rmse[i])]
     chosen = recommended = min(replays, key=lambda i: rmse[i], default=None)
     if chosen is not None:
-        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen], replicates))
+        recommended = next(i for i in replays if i == chosen or _as_good(joined[i], joined[chosen]))
     return Ladder(
         rungs=tuple(rungs), error_db=errors, rmse_db=rmse, best=int(np.nanargmin(rmse)), best_replay=chosen,
         recommended=recommended,
     )  # fmt: skip
 
 
-def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]], *, replicates: int = REPLICATES) -> list[LadderRow]:
+def ladder_rows(ladder: Ladder, names: Sequence[tuple[str, str]]) -> list[LadderRow]:
     """The ladder per tower and channel; ``names`` are (tower, channel) of each series."""
-    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name, replicates=replicates)]
+    return [row for i, name in enumerate(names) for row in series_rows(ladder, i, name)]
 
 
-def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicates: int = REPLICATES) -> list[LadderRow]:
+def series_rows(ladder: Ladder, series: int, name: tuple[str, str]) -> list[LadderRow]:
     """The rows of one series.
 
     Parameters
@@ -197,8 +195,6 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicate
     series : int
         Which of the series of its rungs.
     name : (tower, channel)
-    replicates : int
-        Of the paired differences.
 
     Returns
     -------
@@ -208,9 +204,7 @@ def series_rows(ladder: Ladder, series: int, name: tuple[str, str], *, replicate
     rows = []
     for index, rung in enumerate(ladder.rungs):
         error = ladder.error_db[index][series]
-        against_best = (
-            None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series], replicates)
-        )
+        against_best = None if ladder.best is None else compared(error, ladder.error_db[ladder.best][series])
         rows.append(
             LadderRow(
                 model=rung.model,
@@ -331,13 +325,13 @@ def log_distance_level_db(
     return level
 
 
-def compared(error_db: FloatArray, best_db: FloatArray, replicates: int = REPLICATES) -> PairedDifference:
+def compared(error_db: FloatArray, best_db: FloatArray) -> PairedDifference:
     """A model against the best one; errors of stretches left out count as they are."""
-    return paired_difference(error_db, best_db, free_offset=False, replicates=max(replicates, 2))
+    return paired_difference(error_db, best_db, free_offset=False)
 
 
-def _as_good(error: FloatArray, best: FloatArray, replicates: int) -> bool:
-    against_best = compared(error, best, replicates)
+def _as_good(error: FloatArray, best: FloatArray) -> bool:
+    against_best = compared(error, best)
     return bool(against_best.difference_db <= against_best.standard_error_db)
 
 

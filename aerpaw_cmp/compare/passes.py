@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray, IntArray, wrap_degrees
-from .statistics import NO_INTERVAL, Interval, autocorrelation, block_variance, correlation, of_spread
+from .statistics import Interval, correlation, spread_interval
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -73,47 +73,6 @@ class PassPair:
     place_correlation: float
     cells: int
     height_difference_m: float
-
-
-def spread_interval(difference_db: FloatArray) -> Interval:
-    """95 % interval of the standard deviation of differences in time order.
-
-    Parameters
-    ----------
-    difference_db : ndarray, (n,)
-        Without NaN [dB].
-
-    Returns
-    -------
-    (low, high)
-        NaN where the samples are worth too few independent ones.
-
-    Notes
-    -----
-    What the circular block bootstrap of :func:`~aerpaw_cmp.compare.statistics.error_intervals` tends to with ever
-    more replicates, without drawing any: a resample is a sum of independent blocks, so the variances of the mean m
-    and of the mean square s are (b Var(S_L) + Var(S_l)) / n^2, with S_L the sums of blocks of length L from every
-    start, b of them, and one of the length l that is left. To second order,
-
-        log rmse = (log(s - m^2)) / 2 = (log s0 + (s - s0) / s0 - (s - s0)^2 / (2 s0^2) - m^2 / s0) / 2.
-    """
-    if len(difference_db) < 2:
-        return NO_INTERVAL
-    d = difference_db - difference_db.mean()
-    squared = d * d
-    mean_square = float(squared.mean())
-    if not mean_square > 0:
-        return NO_INTERVAL
-    known = of_spread(autocorrelation(d), autocorrelation(squared))
-    if not known.enough:
-        return NO_INTERVAL
-    of_mean, of_square = (block_variance(x, known.block_length) for x in (d, squared))
-    bias = -0.5 * (of_mean / mean_square + 0.5 * of_square / mean_square**2)
-    reach = known.half_width * 0.5 * float(np.sqrt(of_square)) / mean_square
-    value = 0.5 * float(np.log(mean_square))
-    low, high = (float(np.exp(value - bias + sign * reach)) for sign in (-1.0, 1.0))
-    rmse = float(np.sqrt(mean_square))
-    return min(low, rmse), max(high, rmse)
 
 
 # --- every pair -----------------------------------------------------------------------------------------------------

@@ -22,8 +22,8 @@ from .statistics import (
     autocorrelation,
     bootstrap_means,
     interval,
+    mean_interval,
     paired_difference,
-    paired_verdict,
 )
 
 
@@ -117,7 +117,6 @@ def level_difference(
     *,
     scored: tuple[int, int],
     offsets_db: tuple[float, float],
-    replicates: int = REPLICATES,
 ) -> LevelDifference:
     """Compare one link.
 
@@ -131,8 +130,6 @@ def level_difference(
         Samples with a residual in each whole report.
     offsets_db : (float, float)
         Fitted offset of each [dB].
-    replicates : int
-        Of the bootstrap.
 
     Returns
     -------
@@ -151,8 +148,8 @@ def level_difference(
         simulated_max_db=_largest(moved),
         simulated_rms_db=float(np.sqrt(np.mean(moved**2))) if len(moved) else float("nan"),
         offset_db=_changed(*offsets_db),
-        rmse=paired_difference(second_error, first_error, replicates=replicates),
-        mae_db=mae_difference(first_error, second_error, replicates=replicates),
+        rmse=paired_difference(second_error, first_error),
+        mae_db=mae_difference(first_error, second_error),
     )
 
 
@@ -170,17 +167,13 @@ def _changed(first: float, second: float) -> Changed:
     return Changed(first=first, second=second, difference=second - first)
 
 
-def mae_difference(
-    error_db: FloatArray, other_db: FloatArray, *, replicates: int = REPLICATES, seed: int = SEED
-) -> Changed:
-    """Difference of the mean absolute errors about each one's mean, with a 95 % interval by block bootstrap.
+def mae_difference(error_db: FloatArray, other_db: FloatArray) -> Changed:
+    """Difference of the mean absolute errors about each one's mean, with a 95 % interval.
 
     Parameters
     ----------
     error_db, other_db : (n,)
         Errors of the first and of the second model on the same samples in time order, without NaN [dB].
-    replicates, seed : int
-        Of the bootstrap.
 
     Returns
     -------
@@ -199,61 +192,31 @@ def mae_difference(
     first, second = np.abs(error_db - error_db.mean()), np.abs(other_db - other_db.mean())
     loss = second - first
     estimate = float(loss.mean())
-    known = autocorrelation(loss)
-    drawn = bootstrap_means(loss[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
-    bounds = interval(estimate, drawn, known)
+    bounds = mean_interval(loss)
     return Changed(first=float(first.mean()), second=float(second.mean()), difference=estimate, ci95=bounds)
 
 
-def pooled_difference(
-    links: Sequence[tuple[FloatArray, FloatArray, FloatArray]], *, replicates: int = REPLICATES, seed: int = SEED
-) -> PairedDifference:
+def pooled_difference(links: Sequence[tuple[FloatArray, FloatArray, FloatArray]]) -> PairedDifference:
     """RMSE of the second report against the first over all links, each link about its own offset.
 
     Parameters
     ----------
     links : sequence of three (n,)
         Instants [s] of the common samples of a link, and the residuals of both reports there [dB]; NaN takes no part.
-    replicates, seed : int
-        Of the bootstrap.
 
     Notes
     -----
-    What a sample adds to the difference of the mean squares is its own difference less the mean of its link. These are
-    put in order of time over all links, so that blocks hold what the links share at an instant.
+    Samples are put in order of time over all links, so that what the links share at an instant stands together.
     """
-    time, errors, other_errors, added = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
+    time, errors, other_errors = [np.zeros(0)], [np.zeros(0)], [np.zeros(0)]
     for instants, first, second in links:
         both = np.isfinite(first) & np.isfinite(second)
         if both.any():
-            a, b = first[both] - first[both].mean(), second[both] - second[both].mean()
-            loss = b * b - a * a
             time.append(instants[both])
-            errors.append(a)
-            other_errors.append(b)
-            added.append(loss - loss.mean())
-    a, b = np.concatenate(errors), np.concatenate(other_errors)
-    if not len(a):
-        return paired_difference(b, a)
-    influence = np.concatenate(added)[np.argsort(np.concatenate(time), kind="stable")]
-    known = autocorrelation(influence)
-    estimate = float(np.mean(b * b - a * a))
-    drawn = estimate + bootstrap_means(influence[:, None], known.block_length, replicates=replicates, seed=seed)[:, 0]
-    low, high = interval(estimate, drawn, known)
-    rmse, other = float(np.sqrt(np.mean(b * b))), float(np.sqrt(np.mean(a * a)))
-    scale = 1.0 / (rmse + other) if rmse + other > 0 else 0.0
-    return PairedDifference(
-        n=len(a),
-        rmse_db=rmse,
-        other_rmse_db=other,
-        difference_db=rmse - other,
-        difference_ci95_db=(low * scale, high * scale),
-        standard_error_db=(high - low) / (2 * 1.959964) * scale,
-        mean_square_difference_db2=estimate,
-        mean_square_ci95_db2=(low, high),
-        n_effective=known.n_effective,
-        verdict=paired_verdict(low, high),
-    )
+            errors.append(first[both] - first[both].mean())
+            other_errors.append(second[both] - second[both].mean())
+    order = np.argsort(np.concatenate(time), kind="stable")
+    return paired_difference(np.concatenate(other_errors)[order], np.concatenate(errors)[order], free_offset=False)
 
 
 def rank_difference(

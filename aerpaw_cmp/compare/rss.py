@@ -18,8 +18,6 @@ from ..common.units import FloatArray, IntArray, db_from_power, power_from_db
 from .offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
 from .statistics import (
     NO_INTERVAL,
-    REPLICATES,
-    SEED,
     ErrorIntervals,
     Interval,
     autocorrelation,
@@ -148,8 +146,6 @@ def compare_rss(
     fitted_on_scored: Sequence[str] = (),
     step_db: float = STEP_DB,
     span_db: tuple[float, float] = SPAN_DB,
-    replicates: int = REPLICATES,
-    seed: int = SEED,
 ) -> RssComparison:
     """Compare a measured with a simulated sequence of levels.
 
@@ -173,8 +169,6 @@ def compare_rss(
         What else was fitted on these samples (``"lag_s"``, ``"mount_yaw_deg"``).
     step_db, span_db : float, (float, float)
         Offset search.
-    replicates, seed : int
-        Bootstrap.
 
     Returns
     -------
@@ -207,13 +201,13 @@ def compare_rss(
         n_no_pose=int((~known).sum()),
         at_edge=fit.at_edge,
         correlation=correlation(m, s),
-        intervals=error_intervals(m, s, replicates=replicates, seed=seed),
+        intervals=error_intervals(m, s),
         identifiable_db=identifiable_range(offsets, curve),
         trimmed=trimmed_offset(m, s, step_db=step_db, span_db=span_db),
         baselines={
             name: grid_offset(m, level[order], step_db=step_db, span_db=span_db) for name, level in simple.items()
         },
-        baseline_intervals={name: _rmse_interval(m, level[order], replicates, seed) for name, level in simple.items()},
+        baseline_intervals={name: _rmse_interval(m, level[order]) for name, level in simple.items()},
         lag_s=lag_s,
         fitted_on_scored=(() if offset_db is not None else ("offset_db",)) + tuple(fitted_on_scored),
         residual_db=np.where(use, measured + fit.offset_db - simulated, np.nan),
@@ -250,9 +244,9 @@ def _fixed(measured: FloatArray, simulated: FloatArray, offset_db: float) -> Off
     return OffsetFit(float(offset_db), rmse, len(residual), False)
 
 
-def _rmse_interval(measured: FloatArray, simulated: FloatArray, replicates: int, seed: int) -> Interval:
+def _rmse_interval(measured: FloatArray, simulated: FloatArray) -> Interval:
     ok = np.isfinite(simulated)
-    return error_intervals(measured[ok], simulated[ok], replicates=replicates, seed=seed).rmse_db
+    return error_intervals(measured[ok], simulated[ok]).rmse_db
 
 
 # --- both sides averaged over the same window ----------------------------------------------------------------------

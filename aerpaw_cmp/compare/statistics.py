@@ -1,15 +1,13 @@
 """Uncertainty of numbers that come from neighbouring samples of one flight.
 
-Samples a tenth of a second apart repeat each other, so every interval here rests on blocks: the flight is cut
-into blocks as long as the residual remembers (Politis and White), blocks are drawn with replacement, and the
-spread of the statistic over the draws, corrected for the finite number of blocks, gives the interval.
-
-All statistics of this module are functions of column means, which block sums give without touching samples again.
+Samples a tenth of a second apart repeat each other. Intervals of errors of levels (offset, RMSE, correlation, two
+models in pairs) integrate over how long they do (:mod:`.memory`). Those of ranks rest on blocks: the flight is cut
+into blocks as long as the sequence remembers (Politis and White), blocks are drawn with replacement, and the spread of
+the statistic over the draws, corrected for the finite number of blocks, gives the interval.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, Literal
@@ -18,6 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from ..common.units import FloatArray, IntArray, wrap_degrees
+from .memory import FEWEST, mean_draws, power_draws
 
 REPLICATES = 1000
 """Bootstrap replicates."""
@@ -32,11 +31,9 @@ _LONGER = 2.0
 FEWEST_INDEPENDENT = 10.0
 """Fewer independent samples than this give no interval: how long such a sequence remembers cannot be told from it."""
 
-_UNSURE_OF_SPREAD = 6.0
-"""As :attr:`Autocorrelation.unsure`, for an RMSE or a correlation: squares are skewed."""
-
-_FEWEST_OF_PAIR = 5.0
-"""The errors of two models must each be worth this many independent samples before they are compared."""
+_UNSURE = 3.0
+"""The variance is widened by this over the independent samples, for what the estimate of the memory leaves open (chosen
+on simulated flights)."""
 
 _HELD = 1 << 21
 """Numbers held at once per bootstrap: bounds memory to tens of MiB."""
@@ -78,16 +75,12 @@ class Autocorrelation:
         Independent samples that would fix the mean equally well, 1 to ``n``; NaN below two samples.
     variance_factor : float
         What the variance of a block bootstrap of that length must be multiplied with (first-order bias).
-    unsure : float
-        The variance is widened by this over ``n_effective``, for what its estimate leaves open (chosen on simulated
-        flights: benchmarks/coverage_of_intervals.py).
     """
 
     n: int
     block_length: int
     n_effective: float
     variance_factor: float
-    unsure: float = 3.0
 
     @property
     def blocks(self) -> float:
@@ -103,7 +96,7 @@ class Autocorrelation:
         from scipy.special import stdtrit  # scipy.stats would load for 0.2 s what one quantile needs
 
         blocks = max(self.blocks, 2.0)
-        unsure = 1.0 + self.unsure / self.n_effective if self.n_effective > 0 else 1.0
+        unsure = 1.0 + _UNSURE / self.n_effective if self.n_effective > 0 else 1.0
         return float(stdtrit(blocks - 1.0, 0.975) * np.sqrt(unsure * self.variance_factor * blocks / (blocks - 1.0)))
 
     @property
@@ -365,8 +358,8 @@ class ErrorIntervals:
     Parameters
     ----------
     offset_db, rmse_db, correlation : (low, high)
-        NaN ("none given") where the samples are worth fewer than :data:`FEWEST_INDEPENDENT` independent ones, or
-        where the statistic does not exist.
+        NaN ("none given") of fewer than :data:`~aerpaw_cmp.compare.memory.FEWEST` samples, or where the statistic does
+        not exist.
     autocorrelation : Autocorrelation
         Of the residual.
     """
@@ -377,89 +370,64 @@ class ErrorIntervals:
     autocorrelation: Autocorrelation
 
 
-def error_intervals(
-    measured_db: FloatArray, simulated_db: FloatArray, *, replicates: int = REPLICATES, seed: int = SEED
-) -> ErrorIntervals:
-    """Intervals of offset (mean difference), RMSE about it and correlation, by block bootstrap.
+def error_intervals(measured_db: FloatArray, simulated_db: FloatArray) -> ErrorIntervals:
+    """Intervals of offset (mean difference), RMSE about it and correlation of the process behind a flight.
 
     Parameters
     ----------
     measured_db, simulated_db : (n,)
         Pairs in time order, without NaN [dB].
-    replicates, seed : int
-        Of the bootstrap.
 
     Returns
     -------
     ErrorIntervals
-        Offset [dB], RMSE [dB], correlation, and the autocorrelation that sets the length of the blocks.
+        Offset [dB], RMSE [dB], correlation, and the autocorrelation of the residual.
     """
-    if not len(measured_db):
-        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, autocorrelation(measured_db))
     difference = simulated_db - measured_db
     known = autocorrelation(difference)
-    d = difference - difference.mean()
-    s = simulated_db - simulated_db.mean()
-    squared, crossed, spread = d * d, d * s, float(s @ s) / len(s)
-
-    def drawn(columns: list[FloatArray], of: Autocorrelation) -> FloatArray:
-        return bootstrap_means(np.column_stack(columns), of.block_length, replicates=replicates, seed=seed)
-
-    of_squares = of_spread(known, autocorrelation(squared))
-    mean, square = drawn([d, squared], of_squares).T
-    of_correlation = of_spread(known, autocorrelation(_correlation_influence(spread, crossed, squared)))
-    again, with_residual, residual = drawn([d, crossed, squared], of_correlation).T
+    if len(difference) < FEWEST:
+        return ErrorIntervals(NO_INTERVAL, NO_INTERVAL, NO_INTERVAL, known)
     return ErrorIntervals(
-        interval(float(difference.mean()), drawn([d], known)[:, 0] + difference.mean(), known),
-        interval(
-            float(np.sqrt(np.mean(squared))),
-            np.sqrt(np.maximum(square - mean**2, 0.0)),
-            of_squares,
-            forward=np.log,
-            backward=np.exp,
-        ),
-        interval(
-            correlation(measured_db, simulated_db),
-            _correlation_of_residual(spread, with_residual, np.maximum(residual - again**2, 0.0)),
-            of_correlation,
-            bounds=(-1.0, 1.0),
-            forward=np.arctanh,
-            backward=np.tanh,
-        ),
+        mean_interval(difference),
+        spread_interval(difference),
+        _correlation_interval(measured_db, simulated_db),
         known,
     )
 
 
-def of_spread(residual: Autocorrelation, influence: Autocorrelation) -> Autocorrelation:
-    """Of a statistic of spread about a mean: no better known than the mean, nor than its own influence."""
-    return Autocorrelation(
-        residual.n,
-        max(residual.block_length, influence.block_length),
-        min(residual.n_effective, influence.n_effective),
-        max(residual.variance_factor, influence.variance_factor),
-        _UNSURE_OF_SPREAD,
-    )
+def _correlation_interval(measured_db: FloatArray, simulated_db: FloatArray) -> Interval:
+    """The route was flown as it was: only slope and rest of the measurement over the simulation are random."""
+    s, m = simulated_db - simulated_db.mean(), measured_db - measured_db.mean()
+    spread = float(s @ s) / len(s)
+    if spread == 0.0 or not m.any():
+        return NO_INTERVAL
+    slope = float(m @ s) / len(s) / spread
+    rest = m - slope * s
+    along = (slope + mean_draws(rest * s) / spread) * np.sqrt(spread)
+    return _around(correlation(measured_db, simulated_db), along / np.sqrt(along**2 + power_draws(rest)))
 
 
-def _correlation_influence(spread: float, with_residual: FloatArray, residual: FloatArray) -> FloatArray:
-    """What each sample (n,) adds to :func:`_correlation_of_residual`, to first order and up to a factor."""
-    covariance = spread - float(with_residual.mean())
-    variance = covariance - float(with_residual.mean()) + float(residual.mean())
-    if spread <= 0 or variance <= 0:
-        return np.zeros(len(residual))
-    return np.asarray(-with_residual - 0.5 * covariance / variance * (residual - 2.0 * with_residual))
+def mean_interval(values: FloatArray) -> Interval:
+    """95 % interval of the mean of the process that a sequence (n,) in time order comes from."""
+    if len(values) < FEWEST:
+        return NO_INTERVAL
+    mean = float(values.mean())
+    return _around(mean, mean + mean_draws(values))
 
 
-def _correlation_of_residual(spread: float, with_residual: FloatArray, residual: FloatArray) -> FloatArray:
-    """Correlation of measured and simulated from the simulated variance and the residual's two moments.
+def spread_interval(values: FloatArray) -> Interval:
+    """95 % interval of the standard deviation of the process that a sequence (n,) in time order comes from."""
+    if len(values) < FEWEST:
+        return NO_INTERVAL
+    return _around(float(values.std()), np.sqrt(power_draws(values)))
 
-    The route was flown as it was: only the residual is random, so the simulated variance stays fixed.
-    """
-    covariance = spread - with_residual
-    variance = spread - 2.0 * with_residual + residual
-    with np.errstate(divide="ignore", invalid="ignore"):
-        r = covariance / np.sqrt(spread * variance)
-    return np.asarray(np.where((spread > 0) & (variance > 0), np.clip(r, -1.0, 1.0), np.nan))
+
+def _around(estimate: float, drawn: FloatArray) -> Interval:
+    """95 % interval from draws; it holds the estimate."""
+    if not np.isfinite(estimate) or not np.isfinite(drawn).any():
+        return NO_INTERVAL
+    low, high = np.nanquantile(drawn, [0.025, 0.975])
+    return float(min(low, estimate)), float(max(high, estimate))
 
 
 def correlation(first: ArrayLike, second: ArrayLike) -> float:
@@ -485,14 +453,11 @@ class PairedDifference:
     difference_db : float
         ``rmse_db - other_rmse_db`` [dB]: negative where the first model is better.
     difference_ci95_db : (low, high)
-        95 % interval of it [dB]: that of the mean square errors over the sum of the two RMSE, so that both have one
-        sign; NaN where none can be given.
+        95 % interval of it [dB]; NaN where none can be given.
     standard_error_db : float
-        Of ``difference_db`` [dB]; NaN where no interval can be given.
+        Of ``difference_db`` [dB]: half of its central 68 % interval; NaN where none can be given.
     mean_square_difference_db2, mean_square_ci95_db2 : float, (low, high)
         Difference of the mean square errors and its interval [dB^2].
-    n_effective : float
-        Independent samples that the difference of the squares is worth.
     verdict : {"better", "worse", "no difference shown", "none given"}
         What the interval says about the first model; "none given" where there is no interval.
     """
@@ -505,7 +470,6 @@ class PairedDifference:
     standard_error_db: float
     mean_square_difference_db2: float
     mean_square_ci95_db2: Interval
-    n_effective: float
     verdict: Literal["better", "worse", "no difference shown", "none given"]
 
     def in_words(self, other: str) -> str:
@@ -515,10 +479,10 @@ class PairedDifference:
         size = f"{abs(self.difference_db):.1f} dB"
         if self.verdict == "none given":
             more = "more" if self.difference_db > 0 else "less"
-            return f"{size} {more} error than {other}, too few independent samples for an interval"
+            return f"{size} {more} error than {other}, too few samples for an interval"
         low, high = self.difference_ci95_db
         if self.verdict == "no difference shown":
-            return f"no difference from {other} shown ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
+            return f"no significant difference from {other} ({self.difference_db:+.1f} dB [{low:+.1f}, {high:+.1f}])"
         near, far = sorted((abs(low), abs(high)))
         digits = 1 if near >= 0.05 else 2
         return f"{self.verdict} than {other} by {size} [{near:.{digits}f}, {far:.{digits}f}]"
@@ -528,25 +492,16 @@ class PairedDifference:
         return dict(plain({name: getattr(self, name) for name in self.__slots__}))
 
 
-def paired_difference(
-    error_db: ArrayLike,
-    other_error_db: ArrayLike,
-    *,
-    free_offset: bool = True,
-    replicates: int = REPLICATES,
-    seed: int = SEED,
-) -> PairedDifference:
-    """Compare two models on the same samples by the difference of their mean square errors.
+def paired_difference(error_db: ArrayLike, other_error_db: ArrayLike, *, free_offset: bool = True) -> PairedDifference:
+    """Compare two models on the same samples by the ratio of their mean square errors.
 
     Parameters
     ----------
     error_db, other_error_db : array_like, (n,)
         Measured minus predicted, in time order [dB]; samples with a NaN on either side take no part.
     free_offset : bool
-        Each model has an offset of its own fitted on these samples (an error counts about its mean, also within
-        every resample). False for errors on samples kept out of the fit: they count as they are.
-    replicates, seed : int
-        Of the bootstrap.
+        Each model has an offset of its own fitted on these samples (an error counts about its mean). False for errors
+        on samples kept out of the fit: they count as they are.
 
     Returns
     -------
@@ -560,8 +515,9 @@ def paired_difference(
     Notes
     -----
     The samples are shared, and so is most of the error: the interval of the difference is narrower than the two
-    intervals of the errors suggest, and overlap of those says nothing. Resampled are blocks of the pair, as long as
-    the difference of the squared errors remembers. Diebold and Mariano (1995), doi:10.1080/07350015.1995.10524599.
+    intervals of the errors suggest, and overlap of those says nothing. What a sample adds to the logarithm of the ratio
+    is the difference of the squared errors, each over its mean (Diebold and Mariano 1995,
+    doi:10.1080/07350015.1995.10524599); a short flight lowers both mean squares alike, so the ratio keeps its place.
 
     Examples
     --------
@@ -573,55 +529,49 @@ def paired_difference(
         raise ValueError(f"errors to compare must be of one length, found {len(first)} and {len(second)}")
     both = np.isfinite(first) & np.isfinite(second)
     first, second = first[both], second[both]
-    if not len(first):
-        return _no_pair()
-    if free_offset:
+    if free_offset and len(first):
         first, second = first - first.mean(), second - second.mean()
-    loss = first * first - second * second
-    known = autocorrelation(loss)
-    if (
-        np.ptp(loss) > 0
-        and min(autocorrelation(first).n_effective, autocorrelation(second).n_effective) < _FEWEST_OF_PAIR
-    ):
-        known = dataclasses.replace(known, n_effective=1.0)
-    columns = np.column_stack([loss, first, second])
-    drawn = bootstrap_means(columns, known.block_length, replicates=replicates, seed=seed)
-    difference = drawn[:, 0]
-    if free_offset:
-        difference = difference - drawn[:, 1] ** 2 + drawn[:, 2] ** 2
-    estimate = float(loss.mean())
-    low, high = interval(estimate, difference, known)
-    rmse, other = float(np.sqrt(np.mean(first * first))), float(np.sqrt(np.mean(second * second)))
-    scale = 1.0 / (rmse + other) if rmse + other > 0 else 0.0
-    spread = _spread(difference) * known.half_width / 1.959964 if known.enough else float("nan")
+    nan = float("nan")
+    square, other_square = (float(np.mean(e * e)) if len(e) else nan for e in (first, second))
+    found, squares, spread = NO_INTERVAL, NO_INTERVAL, nan
+    if len(first) >= FEWEST:
+        drawn, other_drawn = _power_pairs(first, second, square, other_square)
+        root = np.sqrt(drawn) - np.sqrt(other_drawn)
+        found = _ends(root)
+        squares = _ends(drawn - other_drawn)
+        spread = float(0.5 * np.diff(np.quantile(root, [0.1587, 0.8413]))[0])
+    rmse, other = float(np.sqrt(square)), float(np.sqrt(other_square))
     return PairedDifference(
         n=len(first),
         rmse_db=rmse,
         other_rmse_db=other,
         difference_db=rmse - other,
-        difference_ci95_db=(low * scale, high * scale),
-        standard_error_db=spread * scale,
-        mean_square_difference_db2=estimate,
-        mean_square_ci95_db2=(low, high),
-        n_effective=known.n_effective,
-        verdict=paired_verdict(low, high),
+        difference_ci95_db=found,
+        standard_error_db=spread,
+        mean_square_difference_db2=square - other_square,
+        mean_square_ci95_db2=squares,
+        verdict=paired_verdict(*found),
     )
 
 
-def _no_pair() -> PairedDifference:
-    nan = float("nan")
-    return PairedDifference(
-        n=0,
-        rmse_db=nan,
-        other_rmse_db=nan,
-        difference_db=nan,
-        difference_ci95_db=NO_INTERVAL,
-        standard_error_db=nan,
-        mean_square_difference_db2=nan,
-        mean_square_ci95_db2=NO_INTERVAL,
-        n_effective=nan,
-        verdict="none given",
+def _ends(drawn: FloatArray) -> Interval:
+    low, high = np.quantile(drawn, [0.025, 0.975])
+    return float(low), float(high)
+
+
+def _power_pairs(
+    first: FloatArray, second: FloatArray, square: float, other_square: float
+) -> tuple[FloatArray, FloatArray]:
+    """Draws of the mean square error of both models: of their ratio, and of the larger one's size."""
+    larger = first if square >= other_square else second
+    size = power_draws(larger) / max(float(larger.var()), 1e-300) * 0.5 * (square + other_square)
+    if min(square, other_square) == 0.0:
+        return size * (2.0 if square > 0.0 else 0.0), size * (2.0 if other_square > 0.0 else 0.0)
+    log_ratio = np.log(square / other_square) + mean_draws(
+        first * first / square - second * second / other_square, "ratio"
     )
+    tilt = np.tanh(0.5 * log_ratio)
+    return size * (1.0 + tilt), size * (1.0 - tilt)
 
 
 def paired_verdict(low: float, high: float) -> Literal["better", "worse", "no difference shown", "none given"]:

@@ -450,6 +450,7 @@ class RssSettings(Settings):
     minimum_height_m: float | None = None
     """Samples below this height are left out of the comparison, and counted."""
     bootstrap: Annotated[int, Field(ge=0, le=100_000)] = 1000
+    """Of 0.3 and without effect: intervals of levels are not resampled any more."""
     reference_powers: ReferencePowers | None = None
 
     @model_validator(mode="after")

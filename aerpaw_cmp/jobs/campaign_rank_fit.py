@@ -35,7 +35,6 @@ SWEEPS = 4
 FINALISTS = 40
 """Combinations that are compared with the best one by one: what cannot be told from it is listed."""
 
-REPLICATES = 300
 MAX_RANK = ranks.MAX_RANK
 
 
@@ -262,7 +261,7 @@ def _ties(benches: Sequence[RankBench], optimum: Search) -> list[dict[str, Any]]
     best = np.concatenate(misses(optimum.point))
     same = []
     for point, _ in optimum.tried[1:FINALISTS]:
-        difference = paired_difference(np.concatenate(misses(point)), best, replicates=REPLICATES)
+        difference = paired_difference(np.concatenate(misses(point)), best)
         if difference.verdict != "worse":
             same.append(point)
     return same

@@ -140,7 +140,6 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         posed=levels.posed,
         step_db=settings.step_db,
         span_db=settings.span_db,
-        replicates=max(settings.bootstrap, 1),
         lag_s=float("nan") if clock is None else clock.result.radio_minus_telemetry_s,
         fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
     )
@@ -186,7 +185,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             n_flagged=dict(series.flagged),
             clock=None if clock is None else clock.result,
             baseline_rmse_ci95_db=score.baseline_intervals,
-            compared_with={} if trained else _paired(levels, {**simple, **alternatives}, settings.bootstrap),
+            compared_with={} if trained else _paired(levels, {**simple, **alternatives}),
             averaged={} if trained else _averaged(series, replayed, levels, position, settings),
             censored=None if trained else _censored(settings, levels),
             snr=None if trained else _snr(series, levels),
@@ -234,15 +233,10 @@ def _baselines(levels: Mapping[str, FloatArray], score: rss.RssComparison) -> di
     }
 
 
-def _paired(
-    levels: Levels, others: Mapping[str, FloatArray], replicates: int
-) -> dict[str, statistics.PairedDifference]:
+def _paired(levels: Levels, others: Mapping[str, FloatArray]) -> dict[str, statistics.PairedDifference]:
     """The replay against each other model on the samples that both have, each with its own offset."""
     error_db = levels.measured_db - levels.simulated_db
-    return {
-        name: statistics.paired_difference(error_db, levels.measured_db - level, replicates=max(replicates, 2))
-        for name, level in others.items()
-    }
+    return {name: statistics.paired_difference(error_db, levels.measured_db - level) for name, level in others.items()}
 
 
 def _variants(settings: RssSettings, levels: Levels, alternatives: Mapping[str, FloatArray]) -> dict[str, ModelLevel]:
@@ -252,7 +246,7 @@ def _variants(settings: RssSettings, levels: Levels, alternatives: Mapping[str, 
         both = np.isfinite(levels.measured_db) & np.isfinite(level)
         measured, simulated = levels.measured_db[both], level[both]
         fit = offsets.grid_offset(measured, simulated, step_db=settings.step_db, span_db=settings.span_db)
-        bounds = statistics.error_intervals(measured, simulated, replicates=max(settings.bootstrap, 1))
+        bounds = statistics.error_intervals(measured, simulated)
         out[name] = ModelLevel(
             level_dbm=level, offset_db=fit.offset_db, rmse_db=fit.rmse_db, rmse_ci95_db=bounds.rmse_db
         )

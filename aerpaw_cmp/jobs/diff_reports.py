@@ -23,7 +23,6 @@ from ..compare.report_difference import (
     pooled_difference,
     rank_difference,
 )
-from ..compare.statistics import REPLICATES
 from ..report.diff_data import Entry, InputEntry, ReportDiff, ReportSide
 from ..report.names import RANK_COLUMNS, RSS_COLUMNS
 
@@ -32,8 +31,6 @@ TOLERANCE_DB = 0.01
 
 _NEEDED = ("flight", "versions", "inputs", "settings", "rss", "rank", "stages")
 _SIMULATED = "simulated_rank_k"
-_LONG, _FEWER = 100_000, 200
-"""Samples of a link beyond which the bootstrap has fewer replicates: its spread is then known to 5 %."""
 _VOLATILE = ("generated", "stages", "versions", "inputs", "settings", "warnings", "speed", "title", "flight")
 """What changes without meaning anything, or is compared on its own."""
 
@@ -260,7 +257,6 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
     """Everything that differs between two reports."""
     levels, residuals = _levels(first, second)
     first_warnings, second_warnings = (list(side.metrics.get("warnings", ())) for side in (first, second))
-    pooled = sum(len(of_link[0]) for of_link in residuals)
     alone = [sorted(_links(a) - _links(b)) for a, b in ((first, second), (second, first))]
     return ReportDiff(
         first=_side(first),
@@ -272,7 +268,7 @@ def compare_reports(first: ReadReport, second: ReadReport, tolerance_db: float =
         numbers=tuple(_numbers(first.metrics, second.metrics, tolerance_db)),
         levels=tuple(levels),
         ranks=tuple(_ranks(first, second)),
-        pooled=pooled_difference(residuals, replicates=_replicates(pooled)) if residuals else None,
+        pooled=pooled_difference(residuals) if residuals else None,
         new_warnings=tuple(text for text in second_warnings if text not in first_warnings),
         gone_warnings=tuple(text for text in first_warnings if text not in second_warnings),
         links_first_only=tuple(alone[0]),
@@ -407,10 +403,6 @@ _Residuals = tuple[FloatArray, FloatArray, FloatArray]
 """Instants [s] of the common samples of a link, and both residuals."""
 
 
-def _replicates(samples: int) -> int:
-    return REPLICATES if samples <= _LONG else _FEWER
-
-
 def _instants(table: Any) -> FloatArray:
     """Seconds after one instant for all links; without times of day, after each link's first sample."""
     import pandas as pd
@@ -442,7 +434,6 @@ def _levels(mine: ReadReport, theirs: ReadReport) -> tuple[list[LevelDifference]
                 level_difference(
                     tower, channel, overlap, first, second,
                     scored=(scored[0], scored[1]), offsets_db=(offsets[0], offsets[1]),
-                    replicates=_replicates(overlap.common),
                 )
             )  # fmt: skip
     return differences, residuals

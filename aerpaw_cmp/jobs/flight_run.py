@@ -94,15 +94,12 @@ def run_flight(
                 stages.progress("ladder of models")
                 climbed = climb()
                 if climbed is not None:
-                    rows = _ladder_rows(climbed, data.settings.rss.bootstrap)
+                    rows = _ladder_rows(climbed)
                     result = dataclasses.replace(result, ladder=tuple(rows))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
 
 
-def _ladder_rows(climbed: FlightLadder, replicates: int) -> list[LadderRow]:
+def _ladder_rows(climbed: FlightLadder) -> list[LadderRow]:
     """The rows of all series in their order, several series at a time where that is safe."""
-    calls = [
-        partial(series_rows, climbed.ladder, index, name, replicates=replicates)
-        for index, name in enumerate(climbed.names)
-    ]
+    calls = [partial(series_rows, climbed.ladder, index, name) for index, name in enumerate(climbed.names)]
     return [row for rows in in_order(calls, fewest=FEWEST_SERIES) for row in rows]

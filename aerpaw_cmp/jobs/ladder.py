@@ -178,7 +178,6 @@ class _Climber:
             [s.time_s for s in self._series],
             rungs,
             position_m=[s.replayed.poses.position_m[s.picked] for s in self._series],
-            replicates=self._data.settings.rss.bootstrap,
         )
 
     # the stages: what may be added to the best model so far

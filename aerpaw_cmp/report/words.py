@@ -76,30 +76,29 @@ def verdicts(rss: Sequence[RssPanel], rank: Sequence[RankPanel]) -> list[str]:
     return [rss_verdict(panel) for panel in rss] + [rank_verdict(panel) for panel in rank]
 
 
-AS_SET, FREE_SPACE = "as set in flight.yaml", "free space"
-"""Names of two rungs of the ladder."""
+AS_SET = "as set in flight.yaml"
+"""Name of the ladder's rung with the settings of the flight file."""
 
 
 def ladder_verdict(ladder: Sequence[LadderRow]) -> str:
-    """What the scene needs: whether the replay as set is worth its trouble, and which model does better."""
+    """Cross-validated errors of this replay, of the baselines and of the recommended model."""
     rows = [row for row in ladder if math.isfinite(row.rmse_heldout_db)]
     chosen = next((row.model for row in rows if row.recommended), None)
     if chosen is None:
         return ""
-    mean = {name: _pooled([r for r in rows if r.model == name]) for name in (AS_SET, FREE_SPACE, chosen)}
-    named = f"\u201c{chosen}\u201d"
-    how = "the simplest model within one standard error of the best"
+    error = {row.model: _pooled([r for r in rows if r.model == row.model]) for row in rows}
+    beside = [f"{name} {error[name]:.1f} dB" for name in (AS_SET, *BASELINE_TITLE.values()) if name in error]
+    least = min(error, key=lambda name: error[name])
+    text = f"Cross-validated RMSE: {', '.join(beside)}."
+    if least in (BASELINE_TITLE["log_distance"], BASELINE_TITLE["constant"]):
+        text += f" The {least}, which replays nothing, has the smallest error of all models."
+    how = "the simplest replay within one standard error of the best replay"
     if chosen == AS_SET:
-        return f"The settings of this flight file are {how}: {mean[AS_SET]:.1f} dB on stretches left out."
-    text = f"Not this replay but {named} is {how}: {mean[chosen]:.1f} dB"
-    if math.isfinite(mean[AS_SET]) and math.isfinite(mean[FREE_SPACE]) and mean[AS_SET] > mean[FREE_SPACE]:
-        text = (
-            f"With these settings the replay is WORSE than free space on stretches left out ({mean[AS_SET]:.1f} "
-            f"against {mean[FREE_SPACE]:.1f} dB); the better model is {named}, {how}: {mean[chosen]:.1f} dB"
-        )
-    elif math.isfinite(mean[AS_SET]):
-        text += f" on stretches left out, {mean[AS_SET]:.1f} dB with these settings"
-    return text + " (report --recommend writes its settings)."
+        return f"{text} The settings of this flight file are {how}."
+    return (
+        f"{text} \u201c{chosen}\u201d is {how}: {error[chosen]:.1f} dB. "
+        "Next: report --recommend FILE writes its settings."
+    )
 
 
 def _pooled(rows: Sequence[LadderRow]) -> float:

@@ -109,7 +109,7 @@ def test_a_place_that_is_visited_twice_is_left_out_as_a_whole():
     # in stretches of time the way back tells the way out
     assert held_out_error_db(level, np.zeros(800), everywhere)[level > 0].mean() < 7.5
     ladder = climb([level], [np.arange(800.0)], [Rung(model="m", level_db=(np.zeros(800),), seconds=0.0)],
-                   position_m=[position], replicates=2)  # fmt: skip
+                   position_m=[position])  # fmt: skip
     assert ladder.error_db[0][0][level > 0] == pytest.approx(8.0)
     assert len(places_of(np.zeros((3, 2)))) == 3
     assert len(places_of(np.zeros((0, 2)))) == 0

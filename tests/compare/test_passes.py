@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from aerpaw_cmp.compare.passes import Pass, pass_pairs, spread_interval
-from aerpaw_cmp.compare.statistics import correlation, error_intervals
+from aerpaw_cmp.compare.passes import Pass, pass_pairs
+from aerpaw_cmp.compare.statistics import correlation
 
 RADIUS_M, WITHIN_DEG, CELL_M = 3.0, 20.0, 20.0
 FLIGHTS, LINKS, SAMPLES = 7, 3, 160
@@ -112,24 +112,3 @@ def test_shares_of_the_work_make_the_whole() -> None:
         for p in pass_pairs(passes, first_flights=share, **rule)
     ]
     assert sorted(map(repr, parts)) == sorted(map(repr, whole))
-
-
-@pytest.mark.parametrize("memory", [0.0, 0.6, 0.9])
-def test_the_closed_interval_is_that_of_the_bootstrap(memory: float) -> None:
-    """Against 4000 resamples of the same blocks: the ends within a twentieth of the width."""
-    rng = np.random.default_rng(3)
-    noise = rng.normal(0.0, 2.0, 3000)
-    x = np.empty(len(noise))
-    x[0] = noise[0]
-    for i in range(1, len(x)):
-        x[i] = memory * x[i - 1] + np.sqrt(1 - memory**2) * noise[i]
-    zero = np.zeros(len(x))
-    low, high = error_intervals(zero, x, replicates=4000).rmse_db
-    found = spread_interval(x)
-    assert found == pytest.approx((low, high), abs=0.05 * (high - low))
-
-
-def test_no_interval_where_there_is_nothing_to_tell_from() -> None:
-    assert np.isnan(spread_interval(np.zeros(0))).all()
-    assert np.isnan(spread_interval(np.ones(50))).all()
-    assert np.isnan(spread_interval(np.cumsum(np.ones(60)))).all()

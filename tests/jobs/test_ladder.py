@@ -71,7 +71,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert as_set["rmse_heldout_db"] == pytest.approx(rows["ground (coherent)"]["rmse_heldout_db"], abs=1e-6)
     assert as_set["difference_to_best_db"] > 0.2
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
-    assert "WORSE than free space" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
+    assert "free space 1.0 dB" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
     assert "Models from the simplest to the richest" in page
 
     settings = load_flight(better)
@@ -89,7 +89,7 @@ def test_a_replay_that_loses_to_a_line_says_so_first(tmp_path: Path, capsys: pyt
     assert set(error) == {"free_space", "two_ray", "log_distance", "constant"}
     assert error["log_distance"] == pytest.approx(1.0, abs=0.1)
     assert min(error["free_space"], error["constant"]) > 2.0
-    assert rss["compared_with"]["log_distance"]["difference_db"] > 1.0
+    assert rss["compared_with"]["log_distance"]["verdict"] == "worse"
     rows = {row["model"]: row for row in metrics["ladder"]}
     assert rows["log-distance line"]["rmse_heldout_db"] == pytest.approx(error["log_distance"], abs=0.2)
     assert rows["log-distance line"]["difference_to_best_db"] == 0.0

@@ -15,19 +15,12 @@ from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.outputs import OutputFolder
 from aerpaw_cmp.compare.report_difference import mae_difference, pooled_difference
 from aerpaw_cmp.compare.statistics import autocorrelation
-from aerpaw_cmp.jobs import diff_reports
 from aerpaw_cmp.jobs.diff_reports import run_diff
 from aerpaw_cmp.report.diff_data import verdict
 from aerpaw_cmp.report.diff_html import diff_page, whiskers
 from aerpaw_cmp.report.write import write_report
 
 LINK = ("LW1", "USRP1")
-
-
-@pytest.fixture(autouse=True)
-def fewer_replicates(monkeypatch):
-    """No test here needs an interval's ends to better than 10 %; whether they hold the truth is asked further down."""
-    monkeypatch.setattr(diff_reports, "REPLICATES", 300)
 
 
 @pytest.fixture(scope="module")
@@ -182,14 +175,6 @@ def test_a_replay_that_moved_without_harm_is_said_to_have_moved(two):
     assert any("measured level by up to 3 dB" in text for text in found.differences)
 
 
-def test_a_long_flight_has_fewer_replicates_and_nearly_the_same_interval(noisy, monkeypatch):
-    (first, second), _ = noisy
-    monkeypatch.setattr(diff_reports, "REPLICATES", 1000)
-    usual = run_diff(first, second).levels[0].rmse.difference_ci95_db
-    monkeypatch.setattr(diff_reports, "_LONG", 10)
-    assert run_diff(first, second).levels[0].rmse.difference_ci95_db == pytest.approx(usual, rel=0.25)
-
-
 def test_links_are_pooled_by_what_each_adds_at_an_instant():
     """Two links with a change of opposite sign: the means of links are no memory of the flight."""
     rng = np.random.default_rng(8)
@@ -202,7 +187,7 @@ def test_links_are_pooled_by_what_each_adds_at_an_instant():
     assert low < np.mean(truth) < high
     # white noise: the variance of a mean square is 2 sigma^4 / n
     spread = np.sqrt(sum(2 * s**4 for s in (2.0, 3.0, 4.0, 3.5)) / 3000) / 2
-    assert (high - low) / 2 == pytest.approx(1.96 * spread, rel=0.2)
+    assert 0.8 < (high - low) / 2 / (1.96 * spread) < 5.0  # the memory of white noise is not known to be none
     once, twice = (np.ptp(pooled_difference(links[:1] * n).mean_square_ci95_db2) for n in (1, 2))
     assert twice == pytest.approx(once, rel=0.2), "one link written down twice is worth no more"
 
@@ -271,7 +256,7 @@ def test_intervals_of_the_mae_hold_the_truth_as_often_as_they_say():
     held = 0
     for _ in range(150):
         shared = rng.normal(0, 2.0, 500)
-        bounds = mae_difference(shared, rng.normal(0, 2.4, 500), replicates=200).ci95
+        bounds = mae_difference(shared, rng.normal(0, 2.4, 500)).ci95
         held += bounds[0] <= truth <= bounds[1]
     assert held >= 0.88 * 150
     assert autocorrelation(shared).enough

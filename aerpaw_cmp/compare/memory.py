@@ -1,0 +1,202 @@
+"""Draws of a process's mean, power and ratio of powers, from one sequence whose memory is not known.
+
+Neighbouring errors of a flight repeat each other, and how long they do is itself hardly known from one flight. The
+sequence is described by its slowest cosine terms, after Mueller and Watson (2008),
+doi:10.1111/j.1468-0262.2008.00868.x: given a memory, they are normal with a known covariance. Memories from three times
+the flight's length to none at all, with and without white noise, are weighted by how well they explain the terms, and
+by weights that make 95 % intervals hold 95 % of the time whatever the memory is (``benchmarks/interval_weights.py``
+finds them by simulation). A flight that is one memory long gets a wide interval, not none.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from ..common.units import FloatArray, IntArray
+
+TERMS = 24
+"""Cosine terms that the memory is judged by; faster ones tell about the power alone."""
+
+FEWEST = 20
+"""Samples below which nothing is said."""
+
+RATES = np.geomspace(0.3, 500.0, 18)
+"""Length of the sequence over the length of its memory (exponential: exp(-rate) is what two ends share)."""
+
+WHITE_SHARES = (0.0, 2e-3, 3e-2)
+"""Share of white noise in the slowest fluctuations."""
+
+Kind = Literal["mean", "power", "ratio"]
+
+_TENTHS: dict[Kind, tuple[tuple[int, ...], ...]] = {
+    "mean": (
+        (-9, 15, 32, 24, 9, -4, -11, -8, 3, 23, 44, 29, 8, -6, -8, 3, 27, 62),
+        (-54, -41, -25, -2, 22, 23, 11, -1, -9, -13, -14, -15, -15, -14, -13, -11, -8, -6),
+        (-35, -35, -36, -35, -33, -29, -25, -20, -16, -13, -12, -12, -13, -13, -12, -10, -9, -6),
+    ),
+    "power": (
+        (-23, -1, 12, 1, -15, -26, -25, -13, 4, 15, 25, 23, 13, 5, 4, 11, 25, 45),
+        (-46, -33, -17, 2, 15, 10, -1, -3, -2, -3, -4, -5, -6, -7, -8, -7, -7, -6),
+        (-13, -17, -21, -24, -26, -26, -24, -21, -18, -14, -11, -9, -8, -8, -7, -7, -6, -5),
+    ),
+    "ratio": (
+        (-31, -25, -17, -5, 14, 39, 66, 71, 62, 57, 37, 11, -7, -16, -14, 0, 26, 63),
+        (-45, -40, -35, -28, -21, -15, -10, -8, -7, -7, -9, -12, -13, -14, -13, -11, -9, -7),
+        (-35, -35, -34, -32, -29, -24, -20, -16, -13, -11, -12, -13, -14, -14, -13, -11, -9, -7),
+    ),
+}
+"""Logarithms of the weights in tenths, by white share and rate; from 300 sequences in each of 54 cells of (samples,
+correlation of neighbours, white noise)."""
+
+_PAIRS = 2048
+"""Draws come in pairs of opposite sign, so that exchanging two models turns an interval about exactly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Memories:
+    """All memories (m,) at ``terms`` cosine terms: normal distributions of the mean and the terms, up to a scale.
+
+    ``whiten`` (m, terms, terms) makes the terms independent, ``log_det`` (m,) is the logarithm of its determinant;
+    ``slope`` (m, terms) and ``left`` (m,) give mean and variance of the sequence's mean once the terms are known;
+    ``power`` (m,) is that of the mean and of the terms together.
+    """
+
+    whiten: FloatArray
+    log_det: FloatArray
+    slope: FloatArray
+    left: FloatArray
+    power: FloatArray
+
+
+@cache
+def memories(terms: int = TERMS) -> Memories:
+    """All combinations of :data:`WHITE_SHARES` and :data:`RATES`, the latter running fastest."""
+    parts = []
+    for share in WHITE_SHARES:
+        for rate in RATES:
+            covariance = (1.0 - share) * 0.5 * rate * _exponential(rate, terms) + share * np.eye(terms + 1)
+            whiten = np.linalg.inv(np.linalg.cholesky(covariance[1:, 1:]))
+            slope = whiten.T @ (whiten @ covariance[0, 1:])
+            left = covariance[0, 0] - covariance[0, 1:] @ slope
+            parts.append((whiten, np.log(np.diag(whiten)).sum(), slope, left, np.trace(covariance)))
+    return Memories(*(np.array(column) for column in zip(*parts, strict=True)))
+
+
+def _exponential(rate: float, terms: int) -> FloatArray:
+    """Covariance (terms + 1, terms + 1) of the cosine terms of exp(-rate |s - t|) on the unit interval."""
+    order = np.arange(terms + 1)
+    sign = np.where(order % 2 == 0, 1.0, -1.0)
+    pole = rate**2 + (np.pi * order) ** 2
+    ends = (1.0 + np.outer(sign, sign)) * rate**2 * (1.0 - sign * np.exp(-rate)) / np.outer(pole, pole)
+    scale = np.where(order == 0, 1.0, np.sqrt(2.0))
+    return np.asarray((np.diag(rate * np.where(order == 0, 2.0, 1.0) / pole) - ends) * np.outer(scale, scale))
+
+
+def weights(kind: Kind) -> FloatArray:
+    """Weight (m,) of each memory before any sample is seen."""
+    drawn = np.exp(0.1 * np.array(_TENTHS[kind], dtype=np.float64).ravel())
+    return np.asarray(drawn / drawn.sum())
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """Cosine terms of a sequence: the slow ones (q,), and power, degrees of freedom of the fast ones and of all."""
+
+    slow: FloatArray
+    fast_power: float
+    fast_freedom: float
+    freedom: float
+
+
+def cosine_terms(values: FloatArray) -> Terms:
+    """Cosine terms, scaled so that their squares add up to the mean square about the mean."""
+    from scipy.fft import dct
+
+    n = len(values)
+    every = dct(values - values.mean(), norm="ortho")[1:] / np.sqrt(n)
+    count = min(TERMS, (n - 1) // 2)
+    squares = every * every
+    fast = squares[count:]
+
+    def freedom(power: FloatArray) -> float:
+        return float(max(3.0 * power.sum() ** 2 / np.maximum((power * power).sum(), 1e-300), 1.0))
+
+    return Terms(every[:count], float(fast.sum()), freedom(fast), freedom(squares))
+
+
+def likelihoods(slow: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Likelihood (..., m) of each memory, its scale integrated out, and the whitened sum of squares (..., m)."""
+    known = memories(slow.shape[-1])
+    square = np.square(np.einsum("mij,...j->...mi", known.whiten, slow)).sum(axis=-1)
+    log = known.log_det - 0.5 * slow.shape[-1] * np.log(np.maximum(square, 1e-300))
+    return np.exp(log - log.max(axis=-1, keepdims=True)), square
+
+
+@cache
+def _random(terms: int) -> tuple[FloatArray, FloatArray, FloatArray, FloatArray]:
+    """Evenly spread draws, the same for every sequence: uniform, chi-squared of ``terms`` degrees, two unit normals.
+
+    A Kronecker sequence in four dimensions.
+    """
+    from scipy.special import gammaincinv, ndtri
+
+    ratio = 1.1673039782614187  # x^5 = x + 1
+    chance = (0.5 + np.outer(np.arange(1, _PAIRS + 1), ratio ** -np.arange(1.0, 5.0))) % 1.0
+    return chance[:, 0], 2.0 * gammaincinv(0.5 * terms, chance[:, 1]), ndtri(chance[:, 2]), ndtri(chance[:, 3])
+
+
+def _picked(slow: FloatArray, kind: Kind) -> tuple[IntArray, FloatArray]:
+    """Memory (draws,) and squared scale (draws,) of each draw."""
+    likelihood, square = likelihoods(slow)
+    running = np.cumsum(likelihood * weights(kind))
+    uniform, chi_squared, *_ = _random(len(slow))
+    index = np.minimum(np.searchsorted(running, uniform * running[-1]), len(running) - 1)
+    return index, square[index] / chi_squared
+
+
+def mean_draws(values: FloatArray, kind: Kind = "mean") -> FloatArray:
+    """Draws of the mean of the process minus the mean of the sequence.
+
+    Parameters
+    ----------
+    values : (n,)
+        In time order, at least :data:`FEWEST`.
+    kind : {"mean", "ratio"}
+        Errors, or differences of their squares.
+    """
+    if np.ptp(values) == 0.0:
+        return np.zeros(2 * _PAIRS)
+    slow = cosine_terms(values).slow
+    known = memories(len(slow))
+    index, scale = _picked(slow, kind)
+    centre = -(known.slope[index] @ slow)
+    reach = np.sqrt(scale * known.left[index]) * _random(len(slow))[2]
+    return np.asarray(np.concatenate([centre + reach, centre - reach]))
+
+
+def power_draws(values: FloatArray) -> FloatArray:
+    """Draws of the mean square of the process about its own mean, in the order of :func:`mean_draws`.
+
+    Parameters
+    ----------
+    values : (n,)
+        In time order, at least :data:`FEWEST`. Tails heavier than normal widen the draws.
+    """
+    away = values - values.mean()
+    mean_square = float(np.mean(away * away))
+    if mean_square == 0.0:
+        return np.zeros(2 * _PAIRS)
+    terms = cosine_terms(values)
+    index, scale = _picked(terms.slow, "power")
+    *_, normal, other = _random(len(terms.slow))
+    third = 2.0 / (9.0 * terms.fast_freedom)
+    # chi-squared over its degrees of freedom, after Wilson and Hilferty (1931)
+    fast = terms.fast_power / np.maximum(1.0 - third + np.sqrt(third) * other, 0.05) ** 3
+    # a short normal sequence shows heavy tails by chance: only what is beyond counts
+    excess = max(float(np.mean(away**4)) / mean_square**2 - 3.0 - np.sqrt(24.0 / terms.freedom), 0.0)
+    tails = np.exp(np.sqrt(excess / terms.freedom) * normal)
+    return np.tile((scale * memories(len(terms.slow)).power[index] + fast) * tails, 2)

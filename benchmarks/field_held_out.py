@@ -74,7 +74,7 @@ def each(score: Score) -> dict[str, Any]:
     return {
         "flight": score.flight, "tower": score.tower, "channel": score.channel, "n": score.n, "rmse_db": score.rmse_db,
         "rmse_4s_db": score.rmse_4s_db, "free_space_rmse_db": score.free_space_rmse_db,
-        "within_2sd": score.within_2sd,
+        "inside_90": score.inside_90,
     }  # fmt: skip
 
 
@@ -178,10 +178,10 @@ def rows_of_flights(found: dict[str, Any]) -> tuple[list[str], list[list[str]]]:
     """Header and rows: each flight and channel from the others."""
     rows = [
         [f"{e['flight']}, {e['tower']} {e['channel']}", str(e["n"]), num(e["free_space_rmse_db"]), num(e["rmse_db"]),
-         num(e["rmse_4s_db"]), f"{100 * e['within_2sd']:.0f} %"]
+         num(e["rmse_4s_db"]), f"{100 * e['inside_90']:.0f} %"]
         for one in found["rss"].values() for e in one["each"]
     ]  # fmt: skip
-    return ["flight", "samples", "free space", "learned", "over 4 s", "within 2 sd"], rows
+    return ["flight", "samples", "free space", "learned", "over 4 s", "inside 90 %"], rows
 
 
 def rows_of_rank(found: dict[str, Any]) -> tuple[list[str], list[list[str]]]:

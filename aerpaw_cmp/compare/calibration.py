@@ -18,6 +18,7 @@ from .ladder import log_distance_level_db
 from .mount import GainOf, MountFit, fit_mounts
 from .result import BASELINE_TITLE
 from .rss import local_mean_db
+from .spread import Spread, StatedSpread, fading_of, inside_shares
 
 SECTORS = 6
 GUARD_DEG = 10.0
@@ -84,6 +85,20 @@ class Learned:
     choice: Choice
     mounts: Mapping[str, MountFit]
     fit: GainFit | None
+    fading: Mapping[str, tuple[float, float]] = field(default_factory=dict)
+    """Of each antenna: :func:`~aerpaw_cmp.compare.spread.fading_of` the flights that were learned from."""
+
+    def spread(self, antenna: str) -> Spread:
+        """What remains of a level at an antenna besides the standard deviation of the gain."""
+        model = self.choice.model
+        sd_db, kurtosis = self.fading.get(antenna, (0.0, 0.0))
+        return Spread(
+            own_sd_db=model.own_sd_db,
+            noise_sd_db=model.noise_sd_db,
+            fading_sd_db=sd_db,
+            fading_kurtosis=kurtosis,
+            bin_s=model.bin_s,
+        )
 
     def pattern_db(self, name: str, direction: FloatArray) -> FloatArray:
         """Gain (n,) of a measured pattern as mounted, towards directions (n, 3) of body or mast; 0 without one."""
@@ -140,15 +155,17 @@ def learn(series: Sequence[LinkSamples], recipe: Recipe, choice: Choice | None =
         choice, fit = choose_and_fit(left, recipe.model)
     else:
         fit = fit_gain(left, choice.model)
-    return Learned(recipe, choice, mounts, fit)
+    antennas = dict.fromkeys(s.antenna for s in series)
+    fading = {name: fading_of([s for s in series if s.antenna == name], choice.model.bin_s) for name in antennas}
+    return Learned(recipe, choice, mounts, fit, fading)
 
 
 @dataclass(frozen=True, slots=True)
 class Score:
     """Error of one flight and channel that had no part in the fit, after one offset [dB].
 
-    ``rmse_4s_db``: both sides averaged in power over 4 s. ``within_2sd``: share of samples (some hundred of them)
-    whose error is within two standard deviations, those of gain, nuisance and noise together. ``offset_db``: measured
+    ``rmse_4s_db``: both sides averaged in power over 4 s. ``inside_50``, ``inside_90``, ``inside_95``: share of
+    samples (some hundred of them) inside the interval that is to hold so many per cent. ``offset_db``: measured
     minus predicted, mean. ``rmse_shared_offset_db``: with the mean offset of the flights that were learned from in
     place of the flight's own. ``constant_rmse_db``, ``log_distance_rmse_db``: of a constant, and of a line over log
     distance whose slope at each of eight places comes from the other places of the flight. Where a part of a flight is
@@ -165,13 +182,13 @@ class Score:
     log_distance_rmse_db: float
     n: int
     offset_db: float = math.nan
-    within_2sd: float = math.nan
+    inside_50: float = math.nan
+    inside_90: float = math.nan
+    inside_95: float = math.nan
     rmse_shared_offset_db: float = math.nan
 
 
-def score(
-    observed: Observed, gain_db: FloatArray, sd_db: FloatArray | None = None, simple: Simple | None = None
-) -> Score | None:
+def score(observed: Observed, gain_db: FloatArray, simple: Simple | None = None) -> Score | None:
     """Score of a prediction; None with fewer than 50 samples to score.
 
     Parameters
@@ -179,8 +196,6 @@ def score(
     observed : Observed
     gain_db : (n,)
         Predicted level above free space [dB]; NaN is not scored.
-    sd_db : (n,), optional
-        Its standard deviation [dB]; NaN is not checked.
     simple : Simple, optional
         Baselines whose offset in each scored part, like that of ``gain_db``, comes from samples outside the part, so
         that they are compared like for like. Without, they have one offset for the whole flight.
@@ -202,10 +217,6 @@ def score(
     else:
         constant, line = simple.constant_db[good], simple.line_db[good]
     means = local_mean_db(time, measured, 4.0) - local_mean_db(time, gain_db[good] + level, 4.0)
-    known = np.zeros(len(left), np.bool_) if sd_db is None else np.isfinite(sd_db[good])
-    inside = math.nan
-    if sd_db is not None and known.any():
-        inside = float(np.mean(np.abs(left - left.mean())[known] < 2.0 * sd_db[good][known]))
     return Score(
         flight=s.flight,
         tower=s.tower,
@@ -217,7 +228,6 @@ def score(
         log_distance_rmse_db=float((measured - line).std()),
         n=int(good.sum()),
         offset_db=float(left.mean()),
-        within_2sd=inside,
     )
 
 
@@ -303,15 +313,17 @@ SPREAD_SAMPLES = 400
 
 def _scored_with(o: Observed, learned: Learned, offset_db: float, *, spread: bool) -> Score | None:
     """Score of a prediction, its own offset and that of the other flights side by side."""
-    gain, model = learned.mean(o.samples), learned.choice.model
-    whole = np.full(len(gain), np.nan)
-    if spread and learned.fit is not None:
-        some = np.unique(np.linspace(0, len(gain) - 1, min(len(gain), SPREAD_SAMPLES)).round().astype(np.int64))
-        sd = learned.predict(o.samples.part(some))[1]
-        whole[some] = np.sqrt(sd**2 + model.own_sd_db**2 + model.noise_sd_db**2)
-    fitted = score(o, gain, whole)
+    gain = learned.mean(o.samples)
+    fitted = score(o, gain)
     if fitted is None:
         return None
+    if spread and learned.fit is not None:
+        some = np.unique(np.linspace(0, len(gain) - 1, min(len(gain), SPREAD_SAMPLES)).round().astype(np.int64))
+        stated = StatedSpread(
+            gain_sd_db=learned.predict(o.samples.part(some))[1], spread=learned.spread(o.samples.antenna)
+        )
+        error = o.samples.residual_db - gain - fitted.offset_db
+        fitted = dataclasses.replace(fitted, **inside_shares(error[some], stated))  # type: ignore[arg-type]
     return dataclasses.replace(fitted, rmse_shared_offset_db=math.hypot(fitted.rmse_db, fitted.offset_db - offset_db))
 
 

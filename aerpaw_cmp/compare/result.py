@@ -19,6 +19,7 @@ from .ladder import LadderRow
 from .rank import CommonestRank, RankComparison, RankRepeat
 from .rss import ChannelDifference, ErrorSpan, ResidualBins, RssComparison
 from .serving import ServingComparison
+from .spread import StatedSpread
 from .statistics import Interval, PairedDifference
 
 BASELINE_TITLE = {
@@ -168,7 +169,9 @@ class RssFurther:
     foliage: Mapping[str, FoliageLoss] | None = None
     explained_by: Mapping[str, float]
     simulated_sd_db: float | None = None
-    """Mean of what learned antennas state."""
+    """Mean of what learned antennas state for one sample: gain, the flight's own nuisance, noise, fading."""
+    error_bars: Mapping[str, float] | None = None
+    """Its parts [dB], and the share of samples that the stated 50, 90 and 95 % intervals hold here."""
     trained_on: tuple[str, ...] | None = None
     """SHA-256 of the logs of this series that its antennas or settings were learned from: then no error is given."""
 
@@ -223,8 +226,8 @@ class RssResult:
     spans: tuple[ErrorSpan, ...]
     residual_by: Mapping[str, ResidualBins]
     further: RssFurther
-    simulated_sd_db: FloatArray | None = None
-    """Standard deviation (n,) of the simulated level that learned antennas state [dB]."""
+    stated: StatedSpread | None = None
+    """Error bars of the simulated level that learned antennas state."""
     tower_m: FloatArray | None = None
     """Place (n, 3) of a tower that moves, NaN where it is not known [m]; None of one that stands."""
 

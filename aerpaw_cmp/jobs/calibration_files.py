@@ -81,7 +81,7 @@ def antenna_files(
     out: dict[str, str | bytes] = {}
     for (antenna, end), one in maps.items():
         stem = safe_name(f"{antenna}.{end}")
-        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, notes)
+        out[f"{stem}.csv"] = sphere_csv(one.gain_dbi, one.sd_db, (*notes, calibration.learned.spread(antenna).text()))
         pattern = SpherePattern(stem, one.gain_dbi, one.sd_db)
         out[f"{stem}.msi"] = planning_cuts(pattern, stem, carrier_hz)
         said = {

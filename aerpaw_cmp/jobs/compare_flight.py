@@ -6,6 +6,7 @@ A new number of a tower and channel is a field of ``RssFurther`` there and a fun
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from functools import partial
 from itertools import combinations
@@ -39,6 +40,7 @@ from ..compare.result import (
     SnrScore,
 )
 from ..compare.serving import ServingComparison, at_times, compare_serving
+from ..compare.spread import StatedSpread, inside_shares
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.losses import direct_foliage_m
 from ..flight.replay import FlightReplay, Replayed, may_share
@@ -47,7 +49,7 @@ from ..flight.training import learned_here
 from ..propagation.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
-from .levels import Levels, at_samples, gain_sd_db, levels_of
+from .levels import Levels, at_samples, levels_of, stated_spread
 from .what_if import (
     expected_offset,
     foliage_rank_difference,
@@ -146,7 +148,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
-    stated_sd = gain_sd_db(data.site, series.tower, replayed)
+    stated = stated_spread(data.site, series.tower, replayed, settings.window_s)
     quantities = {**geometry, "time_s": rss.seconds(series.time), "line_of_sight": direct}
     residual_by = rss.residual_tables(score.residual_db, quantities)
     curve_offset_db, curve_rmse_db = offsets.offset_curve(
@@ -193,11 +195,18 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
             foliage=foliage_rss_difference(alternatives) or None,
             explained_by={name: table.explained for name, table in residual_by.items()},
-            simulated_sd_db=None if stated_sd is None else float(np.nanmean(stated_sd)),
+            simulated_sd_db=None if stated is None else float(np.nanmean(stated.total_db)),
+            error_bars=None if stated is None else _error_bars(stated, None if trained else score.residual_db),
             trained_on=trained or None,
         ),
-        simulated_sd_db=stated_sd,
+        stated=stated,
     )
+
+
+def _error_bars(stated: StatedSpread, residual_db: FloatArray | None) -> dict[str, float]:
+    """Parts of the stated standard deviation [dB], and the shares of samples that its intervals hold, where scored."""
+    parts = {"gain_sd_db": float(np.nanmean(stated.gain_sd_db)), **dataclasses.asdict(stated.spread)}
+    return parts | ({} if residual_db is None else inside_shares(residual_db, stated))
 
 
 def baseline_levels(site: Site, tower: str, replayed: Replayed) -> dict[str, FloatArray]:

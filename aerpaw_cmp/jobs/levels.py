@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..common.units import BoolArray, FloatArray
 from ..compare import rss
+from ..compare.spread import NO_SPREAD, Spread, StatedSpread
 from ..flight.data import RssSeries
 from ..flight.replay import Replayed
 from ..flight.settings import RssSettings
 from ..site.site import Site
+from ..site.sphere_pattern import SpherePattern
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -65,22 +68,38 @@ def at_samples(series: RssSeries, replayed: Replayed, level_db: FloatArray, sett
     return rss.local_mean_db(series.time, level, settings.window_s) if settings.field == "local_mean" else level
 
 
-def gain_sd_db(site: Site, tower: str, replayed: Replayed) -> FloatArray | None:
-    """Standard deviation (n,) [dB] of the simulated level that learned antennas state, along the direct line.
+def stated_spread(site: Site, tower: str, replayed: Replayed, window_s: float = 0.0) -> StatedSpread | None:
+    """Error bars of the simulated level that learned antennas state, along the direct line; None where none does.
 
-    The two ends count as independent; they are learned from the same levels, so the true one is rather smaller.
-    None where neither antenna states one.
+    The gains of both ends count as independent; they are learned from the same levels, so the true standard deviation
+    is rather smaller. Files of 0.3 state that of the gain alone.
+
+    Parameters
+    ----------
+    site : Site
+    tower : str
+    replayed : Replayed
+    window_s : float
+        Time over which the measurement is averaged: as long as the mean that was learned from, it has no fading.
+
+    Returns
+    -------
+    StatedSpread or None
     """
     link, poses = replayed.link, replayed.poses
     ray = poses.position_m - replayed.source_m(site)
     at_uav = np.einsum("nji,nj->ni", poses.rotation, -ray)
-    square = np.zeros(len(ray))
-    stated = False
-    for array, direction in ((link.tower_arrays[tower], ray), (link.uav_array, at_uav)):
-        own = direction @ array.mount
-        sd = getattr(array.patterns[0], "gain_sd_db", None)
-        if sd is not None:
-            stated = True
-            theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
-            square += sd(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
-    return replayed.spread(np.sqrt(square)) if stated else None
+    square, spread, stated = np.zeros(len(ray)), NO_SPREAD, False
+    for array, direction in ((link.uav_array, at_uav), (link.tower_arrays[tower], ray)):
+        pattern = array.patterns[0]
+        if not isinstance(pattern, SpherePattern):
+            continue
+        stated, own = True, direction @ array.mount
+        theta = np.arctan2(np.hypot(own[:, 0], own[:, 1]), own[:, 2])
+        square += pattern.gain_sd_db(theta, np.arctan2(own[:, 1], own[:, 0])) ** 2
+        spread = Spread.from_text(pattern.notes) or spread
+    if not stated:
+        return None
+    if window_s >= spread.bin_s:
+        spread = dataclasses.replace(spread, fading_sd_db=0.0)
+    return StatedSpread(gain_sd_db=replayed.spread(np.sqrt(square)), spread=spread)

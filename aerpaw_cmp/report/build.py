@@ -164,7 +164,7 @@ def rss_panel(result: RssResult) -> record.RssPanel:
             for name in FOLIAGE_RUNS
             if name in result.variants
         }
-        | ({} if result.simulated_sd_db is None else {"simulated_sd_db": result.simulated_sd_db})
+        | ({} if result.stated is None else result.stated.columns(result.simulated_dbm))
         | _tower_columns(result.tower_m),
     )
 

@@ -124,6 +124,26 @@ def _track_specs(data: ReportData, track: Track) -> list[FigureSpec]:
     ]
 
 
+def _band_words(panel: RssPanel) -> str:
+    """What the band of learned antennas is made of, and whether it holds on this flight."""
+    bars = panel.extra.get("error_bars")
+    if not bars:
+        return ""
+    parts = ", ".join(f"{what} {bars[name]:.1f} dB" for name, what in SPREAD_PARTS.items())
+    held = bars.get("inside_90")
+    return f" Band: 90 % interval of a sample about the prediction; its standard deviation joins {parts}." + (
+        "" if held is None else f" It holds {100 * held:.0f} % of the samples of this flight."
+    )
+
+
+SPREAD_PARTS = {
+    "gain_sd_db": "the learned gain",
+    "own_sd_db": "the flight's own nuisance",
+    "noise_sd_db": "noise",
+    "fading_sd_db": "fading within the average",
+}
+
+
 def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
     stem = f"{safe_name(panel.tower)}_{safe_name(panel.channel)}"
     section = f"rss/{panel.tower}/{panel.channel}"
@@ -141,6 +161,7 @@ def _rss_specs(data: ReportData, panel: RssPanel) -> list[FigureSpec]:
                 else ""
             )
             + "Bottom: residual; dashed lines are plus and minus one RMSE."
+            + _band_words(panel)
             + (
                 f" Of {count(len(panel.time))} samples {count(POINTS_PER_CLOUD)} are drawn, and every extreme."
                 if len(panel.time) > POINTS_PER_CLOUD

@@ -12,6 +12,7 @@ from ..compare.ladder import LadderRow
 from .canvas import (
     MEASURED,
     POINTS_PER_CLOUD,
+    POINTS_PER_LINE,
     SIMULATED,
     TOWER,
     WAYPOINT,
@@ -178,6 +179,10 @@ def rss_over_time(data: ReportData, panel: RssPanel) -> Figure:
             label=f"{pretty(baseline.name)} (own offset)",
         )  # fmt: skip
     ax.plot(*thinned(seconds, panel.simulated_dbm), color=SIMULATED, linewidth=1.0, label="ray tracing", zorder=3)
+    if "simulated_low_dbm" in panel.per_sample:
+        some = slice(None, None, max(1, len(seconds) // POINTS_PER_LINE))
+        low, high = (panel.per_sample[f"simulated_{end}_dbm"][some] for end in ("low", "high"))
+        ax.fill_between(seconds[some], low, high, color=SIMULATED, alpha=0.15, linewidth=0, label="90 % band", zorder=1)
     alone = lonely(panel.simulated_dbm)  # a line shows no single point between two gaps
     ax.plot(seconds[alone], panel.simulated_dbm[alone], linestyle="none", marker=".", markersize=4, color=SIMULATED)
     draw_waypoints(ax, data, start)

@@ -31,6 +31,8 @@ class SpherePattern(MeasuredPattern):
         Names of the flights that the gain was learned from, where the file says so.
     trained_on : tuple of str
         SHA-256 of their logs: on those it must not be scored.
+    notes : str
+        Comments of the file.
     """
 
     def __init__(
@@ -41,10 +43,12 @@ class SpherePattern(MeasuredPattern):
         frequency_hz: float | None = None,
         learned_from: tuple[str, ...] = (),
         trained_on: tuple[str, ...] = (),
+        notes: str = "",
     ) -> None:
         super().__init__(name, np.sqrt(power_from_db(gain_dbi)).astype(np.complex128), None, frequency_hz)
         self.learned_from = learned_from
         self.trained_on = trained_on
+        self.notes = notes
         self._sd_db = np.asarray(sd_db, dtype=np.float64)
 
     def gain_sd_db(self, theta_rad: FloatArray, phi_rad: FloatArray) -> FloatArray:
@@ -170,7 +174,10 @@ def read_sphere_csv(path: str | Path, *, name: str | None = None) -> SpherePatte
     gain[row, column] = values[:, 2]
     if len(header) > 3:
         sd[row, column] = values[:, 3]
-    return SpherePattern(name or path.stem, gain, sd, learned_from=_flights_in(text), trained_on=trained_on(text))
+    notes = "\n".join(line for line in text.splitlines() if line.startswith("#"))
+    return SpherePattern(
+        name or path.stem, gain, sd, learned_from=_flights_in(notes), trained_on=trained_on(notes), notes=notes
+    )
 
 
 LEARNED = "# aerpaw-cmp calibrate: "

@@ -1,0 +1,55 @@
+"""Error bars of a learned prediction hold what they say."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from aerpaw_cmp.compare.direction_gain import LinkSamples
+from aerpaw_cmp.compare.spread import SHARES, Spread, StatedSpread, fading_of, inside_shares
+
+N = 60_000
+
+
+def samples(level_db: np.ndarray) -> LinkSamples:
+    unit = np.tile([1.0, 0.0, 0.0], (len(level_db), 1))
+    return LinkSamples(
+        flight="a", tower="LW1", channel="A", time_s=0.1 * np.arange(len(level_db)), position_m=100.0 * unit,
+        at_uav=unit, at_tower=unit, residual_db=level_db,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("freedom", "kurtosis"), [(np.inf, 0.0), (8.0, 1.5)])
+def test_fading_is_what_is_left_within_the_mean(freedom: float, kurtosis: float) -> None:
+    """Planted: 2.5 dB of normal or of heavy-tailed fading on a level that moves by 10 dB from bin to bin."""
+    random = np.random.default_rng(3)
+    fading = random.normal(size=N) if np.isinf(freedom) else random.standard_t(freedom, N)
+    slow = np.repeat(random.normal(0.0, 10.0, N // 40), 40)
+    sd, found = fading_of([samples(slow + 2.5 * fading / fading.std())], 4.0)
+    assert sd == pytest.approx(2.5, rel=0.01)
+    assert found == pytest.approx(kurtosis, abs=0.25)
+    gone = np.full(N, np.nan)
+    assert fading_of([samples(gone)], 4.0) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("freedom", [5.0, 8.0, 30.0, np.inf])
+def test_intervals_hold_their_share_with_heavy_tails(freedom: float) -> None:
+    """Gain, nuisance and noise normal, fading of Student's t: 50, 90 and 95 % within 2 points."""
+    random = np.random.default_rng(4)
+    gain = random.uniform(0.5, 3.0, N)
+    fading = random.normal(size=N) if np.isinf(freedom) else random.standard_t(freedom, N)
+    fading *= 4.0 / fading.std()
+    error = random.normal(0.0, np.sqrt(gain**2 + 3.0**2 + 2.0**2)) + fading
+    kurtosis = float(np.mean(fading**4) / np.mean(fading**2) ** 2 - 3.0)
+    spread = Spread(own_sd_db=3.0, noise_sd_db=2.0, fading_sd_db=4.0, fading_kurtosis=kurtosis, bin_s=4.0)
+    held = inside_shares(error, StatedSpread(gain_sd_db=gain, spread=spread))
+    for share in SHARES:
+        assert held[f"inside_{100 * share:.0f}"] == pytest.approx(share, abs=0.02)
+    assert error.std() == pytest.approx(float(np.sqrt(np.mean(spread.total_db(gain) ** 2))), rel=0.02)
+
+
+def test_a_file_says_its_spread_and_one_of_another_kind_none() -> None:
+    spread = Spread(own_sd_db=2.1, noise_sd_db=1.5, fading_sd_db=2.25, fading_kurtosis=0.75, bin_s=4.0)
+    assert Spread.from_text(f"# a note\n# {spread.text()}\n") == spread
+    for text in ("", "# spread: own_sd_db 2", "# spread: own_sd_db two noise_sd_db 1", spread.text()):
+        assert Spread.from_text(text) is None

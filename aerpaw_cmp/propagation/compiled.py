@@ -1,20 +1,28 @@
-"""Whether and how the compiled kernels run: settings, fall-back to NumPy, threads.
+"""Whether and how compiled kernels run: the choice, the folder that keeps them, threads.
 
-numba is optional (extra ``fast``). Importing it and reading the compiled code takes about a second, the first
-compilation on a machine some ten; so replays too small to gain from it stay with NumPy. The choice depends on the size
-of the work alone: the same replay is evaluated the same way each time. ``AERPAW_CMP_COMPILED`` decides otherwise:
-``auto``, ``never`` or ``always``.
+numba is optional (extra ``fast``). Importing it and reading compiled code takes about a second, compiling it once a
+machine ten to thirty. So a job is compiled where NumPy would take longer than that: the estimated seconds of all jobs
+of a process decide, and a first report never waits for a compiler. ``AERPAW_CMP_COMPILED`` decides otherwise: ``auto``,
+``never`` or ``always``.
+
+numba's cache on disk notices a change in the file of a kernel alone: laws and constants that a kernel takes from
+another file would stay as they were compiled. So the folder is named by a hash of every source of compiled code.
 """
 
 from __future__ import annotations
 
 import os
+import sys
+import tempfile
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import sha256
 from importlib import import_module
+from importlib.metadata import version
 from importlib.util import find_spec
+from pathlib import Path
 from threading import Lock, Thread
 from types import ModuleType
 from typing import Any
@@ -24,10 +32,30 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import AnyArray
 
+ROOM = Path(__file__).parent
 SWITCH = "AERPAW_CMP_COMPILED"
-ENOUGH_WORK = 400_000
-"""Element pairs of all links of a replay from which compiled code is faster, numba's import included
-(``benchmarks/kernel.py --break-even``)."""
+FIELD, BEAMS = "field.kernels", "growth"
+SOURCES = (
+    "field/dyads.py", "field/fresnel.py", "field/kernels.py",
+    "growth.py", "merging.py", "boxtree.py", "image.py", "compiled.py", "numba_options.py",
+)  # fmt: skip
+"""Files of kernels, and those whose functions and constants they take in."""
+
+COMPILE_S = {FIELD: 10.0, BEAMS: 25.0}
+"""CPU seconds of the first compilation on a machine."""
+READ_S = 0.4
+"""CPU seconds of NumPy from which numba's import and reading what was compiled before pay off."""
+LEAST_S = 0.25
+"""A job that NumPy does in less stays there, whatever is loaded."""
+
+FIELD_S = 6e-7
+"""CPU seconds of NumPy per element pair of a link (``benchmarks/kernel.py``)."""
+MIRRORS_S = 1.6e-7
+"""CPU seconds of NumPy per link and face, sequences of two reflections."""
+
+
+_in_numpy_s = {FIELD: 0.0, BEAMS: 0.0}
+"""Estimated seconds of this process so far."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,26 +80,65 @@ def switch() -> str:
     return value
 
 
-def kernels_for(work: int) -> ModuleType | None:
-    """Compiled kernels of the field, or None: the work (element pairs of links) is too small, or they cannot run."""
-    return _chosen("field.kernels", work)
+def source_hash() -> str:
+    """Hash of the sources, of numba's version and of Python's."""
+    made = sha256(f"{version('numba')} {sys.version_info[:3]}".encode())
+    for name in SOURCES:
+        made.update((ROOM / name).read_bytes())
+    return made.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1)
+def cache_folder() -> Path | None:
+    """Folder of compiled code: ``NUMBA_CACHE_DIR``, beside this file or the user's cache; None if none is kept."""
+    given = os.environ.get("NUMBA_CACHE_DIR")
+    home = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
+    for base in (Path(given),) if given else (ROOM / "__pycache__", home / "aerpaw-cmp" / "compiled"):
+        folder = base / f"kernels-{source_hash()}"
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with tempfile.TemporaryFile(dir=folder):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+def kernels_for(pairs: int) -> ModuleType | None:
+    """Compiled kernels of the field, or None: a job of so many element pairs of links is too small, or they fail."""
+    return _worth(FIELD, pairs * FIELD_S)
+
+
+def beams_for(links: int, faces: int) -> bool:
+    """Whether compiled beams are worth it where mirror images in NumPy would do as well."""
+    return _worth(BEAMS, links * faces * MIRRORS_S) is not None
 
 
 def beams() -> State:
     """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.growth`), or why it cannot run."""
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
-    return load("growth")
+    return load(BEAMS)
 
 
-def _chosen(name: str, work: int) -> ModuleType | None:
+def _worth(name: str, numpy_s: float) -> ModuleType | None:
+    """Compiled code for a job that takes NumPy so many CPU seconds; None where that is quicker."""
     chosen = switch()
-    if chosen == "never" or (chosen == "auto" and work < ENOUGH_WORK):
+    _in_numpy_s[name] += numpy_s  # many small jobs of one process are a large one
+    if chosen == "never" or (chosen == "auto" and (numpy_s < LEAST_S or _in_numpy_s[name] < _cost_s(name))):
         return None
     state = load(name)
     if state.kernels is None and (chosen == "always" or find_spec("numba") is not None):
         warn_once(state.reason)
     return state.kernels
+
+
+def _cost_s(name: str) -> float:
+    """CPU seconds until compiled code runs: it is loaded, kept on disk, or has to be compiled."""
+    if f"{__package__}.{name}" in sys.modules:
+        return LEAST_S
+    folder = cache_folder() if find_spec("numba") else None
+    return READ_S if folder is not None and (folder / f"{name}.compiled").exists() else COMPILE_S[name]
 
 
 @lru_cache(maxsize=4)
@@ -88,6 +155,8 @@ def load(name: str) -> State:
             warnings.simplefilter("ignore")  # numba's own, about its cache
             kernels = import_module(f".{name}", __package__)
             kernels.try_out()
+            if (folder := cache_folder()) is not None:
+                (folder / f"{name}.compiled").touch()
     except Exception as error:
         line = (str(error).splitlines() or [""])[0]
         return State(None, f"compiled code cannot run ({type(error).__name__}: {line})")

@@ -18,7 +18,7 @@ from ..site.site import Site
 from . import image
 from .arrays import Link, Poses
 from .cache import PathCache
-from .compiled import beams, switch, warn_once
+from .compiled import beams, beams_for, switch, warn_once
 from .effort import Estimate
 from .interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
 from .options import Run, Search
@@ -126,7 +126,7 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
     common |= {"max_depth": search.max_depth}
     ends = scene.sources_m, poses.position_m
     extent = None if run.whole is None else run.whole.extent_m
-    if by_beams(scene, search):
+    if by_beams(scene, search, _links(scene, run)):
         from . import growth, prisms  # compiled: loaded where there are many faces
 
         common |= {"longest_m": _longest_m(scene, poses, search), "threads": run.threads}
@@ -196,18 +196,27 @@ def other_paths(
     yield joined
 
 
-def by_beams(scene: Scene, search: Search) -> bool:
-    """Whether the image engine searches by compiled beams: a scene of triangles, or many faces."""
+def by_beams(scene: Scene, search: Search, links: int = 0) -> bool:
+    """Whether the image engine searches by compiled beams: a scene of triangles, many faces, or a large job."""
     if search.engine != "image":
         return False
     if scene.surfaces is not None:
         return True
-    if search.max_depth < 2 or len(scene.faces) <= MANY_FACES or find_spec("numba") is None:
+    if search.max_depth < 2:
+        return False
+    if len(scene.faces) <= MANY_FACES:
+        return links > 0 and beams_for(links, len(scene.faces))
+    if find_spec("numba") is None:
         return False
     state = beams()
     if state.kernels is None and switch() != "never":
         warn_once(state.reason)
     return state.kernels is not None
+
+
+def _links(scene: Scene, run: Run) -> int:
+    """Links of the whole job."""
+    return scene.excluded.size if run.whole is None else run.whole.links
 
 
 def _longest_m(scene: Scene, poses: Poses, search: Search) -> float | FloatArray:

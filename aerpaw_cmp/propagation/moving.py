@@ -157,7 +157,8 @@ def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
     good = poses.position_m[np.isfinite(poses.position_m).all(axis=1)]
     points = np.concatenate([good, sources_m])
     pairs = len(poses) * len(link.uav_array) * sum(map(len, link.tower_arrays.values()))
-    return Whole(np.stack([points.min(axis=0), points.max(axis=0)]), pairs * WORK_PER_POSE)
+    extent = np.stack([points.min(axis=0), points.max(axis=0)])
+    return Whole(extent, 0, pairs * WORK_PER_POSE)  # each place has few faces in reach: mirror images
 
 
 def _one_tower(link: Link) -> tuple[str, ...]:

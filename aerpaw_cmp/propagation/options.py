@@ -132,11 +132,12 @@ class Whole:
     ----------
     extent_m : (points, 3)
         Points that span all poses: they set the tolerance of the path search.
-    pairs : int
-        Element pairs of all links: they decide whether compiled code is worth loading.
+    links, pairs : int
+        All links and their element pairs: they decide whether compiled code is worth loading.
     """
 
     extent_m: FloatArray
+    links: int
     pairs: int
 
 

@@ -320,7 +320,8 @@ def test_a_broken_numba_is_told_once_and_the_replay_goes_on(monkeypatch, fresh, 
     module = types.ModuleType("kernels")
     module.try_out = broken
     monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", module)
-    monkeypatch.setattr(compiled, "ENOUGH_WORK", 1)
+    monkeypatch.setattr(compiled, "_cost_s", lambda _: 0.0)
+    monkeypatch.setattr(compiled, "LEAST_S", 0.0)
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     site, link, poses, paths = case
     with pytest.warns(RuntimeWarning, match="cannot run"):
@@ -364,7 +365,7 @@ def test_a_fault_planted_in_a_file_that_a_kernel_takes_in_reaches_compiled_code(
 
 @needs_numba
 def test_every_file_that_kernels_take_in_names_the_folder_of_compiled_code():
-    from aerpaw_cmp.propagation.numba_options import ROOM, SOURCES
+    from aerpaw_cmp.propagation.compiled import ROOM, SOURCES
 
     known = {(ROOM / name).resolve() for name in SOURCES}
     holders = {path for path in ROOM.rglob("*.py") if "\n@kernel\n" in path.read_text(encoding="utf-8")}
@@ -435,13 +436,42 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
         Scene.of(dataclasses.replace(site, scene=mesh), link, poses)
 
 
-def test_only_large_work_is_compiled(monkeypatch):
+def test_compiled_code_has_to_be_quicker_than_numpy_its_compilation_included(monkeypatch, tmp_path):
     monkeypatch.delenv(compiled.SWITCH, raising=False)
     monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
-    assert compiled.kernels_for(compiled.ENOUGH_WORK - 1) is None
-    assert compiled.kernels_for(compiled.ENOUGH_WORK) is not None
+    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compiled, "find_spec", lambda _: True)
+    monkeypatch.delitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", raising=False)
+
+    def least_pairs():
+        monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
+        pairs = 10**5
+        while compiled.kernels_for(pairs) is None:
+            monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
+            pairs *= 2
+        return pairs
+
+    never_compiled = least_pairs()
+    (tmp_path / f"{compiled.FIELD}.compiled").touch()
+    on_disk = least_pairs()
+    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", types.ModuleType("kernels"))
+    loaded = least_pairs()
+    assert loaded <= on_disk < never_compiled
+    assert never_compiled * compiled.FIELD_S >= compiled.COMPILE_S[compiled.FIELD]
     monkeypatch.setenv(compiled.SWITCH, "never")
     assert compiled.kernels_for(10**9) is None
+
+
+def test_many_jobs_of_one_process_pay_for_a_compiler(monkeypatch, tmp_path):
+    monkeypatch.delenv(compiled.SWITCH, raising=False)
+    monkeypatch.setattr(compiled, "load", lambda _: compiled.State(types.ModuleType("kernels"), ""))
+    monkeypatch.setattr(compiled, "cache_folder", lambda: tmp_path)
+    monkeypatch.setitem(compiled._in_numpy_s, compiled.FIELD, 0.0)
+    monkeypatch.delitem(sys.modules, "aerpaw_cmp.propagation.field.kernels", raising=False)
+    pairs = int(1.0 / compiled.FIELD_S)  # a second of NumPy
+    before = [compiled.kernels_for(pairs) is not None for _ in range(30)]
+    assert before == sorted(before)
+    assert before.index(True) * 1.0 == pytest.approx(compiled.COMPILE_S[compiled.FIELD], abs=1.0)
 
 
 def test_wrong_settings_are_named(monkeypatch):

@@ -67,7 +67,7 @@ def soak(simulated_s: float, speed: float, folder: Path, *, web: bool) -> dict[s
             if elapsed > 0.2:
                 memory.append(resident_kib(process.pid))
             time.sleep(min(1.0, duration_s / 40))
-        out, err = process.communicate(timeout=60)
+        out, err = process.communicate(timeout=120)
         if process.returncode:
             raise RuntimeError(f"the tap ended with {process.returncode}: {err or out}")
         summary, third = json.loads(out), max(1, len(memory) // 3)
@@ -98,7 +98,7 @@ def pace(seconds: float, folder: Path, *, web: bool) -> dict[str, Any]:
         time.sleep(seconds)
         share = (cpu_s(process.pid) - before) / (time.monotonic() - start)
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
     for browser in browsers:
         browser.terminate()
     seen = [json.loads(browser.communicate()[0]) for browser in browsers]
@@ -155,7 +155,7 @@ def fuzz(requests: int, folder: Path) -> dict[str, Any]:
         grown = resident_kib(process.pid) - memory
         alive = process.poll() is None
         process.send_signal(signal.SIGINT)
-        process.communicate(timeout=30)
+        process.communicate(timeout=120)
         result = kept(log, modem)
     return {"requests": requests, "answers_by_status": dict(answers), "other_content": others, "alive": alive,
             "fuzz_memory_grown_kib": grown, "fuzz_lost": result["lost"]}  # fmt: skip

@@ -108,6 +108,7 @@ class _Modem:
     measured: Rows = field(default_factory=lambda: Rows(len(MEASURED)))
     predicted: Rows = field(default_factory=lambda: Rows(len(PREDICTED)))
     shift_ns: int = 0
+    period_s: float = 0.5
     rank_s: float = 0.0
     gps_s: float = 0.0
     step_s: float | None = None
@@ -269,6 +270,7 @@ class Feed:
         if not self._live:
             modem.shift_ns = record["utc_ns"] - record["mono_ns"]
         modem.port = str(record.get("port", {}).get("device", ""))
+        modem.period_s = 1.0 / record.get("settings", {}).get("ri_hz", 2.0)
         modem.connected, modem.ended = True, False
         modem.unsynchronised = record.get("clock_synchronised") is False
         modem.rank_s = self._seconds(modem, record["mono_ns"])
@@ -359,17 +361,18 @@ class Feed:
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     """Alarms that hold at this moment, by kind."""
     found: dict[str, str] = {}
+    stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(GPS_LOST_S, 3 * modem.period_s)
     if modem.gap_text:
         found["gap"] = modem.gap_text
-    elif modem.connected and now - modem.rank_s > STALE_S:
-        found["stale"] = f"no rank for more than {STALE_S:g} s: is data flowing, and CSI reporting on?"
-    if modem.predicts and now - modem.gps_s > GPS_LOST_S:
+    elif modem.connected and now - modem.rank_s > stale_s:
+        found["stale"] = f"no rank for more than {stale_s:g} s: is data flowing, and CSI reporting on?"
+    if modem.predicts and now - modem.gps_s > lost_s:
         if modem.fix is not None and 0 <= modem.fix < 3:
             found["gps"] = "GPS lost: the telemetry states no 3-D fix"
         elif modem.age_s is None:
             found["gps"] = "no position: the telemetry log holds no line so far"
         else:
-            found["gps"] = f"no position for more than {GPS_LOST_S:g} s: the telemetry log does not reach the present"
+            found["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
     if modem.disk_fault:
         found["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
     elif modem.disk_free_bytes is not None and modem.disk_free_bytes < DISK_LOW_BYTES:

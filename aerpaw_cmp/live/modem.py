@@ -15,6 +15,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from typing import Any
 
 from ..common.errors import UsageError
@@ -363,39 +364,23 @@ QUERIES: Mapping[str, Query] = {
         Query("identity", "ATI", None, decode_identity),
         Query("firmware", "AT+CGMR", None, lambda lines, _flags: {"text": list(lines)}),
         Query("csi_ctrl", 'AT+QNWCFG="csi_ctrl"', ('+QNWCFG:"csi_ctrl"',), decode_csi_ctrl),
-        Query(
-            "nr5g_csi",
-            'AT+QNWCFG="nr5g_csi"',
-            ('+QNWCFG:"nr5g_csi"',),
-            lambda lines, flags: decode_csi(lines, flags, "nr5g_csi"),
-        ),
-        Query(
-            "lte_csi",
-            'AT+QNWCFG="lte_csi"',
-            ('+QNWCFG:"lte_csi"',),
-            lambda lines, flags: decode_csi(lines, flags, "lte_csi"),
-        ),
+        Query("nr5g_csi", 'AT+QNWCFG="nr5g_csi"', ('+QNWCFG:"nr5g_csi"',), partial(decode_csi, which="nr5g_csi")),
+        Query("lte_csi", 'AT+QNWCFG="lte_csi"', ('+QNWCFG:"lte_csi"',), partial(decode_csi, which="lte_csi")),
         Query("servingcell", 'AT+QENG="servingcell"', ("+QENG:",), decode_servingcell),
-        Query(
-            "qrsrp", "AT+QRSRP", ("+QRSRP:",), lambda lines, flags: decode_antennas(lines, flags, "+QRSRP", "rsrp_dbm")
-        ),
-        Query(
-            "qrsrq", "AT+QRSRQ", ("+QRSRQ:",), lambda lines, flags: decode_antennas(lines, flags, "+QRSRQ", "rsrq_db")
-        ),
-        Query(
-            "qsinr", "AT+QSINR", ("+QSINR:",), lambda lines, flags: decode_antennas(lines, flags, "+QSINR", "sinr_db")
-        ),
+        Query("qrsrp", "AT+QRSRP", ("+QRSRP:",), partial(decode_antennas, command="+QRSRP", kind="rsrp_dbm")),
+        Query("qrsrq", "AT+QRSRQ", ("+QRSRQ:",), partial(decode_antennas, command="+QRSRQ", kind="rsrq_db")),
+        Query("qsinr", "AT+QSINR", ("+QSINR:",), partial(decode_antennas, command="+QSINR", kind="sinr_db")),
         Query(
             "qnwinfo",
             "AT+QNWINFO",
             ("+QNWINFO:",),
-            lambda lines, flags: decode_rows(lines, flags, "+QNWINFO", ("act", "operator", "band", "channel")),
+            partial(decode_rows, command="+QNWINFO", names=("act", "operator", "band", "channel")),
         ),
         Query(
             "qcainfo",
             "AT+QCAINFO",
             ("+QCAINFO:",),
-            lambda lines, flags: decode_rows(lines, flags, "+QCAINFO", ("role", "arfcn", "bandwidth", "band")),
+            partial(decode_rows, command="+QCAINFO", names=("role", "arfcn", "bandwidth", "band")),
         ),
     )
 }

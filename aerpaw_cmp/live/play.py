@@ -35,7 +35,7 @@ class Player:
     def __init__(self, folders: Sequence[Path], speed: float = 1.0) -> None:
         if not 0 < speed <= 1e6:
             raise UsageError(f"--speed {speed:g}", expected="a positive number")
-        self._speed, self._bad = speed, list[BadLine]()
+        self._wanted_speed, self._speed, self._bad = speed, 0.0, list[BadLine]()
         logs = [_timed(folder, modem, self._bad) for modem, folder in enumerate(folders)]
         self._records = heapq.merge(*logs, key=lambda item: item[0])
         self._next = next(self._records, None)
@@ -44,11 +44,12 @@ class Player:
         self._at_ns, self._since = self._next[0], time.monotonic()
 
     def steady_ns(self) -> int:
-        """Time of the log that is played now [ns]."""
+        """Time of the log that is played now [ns]; it stands still before the play and after it."""
         return self._at_ns + int((time.monotonic() - self._since) * self._speed * 1e9)
 
     def play(self, feed: Feed, stop: Stop) -> int:
         """Play to the end of the log or until asked to stop; the number of unreadable lines."""
+        self._since, self._speed = time.monotonic(), self._wanted_speed
         while self._next is not None and not stop.count:
             due, modem, record = self._next
             ahead_s = (due - self.steady_ns()) / 1e9

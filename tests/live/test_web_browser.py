@@ -389,6 +389,12 @@ def test_the_demo_of_the_readme(driver, tmp_path):
             driver, "commands"
         )
         assert [path.suffix for path in log.iterdir()] == [".jsonl"]
+        drafted = run("ingest", log, telemetry, "--timezone", "America/New_York", "--draft", tmp_path / "flight.yaml")
+        out, err = drafted.communicate(timeout=60)
+        assert drafted.returncode == 0, err
+        assert "rank: nr5g" in out
+        assert "rows are missing" not in out + err
+        assert (tmp_path / "flight.yaml").exists()
         shown = run("tap", "--play", log, "--speed", "50", "--web", "127.0.0.1:0", "--flight", flight)
         driver.get(page_of(shown))
         until(driver, "document.getElementById('state').textContent === 'log at its end'", 40)

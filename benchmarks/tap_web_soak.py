@@ -78,8 +78,8 @@ def soak(simulated_s: float, speed: float, folder: Path, *, web: bool) -> dict[s
         result = kept(log, modem)
     return result | {
         "missed_polls": sum(summary["missed"].values()),
-        "memory_grown_kib": round(sum(memory[-third:]) / third - sum(memory[:third]) / third),
-        "memory_kib": memory[-1],
+        "memory_grown_kib": round((sum(memory[-third:]) - sum(memory[:third])) / third),
+        "memory_kib": max(memory, default=0),
         **({"rows_shown": [s["rows"] for s in seen], "holes": sum(s["holes"] for s in seen)} if web else {}),
     }
 
@@ -177,7 +177,7 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         result: dict[str, Any] = {"simulated_s": simulated_s, "speed": arguments.speed}
-        for arm, part in (("alone", simulated_s / 6), ("web", simulated_s)):
+        for arm, part in (("alone", max(60.0, simulated_s / 6)), ("web", simulated_s)):
             found = soak(part, arguments.speed, folder, web=arm == "web")
             result |= {f"{arm}_{key}": value for key, value in found.items()}
         for arm in ("alone", "web"):

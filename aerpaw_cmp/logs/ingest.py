@@ -395,7 +395,7 @@ def _in_pieces(place: Path, reader: Reader, options: OptionsFor | None) -> Inges
     digest = hashlib.sha256()
     given = _options(place, options, _beside(place))
     read_pieces = reader.read_pieces
-    result = _checked(place, reader, lambda: read_pieces(chunks.file_pieces(place, digest), given))
+    result = _checked(place, reader, given, lambda: read_pieces(chunks.file_pieces(place, digest), given))
     return IngestedFile(str(place), digest.hexdigest(), result)
 
 
@@ -423,15 +423,15 @@ def _read(
     beside: Callable[[str], bytes | None] | None = None,
 ) -> IngestedFile:
     given = _options(path, options, beside or _beside(path))
-    return IngestedFile(str(path), digest, _checked(path, reader, lambda: reader.read(data, given)))
+    return IngestedFile(str(path), digest, _checked(path, reader, given, lambda: reader.read(data, given)))
 
 
-def _checked(path: Path, reader: Reader, read: Callable[[], ReadResult]) -> ReadResult:
+def _checked(path: Path, reader: Reader, options: ReadOptions, read: Callable[[], ReadResult]) -> ReadResult:
     """What a reader says, its impossible values flagged; messages name the file, which readers do not know."""
-    from . import limits  # loads pandas, as any reader does
+    from . import limits, origins  # load pandas, as any reader does
 
     try:
-        result = limits.check(read())
+        result = origins.stated(limits.check(read()), reader, options)
     except (InputError, UsageError) as error:
         if error.path is None:
             raise type(error)(

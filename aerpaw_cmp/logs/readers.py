@@ -96,6 +96,9 @@ class Reader:
     read_pieces : callable, optional
         ``read_pieces(pieces, options) -> ReadResult``: the same from pieces of whole lines, for logs larger than
         memory; see :mod:`aerpaw_cmp.logs.chunks`.
+    clock_from, height_from : str
+        ``written``, ``program: which``, or ``assumed: what``; see :mod:`aerpaw_cmp.logs.origins`. A stream's own
+        attribute of that name wins.
     """
 
     name: str
@@ -106,6 +109,8 @@ class Reader:
     read: Callable[[bytes, ReadOptions], ReadResult]
     pieces: bool = False
     read_pieces: ReadPieces | None = None
+    clock_from: str = "assumed: local wall time"
+    height_from: str = "assumed: above take-off"
 
 
 @cache

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 from aerpaw_cmp.logs.readers import Reader
 
 from . import (
+    _origins,
     aadm_snr,
     amarisoft,
     ardupilot_bin,
@@ -36,7 +39,7 @@ from . import (
     vehicle_out,
 )
 
-READERS: tuple[Reader, ...] = (
+_READERS: tuple[Reader, ...] = (
     vehicle_out.READER,
     sounder_log.READER,
     flight_mat.READER,
@@ -68,4 +71,12 @@ READERS: tuple[Reader, ...] = (
     own_csv.READER,
     generic_csv.READER,
     *no_log.READERS,
+)
+READERS: tuple[Reader, ...] = tuple(
+    replace(
+        reader,
+        clock_from=_origins.CLOCKS.get(reader.name, reader.clock_from),
+        height_from=_origins.HEIGHTS.get(reader.name, reader.height_from),
+    )
+    for reader in _READERS
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
@@ -19,7 +21,20 @@ ALTITUDE = (
     r"(gps )?(alt|altitude|ele|elevation)( m| ft| meters)?",
     r"osd altitude( ft| m)?",
     r"altitude above ?sea ?level.*",
+    r"(altitude|alt|height|elevation) (amsl|msl|asl)( m)?|(amsl|msl)( altitude| alt)?( m)?",
 )
+_SEA_LEVEL = re.compile(r"sea ?level|\b(amsl|msl|asl|ele|elevation)\b|^gps |^osd ")
+_OF_AERPAW = {
+    "gpsfix",
+    "numberofsatellites",
+    "number of satellite",
+    "number of satellites",
+    "batteryvolts",
+    "volt",
+    "voltage",
+}
+_OF_RECEIVERS = ({"gcrs", "spd"}, {"networktech"}, {"networkmode"})
+_REST_S, _REST_M, _REST_RISE_M = 5.0, 2.0, 0.3
 ANGLES = {
     "roll_deg": (r"(osd |gimbal )?roll( deg| degrees| rad)?",),
     "pitch_deg": (r"(osd )?pitch( deg| degrees| rad)?",),
@@ -71,7 +86,8 @@ def from_sheet(rows: _rows.Rows, sheet: _sheet.Sheet, *, name: str, source: str)
         if (column := sheet.find(*form)) is not None:
             count = sheet.numbers(column)
             values[key] = np.where(np.abs(count) < _MOST, count, -1).astype(np.int64)
-    return rows.stream("telemetry", name, values, where=None if lost.all() else ~lost, source=source)
+    where = None if lost.all() else ~lost
+    return rows.stream("telemetry", name, values, where=where, source=source, height_from=rows.height_from)
 
 
 def clean(rows: _rows.Rows, values: dict[str, AnyArray]) -> AnyArray:
@@ -101,15 +117,42 @@ _TAKEN_OFF = "altitudes are above sea level: {:.1f} m, that of the first positio
 def _altitude(rows: _rows.Rows, sheet: _sheet.Sheet, lost: BoolArray) -> FloatArray:
     column = sheet.find(*ABOVE_TAKEOFF)
     if column is not None:
+        rows.height_from = "written"
         return sheet.numbers(column)
     column = sheet.find(*ALTITUDE)
     if column is None:
         rows.warnings.append("the log has no altitude: give the track another log, or heights are unknown")
         return np.full(len(rows), np.nan)
     altitude = sheet.numbers(column)
-    known = altitude[np.isfinite(altitude) & ~lost]
-    # take-off is where a flight's log begins: what begins within a few metres of zero is relative to it
-    return above_takeoff(rows, altitude, lost) if len(known) and abs(known[0]) >= 10.0 else altitude
+    first = altitude[np.isfinite(altitude) & ~lost][:1]
+    if not len(first) or abs(first[0]) < 10.0:  # what begins within a few metres of zero is relative to take-off
+        return altitude
+    rows.height_from, names = "program", set(sheet.plain)
+    if len(_OF_AERPAW & names) > 1:
+        return altitude  # converted vehicleOut, whose altitude is above take-off also where the table begins in flight
+    if _SEA_LEVEL.search(sheet.plain[column]):
+        rows.height_from = "written"
+    elif not any(signs <= names for signs in _OF_RECEIVERS):
+        rows.height_from = "assumed"
+        if not _begins_at_rest(rows, sheet, altitude, lost):
+            text = f"altitude begins at {first[0]:.1f} m in flight and nothing says above what: read as above take-off"
+            rows.warnings.append(text)
+            return altitude
+    return above_takeoff(rows, altitude, lost)
+
+
+def _begins_at_rest(rows: _rows.Rows, sheet: _sheet.Sheet, altitude: FloatArray, lost: BoolArray) -> bool:
+    """Whether the first seconds of a track have one place and one height: that of the ground."""
+    seconds = (rows.time - rows.time[:1]) / np.timedelta64(1, "s")
+    early = np.flatnonzero(~lost & np.isfinite(altitude) & (seconds <= _REST_S))
+    if len(early) < 3:
+        return False
+    columns = [sheet.find(*form) for form in (LATITUDE, LONGITUDE)]
+    moved = [np.ptp(sheet.numbers(i)[early]) * _DEGREE_M for i in columns if i is not None]
+    return bool(max(moved) < _REST_M and np.ptp(altitude[early]) < _REST_RISE_M)
+
+
+_DEGREE_M = 111_000.0
 
 
 def _angles(rows: _rows.Rows, sheet: _sheet.Sheet) -> dict[str, FloatArray]:

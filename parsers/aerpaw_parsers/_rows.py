@@ -10,6 +10,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
+from itertools import pairwise
 
 import numpy as np
 
@@ -48,6 +49,10 @@ class Rows:
     warnings : list of str
     relative : bool
         Do the times count from an origin that nobody named?
+    clock_from : str, optional
+        ``written`` where all times carry an offset or are epochs.
+    height_from : str, optional
+        Of the track, where the table says more than its format.
     at : int array, shape (n,)
         Index of each row among those that were given to :func:`built`.
     data : bytes
@@ -65,6 +70,8 @@ class Rows:
     rejected: list[RejectedLine] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     relative: bool = False
+    clock_from: str | None = None
+    height_from: str | None = None
     at: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     data: bytes = field(default=b"", repr=False)
 
@@ -142,7 +149,8 @@ class Rows:
         if not len(row):
             return None
         frame = _frames.frame(kind, time, row + 1, shown, values)
-        attributes = ({"clock": "relative"} if self.relative else {}) | dict(about or {}) | attributes
+        shared = ({"clock": "relative"} if self.relative else {}) | {"clock_from": self.clock_from}
+        attributes = shared | dict(about or {}) | attributes
         return Stream(kind, name, frame, _frames.attributes(self.options, **attributes))
 
     def level(self, values: FloatArray) -> tuple[FloatArray, AnyArray]:
@@ -283,6 +291,7 @@ def built(
         rejected=rejected,
         warnings=warnings,
         relative=relative,
+        clock_from="written" if clock.startswith("epoch") or instants.zoned else None,
         at=at,
         data=lines.data,
     )
@@ -360,8 +369,8 @@ def mean_rank(
     *,
     none: BoolArray,
     pick: IntArray | None = None,
-) -> Stream | None:
-    """Rank stream ``gnb`` of a base station that counts from one and prints means over its report period.
+) -> list[Stream | None]:
+    """Rank streams ``gnb`` of a base station that counts from one and prints means over its report period.
 
     A mean between two ranks is no rank: it stands in ``rank_mean`` and its row is flagged ``rank_is_a_mean``.
 
@@ -388,8 +397,49 @@ def mean_rank(
         **beside,
         "rank_mean": np.where(good, ri, np.nan),
     }
-    where = None if pick is not None else np.ones(len(rows), dtype=bool)
     about = {"ri_base": "one", "source": "CSI report, mean over the period"}
-    if pick is not None:
-        return rows.stream("rank", rows.options.channel or "gnb", values, pick=pick, flag=flag, about=about)
-    return rows.stream("rank", rows.options.channel or "gnb", values, where=where, flag=flag, about=about)
+    return of_ues(rows, "rank", rows.options.channel or "gnb", values, pick=pick, flag=flag, about=about)
+
+
+def of_ues(
+    rows: Rows,
+    kind: Kind,
+    name: str,
+    values: Mapping[str, FloatArray],
+    *,
+    pick: IntArray | None = None,
+    flag: AnyArray,
+    about: Mapping[str, Attribute | None],
+) -> list[Stream | None]:
+    """A stream per UE where several were attached at once, else one: a UE that attaches again gets another RNTI.
+
+    Parameters
+    ----------
+    values : mapping
+        Columns of shape (m,), ``rnti`` among them (NaN where the log names none).
+    pick : int array, shape (m,), optional
+        See :meth:`Rows.stream`.
+    flag : object array, shape (m,)
+    about : mapping
+        Attributes of all.
+    """
+    pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
+    known = np.unique(rnti[np.isfinite(rnti)]).astype(int).tolist()
+    if not _together([np.flatnonzero(rnti == one)[[0, -1]] for one in known]):
+        one = {"rnti": known[0]} if len(known) == 1 else {"identity_from": "assumed"}
+        return [rows.stream(kind, name, values, pick=pick, flag=flag, about={**about, **one})]
+    parts = [(f"{name}_rnti{one:04x}", rnti == one, {"rnti": one}) for one in known]
+    parts.append((name, np.isnan(rnti), {"identity_from": "assumed"}))
+    return [
+        rows.stream(
+            kind, ue, {key: column[mine] for key, column in values.items()}, pick=pick[mine], flag=flag[mine],
+            about={**about, **more},
+        )
+        for ue, mine, more in parts
+    ]  # fmt: skip
+
+
+def _together(spans: list[IntArray]) -> bool:
+    """Whether any two spans (first, last) overlap."""
+    ordered = sorted(spans, key=lambda span: int(span[0]))
+    return any(later[0] < earlier[1] for earlier, later in pairwise(ordered))

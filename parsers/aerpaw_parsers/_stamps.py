@@ -144,8 +144,26 @@ def _of_day(texts: Sequence[str], options: ReadOptions) -> tuple[str, AnyArray, 
     seconds = np.array([_seconds(one.groups()) if one else np.nan for one in found], dtype=np.float64)
     seconds += 86_400.0 * np.cumsum(np.nan_to_num(np.diff(seconds, prepend=np.nan)) < -43_200)
     marked = any(one[5] for one in found if one)
+    hours = _hours_off(seconds, options.file_name)
+    seconds -= 3600.0 * hours
     warnings = ["the times are marked as UTC but read as local, as the program's own names say"] if marked else []
+    if hours:
+        warnings.append(f"the times are {hours:+d} h from the time in the file name: read as those of the name, local")
     return _on_a_date(seconds, options, warnings)
+
+
+_NEMO_NAME = re.compile(r"(?<!\d)\d\d[A-Z][a-z]{2}\d\d_(\d\d)(\d\d)(\d\d)(?!\d)")
+_NEAR_S = 300.0
+
+
+def _hours_off(seconds: FloatArray, name: str) -> int:
+    """Whole hours between the first time of the day [s] and the one in Nemo's file name; 0 where there is none."""
+    found, known = _NEMO_NAME.search(name), seconds[np.isfinite(seconds)][:1]
+    if found is None or not len(known):
+        return 0
+    apart = float(known[0]) - (int(found[1]) * 3600 + int(found[2]) * 60 + int(found[3]))
+    hours = round(apart / 3600)
+    return hours if abs(apart - 3600 * hours) < _NEAR_S else 0
 
 
 def _on_a_date(seconds: FloatArray, options: ReadOptions, warnings: list[str]) -> tuple[str, AnyArray, list[str]]:

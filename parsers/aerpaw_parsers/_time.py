@@ -48,12 +48,15 @@ class Instants:
         Wall clock read twice, or never, because of a change of the clock.
     warnings : tuple of str
         What the user should know.
+    zoned : bool
+        Do all texts carry an offset?
     """
 
     time: AnyArray
     ambiguous: BoolArray
     nonexistent: BoolArray
     warnings: tuple[str, ...] = field(default=())
+    zoned: bool = False
 
     def take(self, rows: IntArray) -> Instants:
         """Some of the times; the warnings stay with the whole."""
@@ -379,7 +382,7 @@ def parsed_to_utc(
     utc = (wall - offset_s * 1_000_000_000).astype("datetime64[ns]")
     ambiguous, nonexistent = np.zeros(len(wall), dtype=bool), np.zeros(len(wall), dtype=bool)
     if not naive.any():
-        return Instants(utc, ambiguous, nonexistent)
+        return Instants(utc, ambiguous, nonexistent, zoned=bool(valid.any()))
     local = wall_to_utc(wall[naive], options, needed_by=needed_by)
     utc[naive], ambiguous[naive], nonexistent[naive] = local.time, local.ambiguous, local.nonexistent
     return Instants(utc, ambiguous, nonexistent, local.warnings)

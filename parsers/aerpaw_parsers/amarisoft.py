@@ -78,7 +78,7 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     kept = [found[i][2] for i in rows.at.tolist()]
     value = {name: np.array([one.get(name, np.nan) for one in kept]) for name in _WANTED}
     beside = {"cqi": value["cqi"], "mcs": value["mcs"], "rnti": value["RNTI"]}
-    return rows.result([_rows.mean_rank(rows, value["ri"], beside, none=value["ri"] == 0)])
+    return rows.result(_rows.mean_rank(rows, value["ri"], beside, none=value["ri"] == 0))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -113,7 +113,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     }
     ri = _json.column(cells, "ri")
     pick = np.array([i for i, _ in pairs], dtype=np.int64)
-    return rows.result([_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick)])
+    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick))
 
 
 READER = Reader(

@@ -20,7 +20,7 @@ from aerpaw_cmp.common.units import AnyArray, IntArray
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _cells, _lines, _rows, _time
+from . import _lines, _rows, _time
 
 _CSI = re.compile(rb"\bUE (?P<rnti>[0-9a-f]{4}):? [^\n]{0,120}?\bCQI (?P<cqi>\d{1,2}),? RI (?P<ri>\d{1,2}),? PMI")
 _LEVEL = re.compile(
@@ -88,14 +88,16 @@ def read(data: bytes, options: ReadOptions) -> ReadResult:
     _lines.add_flag(flag, ~good, "ri_out_of_range")
     beside = {"rank": np.where(good, ri, np.nan), "ri_raw": ri, "cqi": value["cqi"][reported], "rnti": rnti[reported]}
     beside |= {"sinr_db": value["sinr"][reported], "rsrp_dbm": value["rsrp"][reported]}
-    rank = rows.stream(
-        "rank", options.channel or "oai", beside, pick=reported, flag=flag, ri_base="one", source="CSI report, last one"
+    about = {"ri_base": "one", "source": "CSI report, last one"}
+    ranks = _rows.of_ues(rows, "rank", options.channel or "oai", beside, pick=reported, flag=flag, about=about)
+    # a gNB prints 0 of 0 measurements
+    heard = np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
+    level, flag = rows.level(value["rsrp"])
+    levels = {"rss_db": level[heard], "serving": np.ones(len(heard)), "rnti": rnti[heard]}
+    about = {"channel": options.channel or "nr_rsrp", "unit": "dBm", "quantity": "RSRP", "rat": "nr"}
+    return rows.result(
+        [*ranks, *_rows.of_ues(rows, "rss", "nr_rsrp", levels, pick=heard, flag=flag[heard], about=about)]
     )
-    levels = [
-        _cells.Reading(row=int(i), rat="nr", pci=np.nan, arfcn=np.nan, rsrp_dbm=value["rsrp"][i], serving=True)
-        for i in np.flatnonzero(~np.isnan(value["rsrp"]) & (np.isnan(value["meas"]) | (value["meas"] > 0)))
-    ]  # a gNB prints 0 of 0 measurements
-    return rows.result([rank, *_cells.streams(rows, levels, source="OpenAirInterface")])
 
 
 READER = Reader(

@@ -15,6 +15,8 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+import numpy as np
+
 from aerpaw_cmp.logs.records import Stream
 
 from . import _rows, _text, _time
@@ -22,7 +24,7 @@ from . import _rows, _text, _time
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(
     rb"^\[(?P<time>" + _time.TIME + _time.ZONE + rb")\] *"
-    rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?[0-9a-fA-F]{1,5}"
+    rb"(?:(?:lte|nr)(?: +\d{1,4}(?= +[0-9a-fA-F]{2,5} ))? +)?(?P<rnti>[0-9a-fA-F]{1,5})"
     + _N % b"cqi" + _N % b"ri" + _N % b"mcs"
     + rb" +[0-9.]{1,12}[kMG]?(?: +\d{1,9}){2} +\d{1,3}% [^\n]{0,160}$",
     re.MULTILINE,
@@ -38,9 +40,10 @@ def _streams(rows: _rows.Rows) -> Iterator[Stream | None]:
     last = int(rows.row[-1]) if len(rows) else 0
     above = b"\n".join(rows.data.split(b"\n", last)[:last])
     ports = max((int(number) for number in _CHANNELS.findall(above)), default=0) or None
-    values = rows.rank(ri, none=ri == 0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs")}
+    rnti = np.array([int(text, 16) for text in rows.text("rnti")], dtype=np.float64)
+    values = rows.rank(ri, none=ri == 0) | {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti}
     about = {"ri_base": "one", "source": "CSI report, truncated mean", "ports": ports}
-    yield rows.stream("rank", rows.options.channel or "srsenb", values, about=about)
+    yield from _rows.of_ues(rows, "rank", rows.options.channel or "srsenb", values, flag=rows.flag, about=about)
 
 
 READER = _text.reader(

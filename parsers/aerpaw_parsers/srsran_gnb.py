@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -52,12 +53,17 @@ def sniff(head: bytes) -> bool:
 def read(data: bytes, options: ReadOptions) -> ReadResult:
     """Rank stream ``gnb`` with CQI and MCS; UsageError if no time zone is given."""
     pattern = _LOG if _SCHEDULER.search(data) and not _TITLE.search(data) else _ROW
+    begun = pattern.search(data)
+    own_stamp = begun is not None and not begun[0].startswith(b"[")  # not that of ts
+    if own_stamp and options.clock is None:
+        options = replace(options, clock="utc")  # the program's log and metrics are in UTC
     torn = _rows.torn(_TORN, "an incomplete line of the table (torn line?)")
     rows = _rows.matched(data, pattern, options, reader="srsran_gnb", reason=torn)
-    rnti = np.array([int(text, 16) if text else -1 for text in rows.text("rnti")], dtype=np.float64)
+    rnti = np.array([int(text, 16) if text else np.nan for text in rows.text("rnti")], dtype=np.float64)
     beside = {"cqi": rows.number("cqi"), "mcs": rows.number("mcs"), "rnti": rnti, "pci": rows.number("pci")}
     ri = rows.number("ri")
-    return rows.result([_rows.mean_rank(rows, ri, beside, none=ri == 0)])
+    rows.clock_from = rows.clock_from or ("program" if own_stamp else None)
+    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0))
 
 
 def sniff_json(head: bytes) -> bool:
@@ -84,6 +90,8 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     row, found = reports.row, reports.found
     with_ue = [i for i, one in enumerate(found) if any(True for _ in _ues(one))]
     texts = [str(found[i].get("timestamp", "")) for i in with_ue]
+    if options.clock is None:
+        options = replace(options, clock="utc")
     clock, time, warnings = _stamps.read(texts, options)
     mute = np.setdiff1d(row, row[with_ue])  # metrics of cells or of the host: no record is made of them
     rows = _rows.built(
@@ -104,7 +112,7 @@ def read_json(data: bytes, options: ReadOptions) -> ReadResult:
     names = {"cqi": ("cqi", "dl_cqi"), "mcs": ("dl_mcs", "mcs"), "rnti": ("rnti",), "pci": ("pci",)}
     beside = {name: _json.column(ues, *keys) for name, keys in names.items()}
     ri = _json.column(ues, "dl_ri", "ri")
-    return rows.result([_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick)])
+    return rows.result(_rows.mean_rank(rows, ri, beside, none=ri == 0, pick=pick))
 
 
 READER = Reader(

@@ -372,8 +372,8 @@ SRSRAN_GNB_OLD = (
     b"[2025-03-02 10:00:00.000003]    1 4601   15   1   27   797k  471    0   0%    359 |  65.5   28    28M\n"
 )
 SRSRAN_LOG = (
-    b"2025-03-02T10:00:00.000001 [GNB     ] [I] Built in Release mode\n"
-    b"2025-03-02T10:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=15 dl_ri=2.0 dl_mcs=27 dl_brate_bps=1000\n"
+    b"2025-03-02T15:00:00.000001 [GNB     ] [I] Built in Release mode\n"
+    b"2025-03-02T15:00:00.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=15 dl_ri=2.0 dl_mcs=27 dl_brate_bps=1000\n"
 )
 SRSRAN_JSON = (
     b'{"timestamp": 1740927600.25, "ue_list": [{"ue_container": {"pci": 1, "rnti": 17921, "cqi": 15, "dl_ri": 2.0, "dl_mcs": 27}}]}\n'
@@ -563,6 +563,7 @@ WITHOUT_ZONE: tuple[str | tuple[str, str], ...] = (
     ("drive_test", "srsue_metrics"),
     ("pose_csv", "airdata"),
     "srsran_json",
+    ("srsran_gnb", "log"),
     ("oai_log", "frames"),
     ("oai_log", "ue"),
     "amarisoft_json",

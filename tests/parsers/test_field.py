@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import csv
+import json
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -148,3 +151,54 @@ def test_real_logs_cut_at_every_byte_of_their_end(name: str) -> None:
     for end in range(len(data) - 120, len(data)):
         result = by_name("sounder_log").read(data[:end], OPTIONS)
         assert result.lines == result.accepted + len(result.rejected) + result.blank
+
+
+def _numbers(path: str, wanted: str, separator: str) -> int:
+    """Numeric cells of the columns whose names a pattern finds, counted by Python's csv module."""
+    with (FIELD / path).open(encoding="utf-8-sig", newline="") as file:
+        rows = list(csv.reader(file, delimiter=separator))
+    head = next(i for i, row in enumerate(rows) if len(row) > 10)
+    columns = [i for i, name in enumerate(rows[head]) if re.search(wanted, name)]
+    cells = [row[i].strip() for row in rows[head + 1 :] if len(row) > 10 for i in columns]
+    return sum(re.fullmatch(r"-?[0-9.,]+", cell) is not None for cell in cells)
+
+
+def _json_cells(path: str) -> int:
+    """Levels of all cells and NR legs of a PawPrints session."""
+    count = 0
+    for line in (FIELD / path).read_text().splitlines():
+        one = json.loads(line)
+        for leg in [*one.get("cells", []), one.get("nr_signal_strength") or {}]:
+            count += re.fullmatch(r"-\d+", str(leg.get("rsrp", leg.get("ss_rsrp")))) is not None
+    return count
+
+
+READINGS = {
+    "urban_lte/120m.csv": lambda path: _numbers(path, "^RSRP", ","),
+    "urban_lte/60m.csv": lambda path: _numbers(path, "^RSRP", ","),
+    "gnettrack/Orange_log.txt": lambda path: len(re.findall(r"\t4G\t-\d+\t", (FIELD / path).read_text())),
+    "pawprints/2023-08-26_test2_log.txt": lambda path: (FIELD / path).read_text().count("BS_INFO_START"),
+    "pawprints/2024-04-09_flight1_pawprints.jsonl": _json_cells,
+    "pawprints/2024-07-02_flight1_pawprints.jsonl": _json_cells,
+}
+
+
+@pytest.mark.parametrize("path", READINGS)
+def test_every_reading_of_the_file_is_a_record(everything: Ingested, path: str) -> None:
+    """Levels of cells, counted by other means."""
+    (file,) = [file for file in everything if file.path.endswith(path)]
+    levels = [s for s in file.result.streams if s.attributes.get("quantity") == "RSRP"]
+    assert sum(len(stream.frame) for stream in levels) == READINGS[path](path) > 60
+
+
+def test_clocks_and_heights_of_the_new_dialects(everything: Ingested) -> None:
+    files = {str(Path(file.path).relative_to(FIELD)): file.result for file in everything}
+    merged = files["aadm/vehicleOut_snr_merged.csv"].streams[0]
+    assert merged.frame["altitude_m"][0] == pytest.approx(24.3002636, abs=1e-6), "above take-off, begun in the air"
+    assert merged.attributes["height_from"] == "program"
+    nemo = files["nemo/24Feb09_172055.zip/24Feb09_172055.1.gpx"].streams[0]
+    assert str(nemo.frame["time"][0]) == "2024-02-09 22:20:56.086000", "17:20:56 in New York, as name and summary say"
+    assert nemo.attributes["clock_from"] == "assumed"
+    emulator = files["emulator/vehicleOut_lw1_snr_merged.csv"].streams[0].frame
+    assert float((emulator["time"].iloc[-1] - emulator["time"][0]).total_seconds()) == pytest.approx(2.614)
+    assert files["emulator/lw1_snr.txt"].streams[0].attributes["quantity"] == "SNR"

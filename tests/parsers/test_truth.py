@@ -7,11 +7,13 @@ seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
+from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, identify
 
 BEGIN = np.datetime64("2025-03-02T15:00:00")
@@ -85,6 +87,112 @@ CASES |= {
 }
 
 
+LOG2CSV = "Number,Time,Longitude,Latitude,Altitude,Voltage,Battery Level,Fix,Number of Satellites\n"
+
+
+def table(head: str, row: str, count: int = 8) -> str:
+    """A table of poses: ``i`` counts rows, ``s`` whole seconds after ten o'clock."""
+    return head + "".join(
+        row.format(i=i, s=i % 60, rise=50.0 + i, rest=134.5, north=35.73 + 1e-4 * i) for i in range(count)
+    )
+
+
+MERGED = "2025-03-02 10:00:{s:02d},-78.7,35.73,{rise},{i},4,29\n"
+HEIGHTS = [50.0 + i for i in range(8)]
+CASES |= {
+    "converted vehicleOut cut in flight keeps its heights": Case(
+        "cut.csv",
+        table(LOG2CSV, "{i},2025-03-02 10:00:{s:02d},-78.7,{north},{rise},48.1,90,4,29\n"),
+        {"vehicle": {"time": list(range(8)), "altitude_m": HEIGHTS}},
+        "pose_csv",
+    ),
+    "MATLAB merge of vehicleOut that begins in the air": Case(
+        "merged.csv",
+        table("time,Longitude,Latitude,Altitude,BatteryVolts,GPSFix,NumberOfSatellites\n", MERGED),
+        {"vehicle": {"altitude_m": HEIGHTS}},
+        "pose_csv",
+    ),
+    "a table of nobody that begins in flight keeps its heights": Case(
+        "x.csv",
+        table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
+        {"vehicle": {"altitude_m": HEIGHTS}},
+        "pose_csv",
+    ),
+    "a table of nobody that begins at rest counts from the ground": Case(
+        "x.csv",
+        table("time,lat,lon,alt\n", "2025-03-02 10:00:{s:02d},35.73,-78.7,{rest}\n"),
+        {"vehicle": {"altitude_m": [0.0] * 8}},
+        "pose_csv",
+    ),
+    "altitudes that the header calls above sea level": Case(
+        "x.csv",
+        table("time,lat,lon,altitude_msl\n", "2025-03-02 10:00:{s:02d},{north},-78.7,{rise}\n"),
+        {"vehicle": {"altitude_m": [float(i) for i in range(8)]}},
+        "pose_csv",
+    ),
+    "Nemo's name is year, month, day; its clock 4 h off": Case(
+        "25Mar02_100000.1.gpx",
+        '<gpx><trkpt lat="35.73" lon="-78.7"><ele>90.5</ele><time>T14:00:01.250Z</time></trkpt>\n'
+        '<trkpt lat="35.73" lon="-78.7"><ele>91.5</ele><time>T14:00:02.250Z</time></trkpt></gpx>\n',
+        {"track": {"time": [1.25, 2.25], "altitude_m": [0.0, 1.0]}},
+        "gpx",
+    ),
+    "gnb.log of srsRAN Project is UTC": Case(
+        "gnb.log",
+        "2025-03-02T15:00:01.250000 [METRICS ] [I] Scheduler UE pci=1 rnti=0x4601 cqi=12 dl_ri=2.0 dl_mcs=27\n",
+        {"gnb": {"time": [1.25], "rank": [2.0], "rnti": [0x4601]}},
+        "srsran_gnb",
+    ),
+    "srsRAN Project's JSON with texts is UTC": Case(
+        "gnb.json",
+        '{"timestamp": "2025-03-02T15:00:02.500", "ue_list": [{"ue_container": {"pci": 1, "rnti": 17921, "dl_ri": 1}}]}\n',
+        {"gnb": {"time": [2.5], "rank": [1.0]}},
+        "srsran_json",
+    ),
+}
+
+TWO = "[2025-03-02 10:00:{s:02d}.000000] {text}\n"
+CASES |= {
+    "two UEs of an OAI gNB": Case(
+        "oai.log",
+        "".join(
+            TWO.format(s=s, text=f"[NR_MAC] UE {ue}: CQI {15 - s}, RI {ri}, PMI (14,1)")
+            + TWO.format(s=s, text=f"UE RNTI {ue} CU-UE-ID 1 in-sync PH 0 dB average RSRP {rsrp - s} (16 meas)")
+            for s in (1, 2)
+            for ue, ri, rsrp in (("1f4d", 2, -78), ("2a3b", 1, -98))
+        ),
+        {
+            "oai_rnti1f4d": {"time": [1, 2], "rank": [2, 2], "cqi": [14, 13]},
+            "oai_rnti2a3b": {"time": [1, 2], "rank": [1, 1], "cqi": [14, 13]},
+            "nr_rsrp_rnti1f4d": {"time": [1, 2], "rss_db": [-79, -80]},
+            "nr_rsrp_rnti2a3b": {"time": [1, 2], "rss_db": [-99, -100]},
+        },
+        "oai_log",
+    ),
+    "two UEs of srsENB": Case(
+        "x_radio_enb_log.txt",
+        TWO.format(s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr")
+        + "".join(
+            TWO.format(s=s, text=f"lte {ue}   11   {ri}    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
+            for s in (1, 2)
+            for ue, ri in (("46", 2), ("47", 1))
+        ),
+        {"srsenb_rnti0046": {"time": [1, 2], "rank": [2, 2]}, "srsenb_rnti0047": {"time": [1, 2], "rank": [1, 1]}},
+        "srsenb_log",
+    ),
+    "one UE of srsENB that attaches again": Case(
+        "x_radio_enb_log.txt",
+        TWO.format(s=0, text="rat rnti  cqi  ri  mcs  brate   ok  nok  (%) | pusch pucch phr mcs brate ok nok (%) bsr")
+        + "".join(
+            TWO.format(s=s, text=f"lte {ue}   11   2    2   3.7k   14    0   0% |  31.5   12.5   40   15    38k")
+            for s, ue in ((1, 46), (2, 46), (3, 47))
+        ),
+        {"srsenb": {"time": [1, 2, 3], "rank": [2, 2, 2], "rnti": [0x46, 0x46, 0x47]}},
+        "srsenb_log",
+    ),
+}
+
+
 def shown(values: Any) -> list[Any]:
     """A column as it is compared: times in seconds, numbers to the microunit."""
     if values.dtype.kind == "M":
@@ -103,3 +211,32 @@ def test_what_a_file_says_comes_out(case: Case) -> None:
         assert name in streams, f"{name} is not among {list(streams)}"
         for column, expected in columns.items():
             assert shown(streams[name][column].to_numpy()) == pytest.approx(expected, nan_ok=True), f"{name}: {column}"
+
+
+ORIGINS = {
+    "x_vehicleOut.txt": ("vehicle", "program", "program", None),
+    "utc_vehicleOut.txt": ("vehicle", "written", "program", None),
+    "x_power_log.txt": ("power", "program", None, "assumed"),
+    "gnb.json": ("gnb", "program", None, "written"),
+    "nobody.csv": ("vehicle", "assumed", "assumed", None),
+    "amsl.csv": ("vehicle", "assumed", "written", None),
+}
+ROW = '1,-78.7,35.73,30.5,"(0.1,1.5,0.1)","(0.0,5.0,0.1)",48.1,2025-03-02 10:00:07.000000{zone},4,18\n'
+FILES = {
+    "x_vehicleOut.txt": ROW.format(zone=""),
+    "utc_vehicleOut.txt": ROW.format(zone="+00:00"),
+    "x_power_log.txt": od((1.0, -20.5)),
+    "gnb.json": CASES["srsRAN Project's JSON with texts is UTC"].data,
+    "nobody.csv": CASES["a table of nobody that begins in flight keeps its heights"].data,
+    "amsl.csv": CASES["altitudes that the header calls above sea level"].data,
+}
+
+
+@pytest.mark.parametrize("name", ORIGINS)
+def test_a_stream_says_where_its_clock_height_and_identity_are_known_from(name: str, tmp_path: Path) -> None:
+    (tmp_path / name).write_text(FILES[name])
+    (file,) = ingest(tmp_path / name, options=LOCAL)
+    stream, clock, height, identity = ORIGINS[name]
+    about = next(one.attributes for one in file.result.streams if one.name == stream)
+    assert (about["clock_from"], about.get("height_from"), about.get("identity_from")) == (clock, height, identity)
+    assert clock == "written" or about["clock_source"]

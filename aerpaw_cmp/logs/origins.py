@@ -1,0 +1,58 @@
+"""Provenance of a stream's clock, height datum and identity: written in the file, stated by its program, or assumed.
+
+Attributes ``clock_from``, ``height_from`` (streams with altitudes) and ``identity_from`` (levels and ranks) are one of
+``written``, ``program``, ``assumed``; ``clock_source`` and ``height_source`` say what the program or the assumption is.
+What a user states in flight.yaml counts as written. What is assumed is a question of the draft.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .records import Attribute, ReadResult, Stream
+
+if TYPE_CHECKING:
+    from .readers import Reader, ReadOptions
+
+
+def stated(result: ReadResult, reader: Reader, options: ReadOptions) -> ReadResult:
+    """A result whose streams say where their clock, height and identity are known from."""
+    streams = tuple(
+        replace(stream, attributes={**stream.attributes, **_origins(stream, reader, options)})
+        for stream in result.streams
+    )
+    return replace(result, streams=streams)
+
+
+def _origins(stream: Stream, reader: Reader, options: ReadOptions) -> dict[str, Attribute]:
+    about = stream.attributes
+    made: dict[str, Attribute] = {}
+    if "clock_from" not in about:
+        made |= _split("clock", _clock(stream, reader, options))
+    if "height_from" not in about and _has_heights(stream):
+        made |= _split("height", reader.height_from)
+    if stream.kind in ("rss", "rank") and "identity_from" not in about:
+        named = any(key in about for key in ("node", "pci", "rnti")) or options.node is not None
+        made["identity_from"] = "written" if named else "assumed"
+    return made
+
+
+def _clock(stream: Stream, reader: Reader, options: ReadOptions) -> str:
+    if options.clock is not None:
+        return "written"
+    if stream.attributes.get("clock") == "relative":
+        return "assumed: the times are relative, from an unknown origin"
+    return reader.clock_from
+
+
+def _has_heights(stream: Stream) -> bool:
+    return "altitude_m" in stream.frame and bool(np.isfinite(stream.frame["altitude_m"].to_numpy()).any())
+
+
+def _split(what: str, text: str) -> dict[str, Attribute]:
+    """``program: datetime.now()`` as two attributes."""
+    word, _, source = text.partition(": ")
+    return {f"{what}_from": word, **({f"{what}_source": source} if source else {})}

@@ -1,0 +1,58 @@
+"""Each format's clock and height datum, and who says so: the file itself, its program's source, or nobody."""
+
+from __future__ import annotations
+
+_TS = "program: ts on the node, local wall time"
+_GPS = "written: UTC of the GPS"
+_TAKEOFF = "program: DroneKit relative frame, above take-off"
+
+CLOCKS = {
+    "vehicle_out": "program: aerpawlib datetime.now(), local wall time",
+    "vehicle_log": _TS,
+    "pose_csv": "assumed: local wall time",
+    "gpx": "assumed: local wall time",
+    "ardupilot_bin": _GPS,
+    "mavlink_tlog": "written: UTC of the ground station",
+    "px4_ulog": _GPS,
+    "sounder_log": _TS,
+    "flight_mat": "program: AERPAW's post-processing, local wall time",
+    "sigmf": "written: offset or epoch in the meta file",
+    "iq_burst": "program: get_IQ.py names files in America/New_York",
+    "quectel_csv": "program: QuectelLogger datetime.now(), local wall time",
+    "quectel_ri": "program: QuectelLogger datetime.now(), local wall time",
+    "quectel_console": "program: QuectelLogger datetime.now(), local wall time",
+    "pawprints": "written: epoch of the companion computer",
+    "nemo_csv": "program: milliseconds from time_origin",
+    "nemo_kml": "program: milliseconds from time_origin",
+    "drive_test": "assumed: local wall time",
+    "aadm_snr": "program: AADM controller datetime.now(), local wall time",
+    "controller_log": _TS,
+    "srsenb_log": _TS,
+    "srsue_log": _TS,
+    "srsran_gnb": _TS,
+    "srsran_json": "program: srsRAN Project writes UTC",
+    "oai_log": _TS,
+    "amarisoft": _TS,
+    "amarisoft_json": "written: key utc",
+    "tap_jsonl": "written: UTC",
+    "own_csv": "written: UTC",
+    "generic_csv": "written",
+}
+"""``written``, or ``program`` or ``assumed`` with what that is. A text with an offset, or an epoch, is written."""
+
+HEIGHTS = {
+    "vehicle_out": _TAKEOFF,
+    "vehicle_log": _TAKEOFF,
+    "ardupilot_bin": "program: RelHomeAlt, else above the first position",
+    "mavlink_tlog": "program: relative_alt of MAVLink",
+    "px4_ulog": "program: above home_position, else above the first position",
+    "flight_mat": _TAKEOFF,
+    "sigmf": _TAKEOFF,
+    "quectel_ri": "program: joined with vehicleOut, above take-off",
+    "nemo_csv": "assumed: above take-off",
+    "nemo_kml": "assumed: above take-off",
+    "gpx": "program: GPX elevations are above sea level; above the first point",
+    "pawprints": "program: Android altitudes are above the ellipsoid; above the first position",
+    "own_csv": "written",
+    "generic_csv": "written",
+}

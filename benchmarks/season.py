@@ -31,14 +31,24 @@ import time
 from pathlib import Path
 from typing import Any
 
+import dask
 import numpy as np
 import psutil
+from distributed.security import Security
 from season_flights import write_season
 
 from aerpaw_cmp.jobs import campaign as job
 from aerpaw_cmp.jobs.campaign_plan import batched, kept_outcomes, run_tasks
 from aerpaw_cmp.jobs.campaign_tasks import Done, Order, carry_out
 from aerpaw_cmp.jobs.workers import Here, open_workers
+
+SECURITY = Security.temporary()
+for _role in ("client", "scheduler", "worker"):
+    for _kind in ("cert", "key"):
+        _name = f"DASK_DISTRIBUTED__COMM__TLS__{_role}__{_kind}".upper()
+        os.environ.setdefault(_name, getattr(SECURITY, f"tls_{_role}_{_kind}"))
+os.environ.setdefault("DASK_DISTRIBUTED__COMM__TLS__CA_FILE", SECURITY.tls_ca_file)
+dask.config.refresh()
 
 # --- what the campaign gave -----------------------------------------------------------------------------------------
 
@@ -72,7 +82,7 @@ class Cluster:
         with socket.socket() as one:
             one.bind(("127.0.0.1", 0))
             self.port = one.getsockname()[1]
-        self.address = f"tcp://127.0.0.1:{self.port}"
+        self.address = f"tls://127.0.0.1:{self.port}"
         self.count = workers
         self.start()
 
@@ -80,7 +90,7 @@ class Cluster:
         dask = [sys.executable, "-m", "distributed.cli.dask_scheduler"]
         quiet = {"stdout": subprocess.DEVNULL, "stderr": subprocess.DEVNULL}
         self.scheduler = subprocess.Popen(
-            [*dask, "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard"], **quiet
+            [*dask, "--host", "127.0.0.1", "--port", str(self.port), "--no-dashboard", "--protocol", "tls"], **quiet
         )
         self.workers = [self._worker() for _ in range(self.count)]
 

@@ -1,25 +1,30 @@
 """Independent tasks on workers: here, in processes of this machine, or on a Dask cluster; one function, one result.
 
 Tasks are functions of small records (paths, settings, hashes) that can be pickled. A lost worker costs what it was
-doing: those tasks run again, a last time alone, and only one that loses its worker even then is :class:`Lost`.
+doing: that task runs again, a last time alone, and only one that loses its worker even then is :class:`Lost`.
+
+Processes of this machine are talked to by pipes that only they and this process hold: nothing listens. A scheduler and
+its workers unpickle what they are sent, and so run code for whoever reaches them: only TLS is spoken with them.
 """
 
 from __future__ import annotations
 
 import contextlib
 import logging
+import multiprocessing
 import os
+import pickle
 import platform
-import shutil
-import tempfile
+import signal
 import threading
 import time
 import uuid
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, CancelledError, ProcessPoolExecutor, as_completed
+from concurrent.futures import CancelledError
 from dataclasses import dataclass
 from multiprocessing import get_context
+from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
@@ -45,9 +50,6 @@ NO_WORKER_S = 30.0
 
 _LOOKED_S = 2.0
 """How often workers are counted."""
-
-_MEMORY_SHARE = 0.85
-"""Of the machine's memory (or of the container's), shared by the workers of this machine."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,15 +90,11 @@ class Here:
             done(number, function(item))
 
 
-# --- processes of this machine, without Dask ------------------------------------------------------------------------
+# --- processes of this machine --------------------------------------------------------------------------------------
 
 
 class Processes:
-    """A pool of processes that is made anew when a worker is lost.
-
-    A pool breaks as a whole, and does not say whose process ended. Each task leaves a mark when it begins, so that
-    those in work are known; the others lost nothing.
-    """
+    """Processes of this machine, each with a pipe of its own; one that ends is known, and another takes its place."""
 
     def __init__(self, count: int) -> None:
         self.count = count
@@ -108,47 +106,103 @@ class Processes:
         done: Callable[[int, Result | Lost], None],
     ) -> None:
         tries: Counter[int] = Counter()
-        waiting = list(range(len(items)))
-        with tempfile.TemporaryDirectory(prefix="aerpaw-cmp-tasks-") as marks:
-            while waiting:
-                together = [i for i in waiting if tries[i] < TRIES] or waiting[:1]
-                lost = self._round(function, items, together, Path(marks), done)
-                for number, error in lost.items():
-                    mark = Path(marks) / str(number)
-                    if mark.exists():
-                        mark.unlink()
-                        tries[number] += 1
-                    if tries[number] > TRIES:
-                        done(number, _ended(error))
-                waiting = [i for i in waiting if (i in lost and tries[i] <= TRIES) or i not in together]
+        with contextlib.ExitStack() as stack:
+            crew = [stack.enter_context(_Worker(function)) for _ in range(min(self.count, len(items)))]
+            killed = _through(crew, items, range(len(items)), tries, done)
+            for number in killed:  # a last time, so that none pays for its neighbour
+                if _through(crew[:1], items, [number], tries, done):
+                    done(number, Lost("its worker process ended, time after time: out of memory, or killed"))
 
-    def _round(
-        self,
-        function: Callable[[Item], Result],
-        items: Sequence[Item],
-        numbers: Sequence[int],
-        marks: Path,
-        done: Callable[[int, Result | Lost], None],
-    ) -> dict[int, BaseException]:
-        """One pool, until it is through or breaks; gives the tasks that it did not finish."""
-        lost: dict[int, BaseException] = {}
+
+def _through(
+    crew: Sequence[_Worker],
+    items: Sequence[Any],
+    numbers: Iterable[int],
+    tries: Counter[int],
+    done: Callable[[int, Any], None],
+) -> list[int]:
+    """Run some tasks; gives those that lost their worker too often."""
+    waiting, killed = deque(numbers), list[int]()
+    active: dict[Connection, tuple[_Worker, int]] = {}
+    while waiting or active:
+        for worker in crew:
+            if waiting and worker.pipe not in active:
+                number = waiting.popleft()
+                worker.send(items[number])
+                active[worker.pipe] = worker, number
+        for pipe in wait(list(active)):
+            assert isinstance(pipe, Connection)
+            worker, number = active.pop(pipe)
+            try:
+                succeeded, content = pickle.loads(pipe.recv_bytes())
+            except (EOFError, OSError):
+                worker.start_anew()
+                tries[number] += 1
+                (waiting if tries[number] < TRIES else killed).append(number)
+                continue
+            done(number, content if succeeded else Lost(f"its worker process ended: {content}"))
+    return killed
+
+
+class _Worker:
+    """A process that runs a function of what it is sent, as a context; killed where the block is left by an error."""
+
+    def __init__(self, function: Callable[[Any], Any]) -> None:
+        self._function = function
+        self._start()
+
+    def _start(self) -> None:
         # spawn: a forked child would inherit the threads of numerical libraries in an unknown state
-        count = min(self.count, len(numbers))
-        with ProcessPoolExecutor(max_workers=count, mp_context=get_context("spawn")) as pool:
-            futures = {pool.submit(_marked, function, items[i], str(marks / str(i))): i for i in numbers}
-            for future in as_completed(futures):
-                number, error = futures.pop(future), future.exception()
-                if isinstance(error, BrokenExecutor):
-                    lost[number] = error
-                else:
-                    done(number, future.result() if error is None else _ended(error))
-        return lost
+        context = get_context("spawn")
+        self.pipe, there = context.Pipe()
+        self._process = context.Process(target=_serve, args=(there, self._function), daemon=True)  # type: ignore[attr-defined]
+        self._process.start()
+        there.close()
+
+    def send(self, item: Any) -> None:
+        with contextlib.suppress(OSError):  # one that has ended is seen where its answer is awaited
+            self.pipe.send((item,))
+
+    def start_anew(self) -> None:
+        self._end(kill=True)
+        self._start()
+
+    def __enter__(self) -> _Worker:
+        return self
+
+    def __exit__(self, kind: type[BaseException] | None, *_: object) -> None:
+        self._end(kill=kind is not None)
+
+    def _end(self, *, kill: bool) -> None:
+        with contextlib.suppress(OSError):
+            self.pipe.send(None)
+        if not kill:
+            self._process.join(5.0)
+        self._process.kill()
+        self._process.join()
+        self.pipe.close()
 
 
-def _marked(function: Callable[[Item], Result], item: Item, mark: str) -> Result:
-    """Run a task; its mark stands from its beginning on."""
-    Path(mark).touch()
-    return function(item)
+def _serve(pipe: Connection, function: Callable[[Any], Any]) -> None:
+    """Answer until the pipe says no more, or is closed: the process that holds its other end is gone."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the first process
+    for number in (signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)):
+        signal.signal(number, signal.SIG_DFL)
+    threading.Thread(target=_follow_parent, daemon=True).start()
+    with contextlib.suppress(EOFError, OSError):
+        while (order := pipe.recv()) is not None:
+            try:
+                answer = pickle.dumps((True, function(*order)))
+            except Exception as error:
+                answer = pickle.dumps((False, str(error).strip() or type(error).__name__))
+            pipe.send_bytes(answer)
+
+
+def _follow_parent() -> None:
+    """End with the first process, in the middle of a task too."""
+    if (parent := multiprocessing.parent_process()) is not None:
+        wait([parent.sentinel])
+        os._exit(1)
 
 
 def _ended(error: BaseException) -> Lost:
@@ -295,13 +349,13 @@ def open_workers(
     workers : int
         On this machine; 1 runs the tasks in this process.
     scheduler : str, optional
-        Address of a Dask scheduler, in place of workers here.
+        Address of a Dask scheduler (``tls://``), in place of workers here.
     paths : sequence of Path
         Files and folders that every worker of a scheduler has to see.
     keep : str, optional
         Folder or URL of outcomes that it has to reach.
     progress : Progress
-        Where the workers are, and the address of the dashboard.
+        How many workers a scheduler has, and the address of its dashboard.
 
     Yields
     ------
@@ -318,76 +372,8 @@ def open_workers(
             yield cluster
     elif workers <= 1:
         yield Here()
-    elif _has_dask():
-        with _local_cluster(workers, progress) as cluster:
-            yield cluster
     else:
-        progress(
-            f"{workers} processes without memory limits and dashboard: "
-            "'distributed' is not installed (pip install 'aerpaw-cmp[cluster]')"
-        )
         yield Processes(workers)
-
-
-def _has_dask() -> bool:
-    from importlib.util import find_spec
-
-    return find_spec("distributed") is not None
-
-
-@contextlib.contextmanager
-def _local_cluster(workers: int, progress: Progress) -> Iterator[Cluster]:
-    """Workers of one thread each, with a share of the memory, of this machine alone."""
-    import dask
-    from distributed import Client, LocalCluster
-    from distributed.system import MEMORY_LIMIT
-
-    _quiet()
-    settings = {
-        "distributed.scheduler.allowed-failures": TRIES - 1,
-        "distributed.scheduler.worker-saturation": 1.0,  # what waits at a worker is not lost with it
-        "distributed.worker.memory.spill": False,
-        "distributed.worker.memory.target": False,
-        "distributed.worker.daemon": True,
-        "distributed.admin.log-format": "%(message)s",
-        "logging.distributed": "critical",
-    }
-    scratch = tempfile.mkdtemp(prefix="aerpaw-cmp-dask-")
-    limit = int(_MEMORY_SHARE * MEMORY_LIMIT / workers)
-    try:
-        with (
-            dask.config.set(settings),
-            _closed_at_last(
-                LocalCluster(
-                    n_workers=workers,
-                    threads_per_worker=1,
-                    memory_limit=limit,
-                    local_directory=scratch,
-                    dashboard_address="127.0.0.1:0" if _has_dashboard() else None,
-                    silence_logs=50,
-                )
-            ) as local,
-            Client(local, set_as_default=False) as client,
-        ):
-            page = f"; dashboard {local.dashboard_link}" if _has_dashboard() else ""
-            progress(f"{workers} workers of at most {limit / 2**30:.1f} GiB each{page}")
-            yield Cluster(client, progress=progress)
-    finally:
-        shutil.rmtree(scratch, ignore_errors=True)
-
-
-@contextlib.contextmanager
-def _closed_at_last(cluster: Any) -> Iterator[Any]:
-    """A cluster that is closed, whatever its closing says: all results are there by then.
-
-    One whose worker is just being started anew refuses to end it ("can only join a started process"); the worker ends
-    with this process.
-    """
-    try:
-        yield cluster
-    finally:
-        with contextlib.suppress(Exception):
-            cluster.close()
 
 
 def _quiet() -> None:
@@ -395,12 +381,6 @@ def _quiet() -> None:
     for name in list(logging.root.manager.loggerDict):
         if name.split(".")[0] in ("distributed", "tornado"):
             logging.getLogger(name).setLevel(logging.CRITICAL + 1)
-
-
-def _has_dashboard() -> bool:
-    from importlib.util import find_spec
-
-    return find_spec("bokeh") is not None
 
 
 @contextlib.contextmanager
@@ -414,10 +394,20 @@ def _scheduler(address: str, paths: Sequence[Path], keep: str | None, progress: 
         raise UsageError(
             f"--scheduler {address!r} needs the package 'distributed'", expected="pip install 'aerpaw-cmp[cluster]'"
         ) from None
+    if not address.startswith("tls://"):
+        raise UsageError(
+            f"--scheduler {address!r} is not protected: whoever reaches it runs programs as you, here and there",
+            expected="tls://HOST:PORT, with certificates in Dask's configuration (docs/howto/cluster.md)",
+        )
     try:
         client = Client(address, timeout=CONNECT_S, set_as_default=False)
-    except (OSError, ValueError, ImportError) as error:
-        raise UsageError(f"--scheduler {address!r}: no scheduler answers ({error})") from error
+    except (OSError, ValueError, TypeError, ImportError) as error:
+        raise UsageError(
+            f"--scheduler {address!r}: no scheduler answers ({error})",
+            cause="no certificates in Dask's configuration (distributed.comm.tls)"
+            if isinstance(error, TypeError)
+            else None,
+        ) from error
     cluster = Cluster(client, address, progress)
     try:
         check_workers(client, paths, keep)

@@ -10,14 +10,20 @@ in SLURM_CAMPAIGN_..., or change the lines below.
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 from dask_jobqueue import SLURMCluster
+from distributed.security import Security
 
 
 def main() -> int:
     """Start the workers, run the campaign on them, end them; gives the campaign's exit code."""
     asked = os.environ
+    security = Security.temporary()  # whoever reaches a scheduler without TLS runs programs as you
     with SLURMCluster(
+        security=security,
+        protocol="tls://",
+        shared_temp_directory=asked.get("SLURM_CAMPAIGN_SHARED", str(Path.home())),  # certificates
         queue=asked.get("SLURM_CAMPAIGN_QUEUE"),
         account=asked.get("SLURM_CAMPAIGN_ACCOUNT"),
         cores=1,
@@ -36,7 +42,14 @@ def main() -> int:
         cluster.adapt(minimum_jobs=1, maximum_jobs=int(asked.get("SLURM_CAMPAIGN_JOBS", "40")))
         cluster.wait_for_workers(1)
         command = [sys.executable, "-m", "aerpaw_cmp", "campaign", *sys.argv[1:]]
-        return subprocess.run([*command, "--scheduler", cluster.scheduler_address], check=False).returncode
+        tls = "DASK_DISTRIBUTED__COMM__TLS__"
+        keys = {
+            f"{tls}CA_FILE": security.tls_ca_file,
+            f"{tls}CLIENT__CERT": security.tls_client_cert,
+            f"{tls}CLIENT__KEY": security.tls_client_key,
+        }
+        line = [*command, "--scheduler", cluster.scheduler_address]
+        return subprocess.run(line, env={**asked, **keys}, check=False).returncode
 
 
 if __name__ == "__main__":

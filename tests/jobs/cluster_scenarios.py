@@ -17,12 +17,26 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import dask
 import distributed
-from distributed.system import MEMORY_LIMIT
+from distributed.security import Security
 
 from aerpaw_cmp.common.errors import AerpawCmpError
 from aerpaw_cmp.jobs import workers
 from aerpaw_cmp.jobs.workers import Lost, check_workers, open_workers
+
+SECURITY = Security.temporary()
+# as a user's configuration names them, there by files
+dask.config.set(
+    {
+        "distributed.comm.tls.ca-file": SECURITY.tls_ca_file,
+        **{
+            f"distributed.comm.tls.{role}.{kind}": getattr(SECURITY, f"tls_{role}_{kind}")
+            for role in ("client", "scheduler", "worker")
+            for kind in ("cert", "key")
+        },
+    }
+)
 
 
 def square(number: int) -> int:
@@ -63,17 +77,20 @@ def message(action: Callable[[], Any]) -> str:
     return "no error"
 
 
-def on_this_machine(folder: Path) -> dict[str, Any]:
+def on_a_cluster(folder: Path) -> dict[str, Any]:
     told: list[str] = []
-    with open_workers(2, progress=lambda text, *_: told.append(text)) as crew:
-        limits = [one["memory_limit"] for one in crew._client.scheduler_info()["workers"].values()]
+    cluster = distributed.LocalCluster(
+        n_workers=2, threads_per_worker=1, security=SECURITY, dashboard_address=None, silence_logs=50
+    )
+    plain = f"tcp://127.0.0.1:{_port()}"
+    with cluster, open_workers(1, cluster.scheduler_address, progress=lambda text, *_: told.append(text)) as crew:
         out = {
             "count": crew.count,
             "squares": collected(crew, square, list(range(25))),
             "told": told,
-            "memory_share": sum(limits) / MEMORY_LIMIT,
             "good": message(lambda: check_workers(crew._client, [folder], str(folder))),
             "unseen": message(lambda: check_workers(crew._client, [folder / "nowhere"])),
+            "plain": message(lambda: open_workers(1, plain).__enter__()),
         }
         real, workers.code_digest = workers.code_digest, lambda: "another"
         out["other"] = message(lambda: check_workers(crew._client, []))
@@ -91,7 +108,14 @@ def _port() -> int:
 def _scheduler(port: int) -> Any:
     """A scheduler and one worker in threads of this process."""
     return distributed.LocalCluster(
-        n_workers=1, threads_per_worker=1, processes=False, scheduler_port=port, dashboard_address=None, silence_logs=50
+        n_workers=1,
+        threads_per_worker=1,
+        processes=False,
+        scheduler_port=port,
+        dashboard_address=None,
+        silence_logs=50,
+        protocol="tls://",
+        security=SECURITY,
     )
 
 
@@ -112,7 +136,7 @@ def restarted() -> dict[str, Any]:
         if len(found) == 5:
             threading.Thread(target=restart).start()
 
-    with open_workers(1, f"tcp://127.0.0.1:{port}", progress=lambda text, *_: told.append(text)) as crew:
+    with open_workers(1, f"tls://127.0.0.1:{port}", progress=lambda text, *_: told.append(text)) as crew:
         crew.run(slow, range(20), done)
     clusters[1].close()
     return {"squares": [found[i] for i in range(20)], "told": told}
@@ -131,7 +155,7 @@ def gone() -> str:
             threading.Thread(target=cluster.close).start()
 
     def whole() -> None:
-        with open_workers(1, f"tcp://127.0.0.1:{port}") as crew:
+        with open_workers(1, f"tls://127.0.0.1:{port}") as crew:
             crew.run(slow, range(200), done)
 
     return message(whole)
@@ -141,7 +165,7 @@ def none_there() -> str:
     workers.CONNECT_S = 0.5
 
     def whole() -> None:
-        with open_workers(1, f"tcp://127.0.0.1:{_port()}"):
+        with open_workers(1, f"tls://127.0.0.1:{_port()}"):
             pass
 
     return message(whole)
@@ -149,5 +173,5 @@ def none_there() -> str:
 
 if __name__ == "__main__":
     with tempfile.TemporaryDirectory() as name:
-        result = {"local": on_this_machine(Path(name)), "restarted": restarted(), "gone": gone(), "none": none_there()}
+        result = {"cluster": on_a_cluster(Path(name)), "restarted": restarted(), "gone": gone(), "none": none_there()}
     sys.stdout.write(json.dumps(result))

@@ -2,24 +2,47 @@
 
 from __future__ import annotations
 
-import builtins
+import contextlib
 import json
 import os
+import signal
+import socket
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
 import pytest
 
-from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.jobs import workers
-from aerpaw_cmp.jobs.workers import open_workers
+from aerpaw_cmp.jobs.workers import Lost, open_workers
+
+
+def dies(item: tuple[int, str]) -> int:
+    """The third ends its worker the first time, the fifth every time."""
+    number, folder = item
+    mark = Path(folder) / str(number)
+    if number == 5 or (number == 3 and not mark.exists()):
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return number * number
+
+
+def collected(crew: Any, function: Any, items: list[Any]) -> list[Any]:
+    found: dict[int, Any] = {}
+
+    def done(number: int, result: Any) -> None:
+        assert number not in found, "no task comes twice"
+        found[number] = result.message if isinstance(result, Lost) else result
+
+    crew.run(function, items, done)
+    return [found[i] for i in range(len(items))]
 
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, Any]:
-    """Real clusters: two workers of this machine, a scheduler that is started again, one that stays away."""
+    """Real clusters: one of two workers, a scheduler that is started again, one that stays away."""
     pytest.importorskip("distributed", reason="distributed is not installed (extra 'dev')")
     script = Path(__file__).with_name("cluster_scenarios.py")
     # each worker forked from a server that has Dask loaded: a fresh interpreter for each takes two seconds
@@ -32,28 +55,100 @@ def seen() -> dict[str, Any]:
     return found
 
 
-def test_workers_of_this_machine_give_what_one_process_gives(seen: dict[str, Any]) -> None:
-    local = seen["local"]
-    assert local["count"] == 2
-    assert local["squares"] == [i * i for i in range(25)]
-    assert "2 workers of at most" in local["told"][0]
-    assert local["memory_share"] <= 0.9
+def test_workers_of_a_cluster_give_what_one_process_gives(seen: dict[str, Any]) -> None:
+    cluster = seen["cluster"]
+    assert cluster["count"] == 2
+    assert cluster["squares"] == [i * i for i in range(25)]
 
 
-def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any]) -> None:
+def test_a_killed_worker_costs_its_task_one_more_try(seen: dict[str, Any], tmp_path: Path) -> None:
     """The task that kills every time is lost alone; its neighbours, and the one that killed once, are there."""
-    killed = seen["local"]["killed"]
-    assert "worker process ended" in killed[5]
-    assert killed[:5] + killed[6:] == [i * i for i in range(8) if i != 5]
+    crew = workers.Processes(2)
+    here = collected(crew, dies, [(i, str(tmp_path)) for i in range(8)])
+    for killed in (seen["cluster"]["killed"], here):
+        assert "worker process ended" in killed[5]
+        assert killed[:5] + killed[6:] == [i * i for i in range(8) if i != 5]
 
 
 def test_workers_that_see_no_file_or_run_other_code_are_named(seen: dict[str, Any]) -> None:
-    local = seen["local"]
-    assert local["good"] == "no error"
-    assert local["unseen"].startswith("UsageError: 2 of 2 workers cannot do this campaign: ")
-    assert "does not see" in local["unseen"]
-    assert "nowhere" in local["unseen"]
-    assert "runs other code" in local["other"]
+    cluster = seen["cluster"]
+    assert cluster["good"] == "no error"
+    assert cluster["unseen"].startswith("UsageError: 2 of 2 workers cannot do this campaign: ")
+    assert "does not see" in cluster["unseen"]
+    assert "nowhere" in cluster["unseen"]
+    assert "runs other code" in cluster["other"]
+
+
+def test_a_scheduler_without_tls_is_refused(seen: dict[str, Any]) -> None:
+    assert seen["cluster"]["plain"].startswith("UsageError: ")
+    assert "is not protected" in seen["cluster"]["plain"]
+
+
+def listening(_number: int) -> list[str]:
+    """Sockets on which this process, its parent or its siblings listen, as the kernel lists them."""
+    mine = set()
+    for process in (os.getpid(), *family(os.getppid())):
+        for link in Path(f"/proc/{process}/fd").iterdir():
+            with contextlib.suppress(OSError):
+                mine.add(str(link.readlink()))
+    found = []
+    for table in ("tcp", "tcp6", "udp", "udp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            row = line.split()
+            if f"socket:[{row[9]}]" in mine and (row[3] == "0A" or table.startswith("udp")):
+                found.append(f"{table} {row[1]}")
+    for line in Path("/proc/net/unix").read_text().splitlines()[1:]:
+        row = line.split()
+        if f"socket:[{row[6]}]" in mine and row[3] == "00010000":  # the flag of a socket that accepts
+            found.append(f"unix {row[-1]}")
+    return found
+
+
+def family(parent: int) -> list[int]:
+    children = Path(f"/proc/{parent}/task/{parent}/children").read_text().split()
+    return [parent, *map(int, children)]
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="/proc lists sockets")
+def test_nothing_listens_while_workers_of_this_machine_work() -> None:
+    found: dict[int, Any] = {}
+    with open_workers(2) as crew:
+        assert crew.count == 2
+        crew.run(listening, list(range(4)), found.__setitem__)
+    assert found == {number: [] for number in range(4)}
+    with socket.socket() as door:  # what the test would see
+        door.bind(("127.0.0.1", 0))
+        door.listen()
+        crew.run(listening, [0], found.__setitem__)
+    assert len(found[0]) == 1
+
+
+def test_workers_end_with_their_parent_and_leave_nothing(tmp_path: Path) -> None:
+    """SIGKILL in the middle of a task: no process and no temporary folder stays."""
+    script = (
+        "import sys, time; sys.path[:0] = sys.argv[2:]\n"
+        "from aerpaw_cmp.jobs.workers import open_workers\n"
+        "from tests.jobs.test_workers import sleeps\n"
+        "if __name__ == '__main__':\n"
+        "    with open_workers(2) as crew: crew.run(sleeps, [sys.argv[1]] * 2, print)\n"
+    )
+    (tmp_path / "main.py").write_text(script)
+    (tmp_path / "tmp").mkdir()
+    command = [sys.executable, str(tmp_path / "main.py"), str(tmp_path), str(Path(__file__).parents[2])]
+    parent = subprocess.Popen(command, env={**os.environ, "TMPDIR": str(tmp_path / "tmp")})
+    while len(began := [int(path.name) for path in tmp_path.iterdir() if path.name.isdigit()]) < 2:
+        assert parent.poll() is None
+        time.sleep(0.05)
+    parent.kill()
+    parent.wait()
+    while any(Path(f"/proc/{process}").exists() for process in began):
+        time.sleep(0.05)
+    assert list((tmp_path / "tmp").iterdir()) == []
+
+
+def sleeps(folder: str) -> None:
+    Path(folder, str(os.getpid())).touch()
+    time.sleep(600)
 
 
 def test_a_scheduler_that_is_started_again_goes_on(seen: dict[str, Any]) -> None:
@@ -67,24 +162,6 @@ def test_a_scheduler_that_stays_away_or_never_was_is_one_message(seen: dict[str,
     assert seen["gone"].startswith("InputError: ")
     assert "run the same command again" in seen["gone"]
     assert "no scheduler answers" in seen["none"]
-
-
-def test_without_dask_there_are_processes_and_a_line_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    told: list[str] = []
-    monkeypatch.setattr(workers, "_has_dask", lambda: False)
-    with open_workers(3, progress=lambda text, *_: told.append(text)) as crew:
-        assert isinstance(crew, workers.Processes)
-    assert "aerpaw-cmp[cluster]" in told[0]
-    real = builtins.__import__
-
-    def without(name: str, *rest: object, **more: object) -> object:
-        if name == "distributed":
-            raise ImportError(name)
-        return real(name, *rest, **more)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    with pytest.raises(UsageError, match=r"aerpaw-cmp\[cluster\]"), open_workers(1, "tcp://127.0.0.1:1"):
-        pass
 
 
 class NoWorkers:
@@ -135,15 +212,3 @@ def test_a_scheduler_without_workers_is_spoken_of(monkeypatch: pytest.MonkeyPatc
     assert found == {0: 2, 1: 3}
     assert len(told) == 2
     assert "no worker is with the scheduler at tcp://there" in told[0]
-
-
-def test_a_cluster_that_cannot_be_closed_costs_no_result() -> None:
-    class Starting:
-        def close(self) -> None:
-            raise AssertionError("can only join a started process")
-
-    with workers._closed_at_last(Starting()):
-        found = 3
-    assert found == 3
-    with pytest.raises(KeyError, match="ours"), workers._closed_at_last(Starting()):
-        raise KeyError("ours")

@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from .detection import DetectionScore
 from .field_difference import FieldAudit
 from .forecast import ForecastScore
 from .ladder import LadderRow
@@ -163,6 +164,8 @@ class RssFurther:
     averaged: Mapping[str, Mapping[str, Fit]]
     censored: Censored | None = None
     expected_offset: ExpectedOffset | None = None
+    detection: DetectionScore | None = None
+    """Of a receiver that loses its lock or ends at a floor."""
     snr: SnrScore | None = None
     """Of a ratio to the noise whose receiver's bandwidth is given."""
     repeatability: Mapping[str, Repeated]

@@ -22,6 +22,7 @@ from ..site.site import Site, Tower
 from ..site.siteyaml import load_site
 from .clock import clock_trap
 from .heights import at_height, lacks_height
+from .lock import lock_of
 from .scored import scored_rows, unscored
 from .settings import FlightFile, GroundNode, LinkSettings, LinksSettings, LogSettings, SiteChoice
 from .track import Track, TrackPoses, good_positions
@@ -47,6 +48,8 @@ class RssSeries:
     """Rows of the log that are not here, because a flag voids them: how many per flag."""
     serving: FloatArray | None = None
     """Of a cell: 1 where it served the phone, 0 where another did (n,), NaN unknown; None for other levels."""
+    locked: FloatArray | None = None
+    """Of a sounder: 1 where it was in lock, 0 where it had lost it (n,), NaN unknown; None for other levels."""
     log: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
     """Number of the log (n,) under ``logs:`` that holds each sample; empty where it is not known."""
     line: IntArray = field(default_factory=lambda: np.zeros(0, dtype=np.int64))
@@ -337,7 +340,10 @@ def gather(
             if stream.kind == "telemetry":
                 telemetry.append((log.path, stream))
             elif stream.kind == "rss" and not _unnamed_cell(log, stream):
-                rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number)))
+                beside = [*file.result.streams, *(s for one in files if one is not file for s in one.result.streams)]
+                locked, said = lock_of(stream, beside)
+                warnings += [f"{log.path}: {said}"] if said else []
+                rss.append((log.path, _rss_series(settings.link, log, stream, site, number=number, locked=locked)))
             elif stream.kind == "rank":
                 tower = log.node or settings.rank.tower
                 rank.append((log.path, _rank_series(log, stream, site, tower=tower, number=number)))
@@ -496,7 +502,7 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
                 if pose is None or data.track is None
                 else "the telemetry holds no attitude: level flight along the course stands in"
                 if pose.valid.any()
-                else data.track.why_not(pose)
+                else f"the telemetry covers none of its instants: {data.track.why_not(pose)}"
             )
             messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():
@@ -527,7 +533,9 @@ def _unnamed_cell(log: LogSettings, stream: Stream) -> bool:
     return bool(log.cells) and pci is not None and int(pci) not in log.cells
 
 
-def _rss_series(links: LinksSettings, log: LogSettings, stream: Stream, site: Site, *, number: int) -> RssSeries:
+def _rss_series(
+    links: LinksSettings, log: LogSettings, stream: Stream, site: Site, *, number: int, locked: FloatArray | None
+) -> RssSeries:
     pci = stream.attributes.get("pci")
     home = log.cells.get(int(pci)) if pci is not None else None
     tower = _known_tower(home or log.node or _text(stream, "node"), log, site)
@@ -546,6 +554,7 @@ def _rss_series(links: LinksSettings, log: LogSettings, stream: Stream, site: Si
         log=np.full(len(frame), number, dtype=np.int64),
         line=frame["line"].to_numpy(np.int64),
         flagged=left_out,
+        locked=None if locked is None else locked[~unscored(stream.frame)],
         serving=frame["serving"].to_numpy(np.float64) if "serving" in frame else None,
     )
 

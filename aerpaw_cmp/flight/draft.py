@@ -22,14 +22,8 @@ from .data import is_ratio
 from .dry_run import DryRun, dry_run
 from .grouping import flights
 from .heights import height_in_name, lacks_height
-from .node import (
-    CARRIER_HZ,
-    LOCK_FLOOR_DB,
-    POWER_DBM,
-    Placer,
-    listed_places,
-    may_lose_lock,
-)
+from .lock import LOCK_FLOOR_DB, is_sounder_power, may_lose_lock
+from .node import CARRIER_HZ, POWER_DBM, Placer, listed_places
 from .settings import FlightFile, LogSettings, RssSettings
 from .time_origin import Origin, origin_of
 
@@ -86,7 +80,7 @@ def draft(
     entries = _Entries(
         folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}),
         positioned=any(_has_positions(s) for file in files for s in file.result.streams),
-        placer=_placer(files, flown), locks=may_lose_lock(s for file in files for s in file.result.streams),
+        placer=_placer(files, flown), locks=any(may_lose_lock(s) for file in files for s in file.result.streams),
     )  # fmt: skip
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
         entries.enter(file)
@@ -340,6 +334,11 @@ class _Entries:
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
+        if not kept and reasons == [RATIO] and all(may_lose_lock(s) for s in streams):
+            asked = "  # says when the receiver was in lock"
+            skip = [s.name for s in streams]
+            self.lines[file.path] = f"  - {_flow({'path': path, 'reader': file.result.reader, 'skip': skip})}{asked}\n"
+            return
         if not kept:
             self.out.append(f"{shown}: {'; '.join(reasons) or 'no samples'}")
             return
@@ -397,7 +396,7 @@ class _Entries:
         return asked
 
     def _floor_db(self, level: Stream) -> float:
-        if self.locks and level.attributes.get("unit") == "dB re full scale":
+        if self.locks and is_sounder_power(level):
             return LOCK_FLOOR_DB
         floor = None if level.attributes.get("quantity") == "RSRP" else receiver_floor_db([level])
         return -np.inf if floor is None else floor

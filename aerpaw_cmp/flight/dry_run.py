@@ -85,5 +85,5 @@ def _loss(data: FlightData, time: Times, counts: tuple[int, int, int]) -> str:
         return ""
     if placed and placed >= 0.5 * valued:
         return f"all of {placed} samples lie below minimum_height_m"
-    why = "no positions" if data.track is None else data.track.why_not(data.track.pose_at(time))
-    return f"{high} of {valued} samples can be compared: {why}"
+    why = "there are no positions" if data.track is None else data.track.why_not(data.track.pose_at(time))
+    return f"{high} of {valued} samples lie within the telemetry: {why}"

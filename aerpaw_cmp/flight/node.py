@@ -27,28 +27,11 @@ UNDECIDED = 3.0
 CARRIER_HZ, POWER_DBM = 3.3e9, 40.0
 """Of the link that a draft proposes."""
 
-LOCK_QUALITY_DB, LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
-"""Quality [dB] of AERPAW's sounder at perfect lock (the peak of its 4095 chips), and below which it has lost it."""
-
-LOCK_FLOOR_DB = -15.0
-"""Level [dB re full scale] below which that receiver has lost its lock."""
-
 LOW_M = 5.0
 """Below it an airframe on the ground decides the level."""
 
 NEAR_M = 5000.0
 """A place of a list that is farther from the track is not of this flight."""
-
-
-def may_lose_lock(streams: Iterable[Stream]) -> bool:
-    """Whether one of the streams is the lock quality of AERPAW's sounder: where locked, it stays near its peak."""
-    for stream in streams:
-        if stream.kind == "rss" and stream.name == "quality":
-            quality = stream.frame["rss_db"].to_numpy(np.float64)
-            locked = quality[quality > LOST_QUALITY_DB]
-            if len(locked) and abs(float(np.median(locked)) - LOCK_QUALITY_DB) < 3.0:
-                return True
-    return False
 
 
 @dataclass(frozen=True, slots=True)

@@ -335,9 +335,9 @@ class Track:
         """Reason for most of the instants that have no pose."""
         reason = REASONS[int(np.bincount(pose.reason_code[~pose.valid], minlength=len(REASONS)).argmax())]
         if reason != "telemetry gap":
-            return f"its samples have no position: {reason}" if reason else "it has no samples"
+            return f"most are {reason}" if reason else "there are no samples"
         return (
-            f"the telemetry has a fix every {np.median(np.diff(self._time_s)):.0f} s; gaps above "
+            f"it has a fix every {np.median(np.diff(self._time_s)):.0f} s; gaps above "
             f"{self.maximum_gap_s:g} s (rt.maximum_gap_s) are not interpolated"
         )
 

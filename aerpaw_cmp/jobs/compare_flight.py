@@ -22,6 +22,7 @@ from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
 from ..compare import rank as ranks
 from ..compare import rss, statistics
+from ..compare.detection import DetectionScore, score_detection
 from ..compare.forecast import ForecastScore, score_forecast
 from ..compare.ladder import log_distance_level_db
 from ..compare.result import (
@@ -42,6 +43,7 @@ from ..compare.result import (
 from ..compare.serving import ServingComparison, at_times, compare_serving
 from ..compare.spread import StatedSpread, inside_shares
 from ..flight.data import FlightData, RankSeries, RssSeries
+from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.losses import direct_foliage_m
 from ..flight.replay import FlightReplay, Replayed, may_share
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
@@ -190,6 +192,7 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             compared_with={} if trained else _paired(levels, {**simple, **alternatives}),
             averaged={} if trained else _averaged(series, replayed, levels, position, settings),
             censored=None if trained else _censored(settings, levels),
+            detection=None if trained else _detection(settings, series, levels),
             snr=None if trained else _snr(series, levels),
             expected_offset=_expected(settings.reference_powers, data.folder, series, score.offset_db),
             repeatability=_repeatability(series.time, position, levels.measured_db, geometry.get("heading_deg")),
@@ -317,6 +320,28 @@ def _snr(series: RssSeries, levels: Levels) -> SnrScore | None:
         rmse_db=float(np.sqrt(np.mean(error_db**2))),
         mean_error_db=float(error_db.mean()),
         n=len(error_db),
+    )
+
+
+def _detection(settings: RssSettings, series: RssSeries, levels: Levels) -> DetectionScore | None:
+    """P(lock), or P(above the floor), and all samples with the floor; None for a level without either."""
+    if series.locked is not None:
+        known, detected, floor_db = np.isfinite(series.locked), series.locked == 1.0, LOCK_FLOOR_DB
+    else:
+        detected = np.isfinite(levels.measured_db)
+        known = np.ones(len(detected), dtype=np.bool_)
+        if not (levels.posed & ~detected).any() or not detected.any():
+            return None
+        floor_db = float(np.nanmin(levels.measured_db))
+    at = known & levels.posed
+    return score_detection(
+        rss.seconds(series.time[at]),
+        levels.measured_db[at],
+        levels.simulated_db[at],
+        detected[at],
+        floor_db=floor_db,
+        span_db=settings.span_db,
+        step_db=settings.step_db,
     )
 
 

@@ -135,7 +135,22 @@ def rss_verdict(panel: RssPanel) -> str:
         return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
     words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
     words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
-    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB.{_snr_words(panel)}"
+    further = _detection_words(panel) + _snr_words(panel)
+    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB.{further}"
+
+
+def _detection_words(panel: RssPanel) -> str:
+    """What a receiver adds that loses its lock or ends at a floor: both parts of its score."""
+    score = panel.extra.get("detection")
+    if not score:
+        return ""
+    return (
+        f" The receiver detected the signal in {100 * score['n_detected'] / score['n']:.0f} % of {score['n']} samples. "
+        f"The predicted level gives P(detected) with a Brier score of {score['brier']:.2f} (held-out segments; a "
+        f"constant: {score['constant_brier']:.2f}). With a floor at {score['floor_db']:.0f}, all samples: RMSE "
+        f"{score['rmse_db']:.1f} dB; detected samples, which are selected by their level: "
+        f"{score['detected_rmse_db']:.1f} dB."
+    )
 
 
 def _snr_words(panel: RssPanel) -> str:

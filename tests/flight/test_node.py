@@ -10,7 +10,7 @@ import pytest
 from aerpaw_cmp.common.units import FloatArray
 from aerpaw_cmp.common.yamlfile import parse_yaml
 from aerpaw_cmp.flight.draft import draft
-from aerpaw_cmp.flight.node import listed_places, may_lose_lock
+from aerpaw_cmp.flight.node import listed_places
 from aerpaw_cmp.flight.settings import FlightFile
 from aerpaw_cmp.logs.ingest import IngestedFile, ingest
 from aerpaw_cmp.logs.readers import ReadOptions
@@ -89,14 +89,3 @@ def test_the_span_of_offsets_holds_the_expected_one(tmp_path: Path, level_100_m:
     expected = 40.0 - 82.8 - level_100_m  # Friis over 100 m at 3.3 GHz: -82.8 dB
     assert low + 10.0 < expected < high - 10.0
     assert ((low, high) != (-50.0, 50.0)) is moved
-
-
-def test_a_quality_near_the_peak_of_a_locked_correlator_is_a_lock(tmp_path: Path) -> None:
-    for level, lock in ((72.2, True), (40.0, False)):
-        rows = "".join(f"{t},{level + 0.1 * (t % 3)}\n" for t in range(40))
-        (tmp_path / "q.csv").write_text("t,q\n" + rows)
-        named = ReadOptions(time_origin=ORIGIN, kind="rss", columns={"time": "t", "rss_db": "q"}, unit="dB")
-        (file,) = ingest([tmp_path / "q.csv"], reader="generic_csv", options=named)
-        (stream,) = file.result.streams
-        object.__setattr__(stream, "name", "quality")
-        assert may_lose_lock([stream]) is lock

@@ -1,0 +1,83 @@
+"""When the receiver of AERPAW's channel sounder was in lock."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from ..common.units import FloatArray
+from ..compare.detection import aligned_quality
+from ..logs.records import Stream
+
+LOCK_QUALITY_DB, LOST_QUALITY_DB = 20.0 * float(np.log10(4095.0)), 60.0
+"""Quality [dB] at perfect lock (the peak of 4095 chips), and below which the receiver has lost it."""
+
+LOCK_FLOOR_DB = -15.0
+"""Level [dB re full scale] below which the receiver loses its lock: what it then writes is noise."""
+
+_WITHIN_S = 0.1
+"""A quality of another log stands for a level this near in time."""
+
+
+def may_lose_lock(stream: Stream) -> bool:
+    """Whether a stream is the lock quality of the sounder: where locked, it stays near its peak."""
+    if stream.kind != "rss" or stream.name != "quality":
+        return False
+    quality = stream.frame["rss_db"].to_numpy(np.float64)
+    locked = quality[quality > LOST_QUALITY_DB]
+    return bool(len(locked)) and abs(float(np.median(locked)) - LOCK_QUALITY_DB) < 3.0
+
+
+def is_sounder_power(stream: Stream) -> bool:
+    """Whether a stream may be the level beside such a quality."""
+    return stream.kind == "rss" and stream.name == "power" and stream.attributes.get("unit") == "dB re full scale"
+
+
+def lock_of(power: Stream, others: Iterable[Stream]) -> tuple[FloatArray | None, str]:
+    """When a sounder's level was measured in lock.
+
+    Parameters
+    ----------
+    power : Stream
+    others : iterable of Stream
+        Of the flight, those of the same file first; the first lock quality that shares time with the level is taken.
+
+    Returns
+    -------
+    (n,) or None, str
+        1 in lock, 0 where lost, NaN unknown, for each row of the level; and what is to be said of the quality's times.
+    """
+    if not is_sounder_power(power):
+        return None, ""
+    time = _seconds(power)
+    for other in others:
+        if not may_lose_lock(other):
+            continue
+        at, quality = _seconds(other), other.frame["rss_db"].to_numpy(np.float64)
+        said = ""
+        if len(at) == len(time) and np.array_equal(at, time):
+            quality, shift_s = aligned_quality(time, power.frame["rss_db"].to_numpy(np.float64), quality)
+            if shift_s:
+                said = (
+                    f"the quality is paired with the power by row and runs up to {shift_s:.0f} s ahead: it is taken "
+                    "at its own times, 0.032768 s a row"
+                )
+        else:
+            quality = _nearest(time, at, quality)
+        if np.isfinite(quality).any():
+            return np.where(np.isfinite(quality), (quality > LOST_QUALITY_DB).astype(np.float64), np.nan), said
+    return None, ""
+
+
+def _seconds(stream: Stream) -> FloatArray:
+    return np.asarray(stream.frame["time"].to_numpy("datetime64[ns]").astype(np.int64) * 1e-9)
+
+
+def _nearest(time: FloatArray, at: FloatArray, values: FloatArray) -> FloatArray:
+    """Values at the nearest instant; NaN where none is near."""
+    order = np.argsort(at, kind="stable")
+    at, values = at[order], values[order]
+    right = np.clip(np.searchsorted(at, time), 1, len(at) - 1) if len(at) > 1 else np.zeros(len(time), dtype=np.int64)
+    best = np.where(np.abs(at[right] - time) < np.abs(at[right - 1] - time), right, right - 1)
+    return np.where(np.abs(at[best] - time) <= _WITHIN_S, values[best], np.nan)

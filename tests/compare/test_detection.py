@@ -1,0 +1,74 @@
+"""A level that is detected or lost: probabilities that are calibrated, and offsets with a floor."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from scipy.special import expit
+
+from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.compare.detection import aligned_quality, floored_offset, score_detection
+
+FLOOR = -15.0
+
+
+def _flight(offset_db: float = -40.0, n: int = 6000) -> tuple[FloatArray, FloatArray, FloatArray, BoolArray]:
+    """Times, measured and simulated levels, and detections by a logistic threshold at the floor."""
+    random = np.random.default_rng(3)
+    time = np.arange(n) / 10.0
+    simulated = -60.0 + 15.0 * np.sin(time / 17.0) + random.normal(0.0, 2.0, n)
+    measured = simulated - offset_db + random.normal(0.0, 4.0, n)
+    detected = random.random(n) < expit((simulated - offset_db - FLOOR) / 3.0)
+    return time, measured, simulated, detected
+
+
+def test_the_probability_is_calibrated_and_beats_the_constant() -> None:
+    time, measured, simulated, detected = _flight()
+    score = score_detection(
+        time, measured, simulated, detected, floor_db=FLOOR, span_db=(-80.0, 0.0), step_db=0.1
+    )  # fmt: skip
+    assert score is not None
+    truth = expit((simulated + 40.0 - FLOOR) / 3.0)
+    best = float(np.mean((truth - detected) ** 2))
+    assert best < score.brier < 1.03 * best + 0.005
+    share = detected.mean()
+    assert score.constant_brier == pytest.approx(share * (1 - share), rel=0.1)
+    assert score.brier < 0.75 * score.constant_brier
+    assert score.log_score < score.constant_log_score
+    assert (score.n, score.n_detected) == (6000, int(detected.sum()))
+    for said, seen, count in score.reliability:
+        assert abs(said - seen) < 4.0 * np.sqrt(0.25 / count) + 0.02
+    assert score.offset_db == pytest.approx(-40.0, abs=0.5)
+
+
+def test_a_level_that_says_nothing_gains_nothing() -> None:
+    time, measured, simulated, detected = _flight()
+    shuffled = np.random.default_rng(1).permutation(simulated)
+    score = score_detection(time, measured, shuffled, detected, floor_db=FLOOR, span_db=(-80.0, 0.0), step_db=0.1)
+    assert score is not None
+    assert score.brier > 0.98 * score.constant_brier
+
+
+@pytest.mark.parametrize("offset_db", [-40.0, 12.3])
+def test_the_floored_offset_is_that_of_a_search_by_hand(offset_db: float) -> None:
+    random = np.random.default_rng(4)
+    simulated = random.normal(-50.0, 15.0, 400)
+    measured = np.maximum(simulated - offset_db + random.normal(0.0, 3.0, 400), FLOOR)
+    fit = floored_offset(measured, simulated, floor_db=FLOOR, span_db=(-60.0, 40.0), step_db=0.1)
+    grid = np.arange(-600, 401) / 10.0
+    by_hand = [np.sqrt(np.mean((measured - np.maximum(simulated - o, FLOOR)) ** 2)) for o in grid]
+    assert fit.rmse_db == pytest.approx(min(by_hand), abs=1e-9)
+    assert fit.offset_db == pytest.approx(grid[int(np.argmin(by_hand))])
+    assert fit.at_edge is False
+
+
+def test_one_outcome_alone_is_no_score() -> None:
+    time, measured, simulated, _ = _flight()
+    always = np.ones(len(time), dtype=bool)
+    assert score_detection(time, measured, simulated, always, floor_db=FLOOR, span_db=(-80, 0), step_db=0.1) is None
+
+
+def test_short_logs_keep_their_pairs() -> None:
+    quality, shift = aligned_quality(np.arange(10) / 30.0, np.arange(10.0), np.arange(10.0))
+    assert shift == 0.0
+    assert quality.tolist() == list(range(10))

@@ -38,8 +38,9 @@ from .paths import Faces, PathSet, path_lengths
 from .surfaces import Surfaces
 
 SPECULAR_TABLE_SLOTS = 2**24
-MAXIMUM_PATHS = 1_000_000
-"""Candidates per tower and batch that there is room for at first."""
+FEWEST_SLOTS = 2**20
+MAXIMUM_PATHS = 2**16
+"""Candidates per tower and batch that there is room for at first: their number is known afterwards."""
 
 MOST_CANDIDATES = 2**25
 """Room beyond which a batch is refused (some 100 bytes each)."""
@@ -199,6 +200,16 @@ def _material(name: str, carrier_hz: float, own_table: bool, scattering: float =
     )
 
 
+def _slots(built: _Scene, targets: int) -> int:
+    """Slots of PathSolver's table: fewer over bare ground, where so few candidates can be that none shares a slot.
+
+    Of n candidates some ``2 n^2 / slots`` are lost: less than one in two hundred batches.
+    """
+    mirrors = sum(len(np.unique(faces)) for faces in built.face_of.values())
+    wanted = 400.0 * (targets * max(mirrors, 1) ** 2) ** 2
+    return int(np.clip(2 ** np.ceil(np.log2(wanted)), FEWEST_SLOTS, SPECULAR_TABLE_SLOTS))
+
+
 def _points(values: FloatArray) -> Any:
     import mitsuba as mi
 
@@ -274,7 +285,6 @@ class _Finder:
         import sionna.rt as rt
         from sionna.rt.path_solvers.sb_candidate_generator import SBCandidateGenerator
 
-        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = SPECULAR_TABLE_SLOTS
         self.built, self.batch, self.synthetic = built, batch, synthetic
         self.flags = {"diffuse_reflection": False, "refraction": False, "diffraction": False} | (flags or {})
         scene = built.scene
@@ -287,7 +297,8 @@ class _Finder:
             scene.add(rt.Transmitter(name=f"tx{i}", position=[0.0, 0.0, 1.0]))
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
-        self.limit, self.slots, self.candidates = MAXIMUM_PATHS, SPECULAR_TABLE_SLOTS, None
+        self.limit, self.slots, self.candidates = MAXIMUM_PATHS, _slots(built, batch * len(elements_m)), None
+        SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots
         self.sources = sources.arguments(synthetic)
         self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)
         self._replace_endpoints(len(sources.centres_m))
@@ -299,7 +310,8 @@ class _Finder:
         generator: Any = getattr(self.solver, "_candidate_generator", None)
         inner = getattr(generator, "_shoot_and_bounce", None)
         if inner is None:
-            return  # another release: then the count of valid paths is all there is
+            self.limit = max(self.limit, 1_000_000)  # another release: the count of valid paths is all there is
+            return
         place = list(inspect.signature(inner).parameters).index("paths_counter_per_source")
 
         def watched(*arguments: Any, **named: Any) -> Any:
@@ -341,8 +353,14 @@ class _Finder:
         gc.collect()
 
     def trace(self, targets: _Ends, max_depth: int, samples: int) -> Any:
-        """Sionna's paths of one batch, padded."""
+        """Sionna's paths of one batch, padded, searched until there was room for all."""
         self.targets = targets.padded(self.batch).arguments(self.synthetic)
+        paths = self._solved(max_depth, samples)
+        while max_depth and self._more_room():
+            paths = self._solved(max_depth, samples)
+        return paths
+
+    def _solved(self, max_depth: int, samples: int) -> Any:
         return self.solver(
             self.built.scene,
             max_depth=max_depth,
@@ -383,14 +401,12 @@ class _Finder:
         return True
 
     def searched(self, targets_m: FloatArray, max_depth: int, samples: int) -> tuple[Any, dict[str, Any]]:
-        """Sionna's paths of one batch, searched until there was room for all, and what they are as arrays.
+        """Sionna's paths of one batch, and what they are as arrays.
 
         Arrays, for the real (not padding) targets: valid, kind, shape, primitive, gain.
         """
         count = len(targets_m)
         paths = self.trace(_Ends.points(targets_m), max_depth, samples)
-        while max_depth and self._more_room():
-            paths = self.trace(_Ends.points(targets_m), max_depth, samples)
         real, imaginary = (np.asarray(part.numpy()) for part in paths.a)
         valid = paths.valid.numpy()
         if valid.sum(axis=(0, 2)).max(initial=0) > 0.9 * self.limit:

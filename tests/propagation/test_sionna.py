@@ -319,6 +319,21 @@ def test_a_second_search_compiles_nothing(sionna, scenes, lone):
         for shift in range(4):
             compiled()
             few = type(poses)(poses.position_m[shift : shift + 5], poses.rotation[shift : shift + 5])
-            replay(site, link, few, "sionna", samples=1000, batch=5, cache_dir="", max_depth=1)
+            replay(site, link, few, Search("sionna", samples=1000, batch=5, max_depth=1), run=Run(cache_dir=""))
             big = [kernel for kernel in compiled() if kernel["operation_count"] > 1000]
             assert not (shift and big), "a search like the one before was compiled anew"
+
+
+def test_a_batch_without_room_is_searched_again_with_more(sionna, scenes, lone, monkeypatch):
+    site, poses = lone
+    link = scenes.link(site, tower_comparison_array(), uav_comparison_array(wavelength_m(scenes.carrier_hz)))
+
+    def searched():
+        search = Search("sionna", samples=10_000, batch=BATCH)
+        return scenes.keys(replay(site, link, poses, search, run=Run(cache_dir="")).paths)
+
+    usual = searched()
+    monkeypatch.setattr(sionna, "MAXIMUM_PATHS", 32)  # not below the receivers of a batch: PathSolver corrupts memory
+    assert searched() == usual
+    monkeypatch.setattr(sionna, "RAISE_LIMITS", False)
+    assert len(searched()) < len(usual), "32 candidates were enough: the case is not hard"

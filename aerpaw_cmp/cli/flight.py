@@ -142,7 +142,7 @@ def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
             f"{min(errors):.2f}" if len(errors) == 1 else f"{min(errors):.2f} .. {max(errors):.2f}" if errors else "-"
         )
         star = "* " if any(m["recommended"] for m in mine) else ""
-        rows.append([star + model, shown, number(sum(m["seconds"] for m in mine), "{:.1f}")])
+        rows.append([star + model, shown, number(max(m["seconds"] for m in mine), "{:.1f}")])
     if rows:
         heads = ["model", "RMSE dB", "s"]
         table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")

@@ -52,7 +52,7 @@ class LadderRow:
     n : int
         Samples that all compared models share.
     seconds : float
-        For the whole flight.
+        For the whole flight, the same in each of its rows.
     recommended : bool
         The simplest model within one standard error of the best, over all series of the flight.
     """

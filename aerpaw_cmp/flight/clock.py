@@ -268,9 +268,10 @@ def _timed(times: ArrayLike) -> AnyArray:
 
 
 def _estimate(fit: LagFit, start: int, model: str, channels: Mapping[str, float] | None = None) -> ClockEstimate:
-    """A pooled fit before its checks."""
+    """A pooled fit before its checks; refining the best lag between two tried ones never leaves interval and window."""
+    low, high = np.clip(fit.ci95_s, -fit.window_s, fit.window_s)
     return ClockEstimate(
-        radio_minus_telemetry_s=fit.radio_minus_telemetry_s,
+        radio_minus_telemetry_s=float(np.clip(fit.radio_minus_telemetry_s, low, high)),
         ci95_s=fit.ci95_s,
         drift_s_per_s=fit.drift_s_per_s,
         drift_ci95_s_per_s=fit.drift_interval_s_per_s,

@@ -34,8 +34,8 @@ HEAD = """\
 # A first draft for these logs, made by 'aerpaw-cmp ingest --draft'. Check every line with a question mark.
 """
 LINK = (
-    f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true}}"
-    "  # as in your experiment?\n"
+    f"link:\n  rss: {{carrier_hz: {CARRIER_HZ / 1e9:g}e9, transmit_power_dbm: {POWER_DBM:g}, uav_transmits: true,"
+    " bandwidth_hz: 20e6}  # out of coverage below the noise of this bandwidth; all as in your experiment?\n"
 )
 NO_TRACK = "  # no telemetry here: which vehicleOut log belongs to this flight?\n"
 RANK = "# Rank is compared for the paper's 4 x 4 arrays at 3.4 GHz unless link.rank names others: is that your modem?\n"
@@ -214,11 +214,16 @@ def _settings(entries: _Entries) -> list[str]:
     if float(np.nanmax(frame["altitude_m"].to_numpy(np.float64), initial=-np.inf)) > FLOWN_ABOVE_M:
         low = {"minimum_height_m": MINIMUM_HEIGHT_M}
     for kind in sorted(entries.kinds & {"rss", "rank"}, reverse=True):
-        span = _span_of_offsets(entries.offsets_db) if kind == "rss" else {}
+        chosen: dict[str, Any] = dict(low)
         reasons = ["without take-off and landing"] if low else []
-        reasons += ["the levels lie outside the usual span of offsets"] if span else []
-        if low or span:
-            lines.append(f"{kind}: {_plain(low | span)}  # {'; '.join(reasons)}\n")
+        if kind == "rss":
+            chosen |= {"field": "power"}
+            reasons.append("powers of paths added: phases of a real ground are not known")
+            if span := _span_of_offsets(entries.offsets_db):
+                chosen |= span
+                reasons.append("the levels lie outside the usual span of offsets")
+        if chosen:
+            lines.append(f"{kind}: {_plain(chosen)}  # {'; '.join(reasons)}\n")
     return lines
 
 

@@ -303,10 +303,13 @@ def _in_blocks(times: Any) -> list[Any]:
 def _estimated_clock(data: FlightData, channels: Sequence[RssSeries], predictions: _Predictions) -> ClockEstimate:
     """Clock of one receiver by the coherent replay and by its power sum; the one that explains more decides.
 
-    Interference of direct and ground path pins a clock to milliseconds where the field shows it. Where it does not
-    (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured on real flights.
+    Ratios (the sounder's ``quality``, an SNR) saturate and lose lock where levels do not: they take part only where
+    nothing else was logged. Interference of direct and ground path pins a clock to milliseconds where the field shows
+    it. Where it does not (directive antennas, rough ground), its wrong ripple finds a sharp optimum anywhere: measured
+    on real flights.
     """
     tower = channels[0].tower
+    channels = [series for series in channels if series.unit != "dB"] or channels
 
     def channel(series: RssSeries, field: str, resolution_s: float) -> ClockChannel:
         return ClockChannel(

@@ -343,7 +343,8 @@ class FlightSimulator:
         )
         result = replay(self.site, link, self._poses(time_s), search)
         offset = plan.offsets_db.get(log.node, {}).get(log.channel, 0.0)
-        level = result.rss_dbm[:, 0] - offset
+        summed = result.rss_power_dbm if self.settings.rss.field == "power" else result.rss_dbm
+        level = summed[:, 0] - offset
         level = level + correlated_noise(
             self.generator, len(level), plan.fading_db, plan.rss_interval_s, plan.fading_correlation_s
         )

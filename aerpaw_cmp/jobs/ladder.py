@@ -229,11 +229,19 @@ class _Climber:
 
     def _as_set(self) -> Rung:
         levels = tuple(s.levels.simulated_db[s.rows] for s in self._series)
-        seconds = sum(s.replayed.replay.seconds for s in self._series)
+        seconds = self._of_flight([s.replayed.replay.seconds for s in self._series])
         if self._learned_here:
             nothing = tuple(np.full(len(level), np.nan) for level in levels)
             return Rung(model=AS_SET + LEARNED_HERE, level_db=nothing, seconds=seconds)
         return Rung(model=AS_SET, level_db=levels, seconds=seconds)
+
+    def _of_flight(self, seconds: Sequence[float]) -> float:
+        """Seconds of a flight from those of its series: channels that share a replay cost it once."""
+        shared: dict[tuple[str, str], float] = {}
+        for series, one in zip(self._data.rss, seconds, strict=True):
+            key = series.tower, series.settings_key
+            shared[key] = max(one, shared.get(key, 0.0))
+        return sum(shared.values())
 
     @cached_property
     def _learned_here(self) -> bool:
@@ -247,7 +255,9 @@ class _Climber:
             nothing = tuple(np.full(len(s.rows), np.nan) for s in self._series)
             return Rung(model=model.name + LEARNED_HERE, level_db=nothing, seconds=0.0)
         levels = [self._level(i, model) for i in range(len(self._series))]
-        return Rung(model=model.name, level_db=tuple(f[0] for f in levels), seconds=sum(f[1] for f in levels))
+        return Rung(
+            model=model.name, level_db=tuple(f[0] for f in levels), seconds=self._of_flight([f[1] for f in levels])
+        )
 
     def _level(self, index: int, model: Model) -> tuple[FloatArray, float]:
         """Level (m,) [dBm] at the thinned samples of a series, and the seconds that the whole series would take."""

@@ -174,7 +174,8 @@ class _Runner:
             result = replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=self.depth))
         nearest = np.minimum((self.all + step // 2) // step, len(chosen) - 1)
         level = np.stack([_between(self.all, chosen, column, nearest) for column in result.rss_dbm.T], axis=1)
-        difference = self._difference(result.h[nearest], level, self.all)
+        left_out = np.flatnonzero(self.all % step)  # poses that were replayed have no error, and say nothing
+        difference = self._difference(result.h[nearest[left_out]], level[left_out], self.all[left_out])
         return self._row(
             engine="image",
             samples=None,

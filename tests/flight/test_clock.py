@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from aerpaw_cmp.flight.clock import AGREE_S, ClockChannel, HeldOutBlocks, _near, clock_trap, judge_clock
+from aerpaw_cmp.flight import replay as flight_replay
+from aerpaw_cmp.flight.clock import AGREE_S, ClockChannel, HeldOutBlocks, _estimate, _near, clock_trap, judge_clock
 from aerpaw_cmp.flight.lag import DRIFT_LIMIT, direction_terms, no_lag
 from tests.flight.test_lag import two_ray_flight
 
@@ -202,3 +204,29 @@ def test_part_of_the_evidence_agrees_where_it_is_near_or_cannot_tell(own_s, verd
     assert _near(replace(part, evidence=np.roll(evidence, -1)), 2.0) == near
     two_away = replace(part, evidence=np.roll(evidence, 2))
     assert _near(two_away, 2.0) == (own_s == 2.3)
+
+
+def test_a_refined_lag_stays_inside_its_interval_and_the_window():
+    """A parabola through the last tried lags peaks beyond them: 15.04 s of a window of 15 s was reported."""
+    fit = no_lag("none", 0, 15.0, np.linspace(-15.0, 15.0, 31))
+    beyond = replace(fit, radio_minus_telemetry_s=15.04, ci95_s=(11.6, 15.0), window_s=15.0)
+    assert _estimate(beyond, 0, "model").radio_minus_telemetry_s == 15.0
+
+
+def test_ratios_do_not_vote_on_the_clock_where_levels_do(monkeypatch):
+    """The sounder's quality saturates: pooled with the level, it said +14.8 s for a planted lag of 5 s."""
+    seen = []
+    monkeypatch.setattr(
+        flight_replay,
+        "judge_clock",
+        lambda channels, **_: seen.append([c.name for c in channels]) or SimpleNamespace(explained=0.0),
+    )
+    time = np.zeros(3, "datetime64[ns]")
+    data = SimpleNamespace(settings=SimpleNamespace(rss=SimpleNamespace(minimum_height_m=None, lag_window_s=15.0)))
+    series = [
+        SimpleNamespace(tower="LW1", channel=c, unit=u, time=time, measured_db=np.zeros(3))
+        for c, u in (("power", "dB re full scale"), ("quality", "dB"))
+    ]
+    flight_replay._estimated_clock(data, series, None)
+    flight_replay._estimated_clock(data, series[1:], None)
+    assert seen == [["power"], ["power"], ["quality"], ["quality"]]

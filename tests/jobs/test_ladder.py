@@ -6,6 +6,7 @@ import dataclasses
 import json
 from functools import partial
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from aerpaw_cmp.common import forked
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
-from aerpaw_cmp.jobs.ladder import Model, recommended_settings
+from aerpaw_cmp.jobs.ladder import Model, _Climber, recommended_settings
 from aerpaw_cmp.site.sphere_pattern import sphere_csv
 
 pytestmark = pytest.mark.usefixtures("few_pictures")
@@ -180,3 +181,9 @@ def _plain(value: Any) -> Any:
     if isinstance(value, dict):
         return {key: _plain(one) for key, one in value.items()}
     return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
+
+
+def test_channels_that_share_a_replay_cost_it_once() -> None:
+    series = [SimpleNamespace(tower=t, settings_key=k) for t, k in (("LW1", "a"), ("LW1", "a"), ("LW1", "b"))]
+    climber = SimpleNamespace(_data=SimpleNamespace(rss=series))
+    assert _Climber._of_flight(climber, [2.0, 3.0, 4.0]) == 7.0

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import sionna
+from aerpaw_cmp.propagation import bench, sionna
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,
     rotation_from_yaw_pitch_roll,
@@ -143,3 +143,16 @@ def test_thinning_keeps_what_is_constant():
     (row,) = speed_against_error(site, link, still, samples=(), depths=(), thinning=(7,))
     assert row.rss_max_error_db == pytest.approx(0.0, abs=1e-9)
     assert set(row.rank_disagreement.values()) == {0.0}
+
+
+def test_thinning_is_scored_on_the_poses_that_it_left_out(monkeypatch):
+    site, link, poses = random_scene(20, buildings=0)
+    scored = []
+    own = bench._Runner._difference
+    monkeypatch.setattr(
+        bench._Runner,
+        "_difference",
+        lambda self, h, level, chosen: scored.append(chosen) or own(self, h, level, chosen),
+    )
+    speed_against_error(site, link, poses, samples=(), depths=(), thinning=(5,))
+    assert scored[0].tolist() == [i for i in range(20) if i % 5]

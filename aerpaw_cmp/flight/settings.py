@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from ..common.errors import UsageError
-from ..common.units import FloatArray, noise_floor_dbm, wavelength_m
+from ..common.units import SPEED_OF_LIGHT_MPS, FloatArray, noise_floor_dbm, wavelength_m
 from ..common.yamlfile import load_yaml
 from ..logs.readers import ReadOptions
 from ..logs.records import Kind
@@ -116,20 +116,20 @@ class ArraySettings(Settings):
         return Array(
             positions,
             np.radians(np.broadcast_to(slant, (len(positions),)).copy()),
-            tuple(load_pattern(a, folder) for a in antennas),
+            tuple(load_pattern(a, folder, SPEED_OF_LIGHT_MPS / wavelength) for a in antennas),
             mount,
         )
 
 
-def load_pattern(settings: AntennaSettings, folder: Path) -> Pattern:
-    """The element pattern of the settings; files resolve against ``folder``."""
+def load_pattern(settings: AntennaSettings, folder: Path, carrier_hz: float | None = None) -> Pattern:
+    """The element pattern of the settings; files resolve against ``folder``, the carrier chooses among frequencies."""
     from ..site.installed import InstalledPattern
 
-    alone = _pattern_alone(settings, folder)
+    alone = _pattern_alone(settings, folder, carrier_hz)
     return InstalledPattern(alone, tuple(settings.installed_db)) if settings.installed_db else alone
 
 
-def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
+def _pattern_alone(settings: AntennaSettings, folder: Path, carrier_hz: float | None) -> Pattern:
     from ..site import antennas
 
     if settings.model == "dipole":
@@ -137,7 +137,10 @@ def _pattern_alone(settings: AntennaSettings, folder: Path) -> Pattern:
     if settings.model == "tr38901":
         return antennas.TR38901()
     if settings.model == "file":
-        return antennas.read_pattern_text(folder / str(settings.file), polarised=settings.polarised)
+        from ..site.pattern_files import read_pattern_file
+
+        file = folder / str(settings.file)
+        return read_pattern_file(file, polarised=settings.polarised, carrier_hz=carrier_hz)
     if settings.model == "sphere":
         from ..site.sphere_pattern import read_sphere_csv
 

@@ -261,16 +261,16 @@ def expected_array(settings: ArraySettings, wavelength: float, folder: Path) -> 
     return ExpectedArray(
         positions_m=positions,
         slants_deg=tuple(float(x) for x in per_element(slants)),  # type: ignore[arg-type]
-        patterns=tuple(_pattern(a, folder) for a in per_element(antennas)),  # type: ignore[arg-type]
+        patterns=tuple(_pattern(a, folder, C_MPS / wavelength) for a in per_element(antennas)),  # type: ignore[arg-type]
         mount=turned(settings.yaw_deg, settings.pitch_deg, settings.roll_deg),
     )
 
 
-def _pattern(settings: AntennaSettings, folder: Path) -> Pattern:
+def _pattern(settings: AntennaSettings, folder: Path, carrier_hz: float) -> Pattern:
     """A formula a second time, or what an antenna file says."""
     if settings.model in PATTERNS and not settings.installed_db:
         return PATTERNS[settings.model]
-    pattern: Pattern = scalar_pattern(load_pattern(settings, folder))
+    pattern: Pattern = scalar_pattern(load_pattern(settings, folder, carrier_hz))
     return pattern
 
 

@@ -215,7 +215,8 @@ def _single_valued_poles(e_theta: ComplexArray, e_phi: ComplexArray) -> tuple[Co
 
 # ---------------------------------------------------------------- AERPAW text files
 
-_COLUMNS = ("phi", "theta", "e total", "e(phi) . amp", "e(theta) . amp", "e(phi) . phase", "e(theta) . phase")
+_COLUMNS = ("phi", "theta", "etotal", "e(phi)amp", "e(theta)amp", "e(phi)phase", "e(theta)phase")
+"""As they begin without spaces and points, which differ from file to file of one lab."""
 
 
 @dataclass(slots=True)
@@ -327,7 +328,7 @@ def _check_last_line(text: str, rows: _Rows, path: Path) -> None:
 
 
 def _check_header(line: str, path: Path, number: int) -> None:
-    columns = [cell.strip().lower() for cell in line.split("\t")]
+    columns = [re.sub(r"[\s.]", "", cell.lower()) for cell in line.split("\t")]
     if len(columns) != 7 or not all(cell.startswith(column) for cell, column in zip(columns, _COLUMNS, strict=True)):
         cause = "the columns are not separated by tabs" if len(columns) == 1 else None
         raise InputError(

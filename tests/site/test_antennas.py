@@ -18,6 +18,7 @@ from aerpaw_cmp.site.antennas import (
     read_gain_grid,
     read_pattern_text,
 )
+from aerpaw_cmp.site.pattern_files import read_pattern_file
 
 MOMENT = np.array([0.8 + 0.1j, -0.3 + 0.5j, 0.6 - 0.2j])
 MOMENT = MOMENT * math.sqrt(1.5) / np.linalg.norm(MOMENT)  # efficiency 1
@@ -316,3 +317,21 @@ def test_damaged_gain_grids(
     savemat(tmp_path / "g.mat", {"theta2": elevation, "phi2": azimuth, "g": grid.T if change == "transpose" else grid})
     with pytest.raises(AerpawCmpError, match=words):
         read_gain_grid(tmp_path / "g.mat", "g")
+
+
+@pytest.mark.field
+@pytest.mark.skipif(not os.environ.get("AERPAW_CMP_FIELD_DATA"), reason="AERPAW_CMP_FIELD_DATA is not set")
+def test_the_headers_of_one_lab_tell_one_antenna() -> None:
+    """The file at 3.5 GHz, the cut at phi = 0 and the gain over frequency are three views of the UAV's antenna."""
+    folder = Path(os.environ["AERPAW_CMP_FIELD_DATA"]) / "antennas"
+    gain = np.loadtxt(folder / "SA-1400-5900_gain.txt", skiprows=2)
+    (at_3500,) = gain[gain[:, 0] == 3.5e9, 1]
+    assert read_pattern_file(folder / "SA-1400-5900_F3500.txt").peak_gain_dbi == pytest.approx(at_3500, abs=0.01)
+    cut = read_pattern_file(folder / "SA-1400-5900_phi_0.txt", carrier_hz=3.31e9)
+    whole = read_pattern_file(folder / "SA-1400-5900_F3300.txt")
+    theta = np.radians(np.arange(20, 161, 10))
+    for half in (0.0, np.pi):
+        side = np.full(len(theta), half)
+        np.testing.assert_allclose(cut.gain_dbi(theta, side), whole.gain_dbi(theta, side), atol=0.25)
+    with pytest.raises(InputError, match="without directions"):
+        read_pattern_file(folder / "SA-1400-5900_gain.txt")

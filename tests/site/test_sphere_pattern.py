@@ -5,6 +5,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.site.antennas import HalfWaveDipole
+from aerpaw_cmp.site.pattern_files import read_pattern_file
 from aerpaw_cmp.site.sphere_pattern import (
     SpherePattern,
     planning_cuts,
@@ -77,3 +78,76 @@ def test_broken_files_are_told(tmp_path, spoil, message):
 
 def test_other_patterns_have_no_standard_deviation():
     assert not hasattr(HalfWaveDipole(), "gain_sd_db")
+
+
+def lobed():
+    _, _, v = sphere_grid()
+    return SpherePattern("a", unit_mean_gain(6.0 * v[..., 0] - 2.0 * v[..., 1] + 3.0 * v[..., 2]), 0.0 * v[..., 0])
+
+
+def nsma(pattern):
+    """The same two cuts as NSMA's text: dB relative to the peak, elevation positive upwards."""
+    azimuth = np.arange(-180.0, 181.0, 2.0)
+    level = pattern.gain_dbi(np.full(len(azimuth), np.pi / 2), -np.radians(azimuth))
+    zenith = np.radians(90.0 - azimuth) % (2 * np.pi)
+    over = pattern.gain_dbi(np.where(zenith > np.pi, 2 * np.pi - zenith, zenith), np.where(zenith > np.pi, np.pi, 0.0))
+    lines = ["REVNUM:,TIA/EIA-804-B", "GUNITS:,DBI/DBR", "MDGAIN:,10.0", "PATFRE:,3500", "NUMCUT:,2"]
+    for kind, values in (("AZ", level), ("EL", over)):
+        lines += [f"PATCUT:,{kind}", "POLARI:,V/V", f"NUPOIN:,{len(azimuth)}"]
+        lines += [f"{a:g},{v - 10.0:.3f}," for a, v in zip(azimuth, values, strict=True)]
+    return "\n".join([*lines, "ENDFIL:,EOF"]) + "\n"
+
+
+@pytest.mark.parametrize("form", ["msi", "msi in dBd", "nsma"])
+def test_cuts_of_planning_tools_read_back(tmp_path, form):
+    """Both principal cuts come back; between them nothing is known."""
+    pattern, file = lobed(), tmp_path / "a.msi"
+    text = nsma(pattern) if form == "nsma" else planning_cuts(pattern, "a", 3.3e9)
+    if form == "msi in dBd":
+        gain = float(text.split("GAIN ")[1].split()[0])
+        text = text.replace(f"GAIN {gain:.2f} dBi", f"GAIN {gain - 2.15:.2f}").replace("\n", "\r\n")
+    file.write_text(text)
+    again = read_pattern_file(file)
+    around = np.radians(np.arange(0.0, 360.0, 5.0))
+    level = np.full(len(around), np.pi / 2)
+    assert np.allclose(again.gain_dbi(level, around), pattern.gain_dbi(level, around), atol=0.06)
+    down = np.radians(np.arange(10.0, 171.0, 5.0))
+    for half in (0.0, np.pi):
+        side = np.full(len(down), half)
+        assert np.allclose(again.gain_dbi(down, side), pattern.gain_dbi(down, side), atol=0.06)
+
+
+@pytest.mark.parametrize(
+    ("spoil", "message"),
+    [
+        (lambda t: t.replace("GAIN", "GAUN"), "no line 'GAIN"),
+        (lambda t: t[: t.index("VERTICAL")], "no cut VERTICAL"),
+        (lambda t: "\n".join(t.splitlines()[:-100]), "a cut of 260 lines"),
+        (lambda t: t.replace("\n12 ", "\nx "), "an angle and a value"),
+        (lambda _: "1\r\nFrequency\tE Total. dB\r\n3300000000\t-1.2\r\n", "without directions"),
+    ],
+)
+def test_broken_cuts_are_told(tmp_path, spoil, message):
+    file = tmp_path / "a.msi"
+    file.write_text(spoil(planning_cuts(lobed(), "a", 3.3e9)))
+    with pytest.raises(InputError, match=message):
+        read_pattern_file(file)
+
+
+def test_a_great_circle_at_several_frequencies(tmp_path):
+    """The carrier chooses; both halves of the circle come back, blended around."""
+    theta = np.linspace(-np.pi, np.pi, 121)
+    rows = [
+        f"{f}\t{t:.10f}\t{g}\t0\t0\t0\t0" for f, shift in ((902000000, 0), (3300000000, 2))
+        for t, g in zip(theta, 3 * np.cos(theta) + shift + 2 * (theta > 0), strict=True)
+    ]  # fmt: skip
+    head = "2\r\nPhi=0(deg)\r\n\r\nFrequency\tTheta\tE Total. dB\tE(Phi) . Amp dB\tE(Theta) . Amp dB\tp\tq"
+    file = tmp_path / "phi_0.txt"
+    file.write_text("\n".join([head, *rows]) + "\n")
+    pattern = read_pattern_file(file, carrier_hz=3.4e9)
+    assert pattern.frequency_hz == 3.3e9
+    down = np.radians([30.0, 60.0, 120.0])
+    assert np.allclose(pattern.gain_dbi(down, np.zeros(3)), 3 * np.cos(down) + 4, atol=0.05)
+    assert np.allclose(pattern.gain_dbi(down, np.full(3, np.pi)), 3 * np.cos(down) + 2, atol=0.05)
+    with pytest.raises(InputError, match="2 frequencies"):
+        read_pattern_file(file)

@@ -1,0 +1,313 @@
+"""Edges of buildings that diffract, and the paths over one of them.
+
+An edge is where two faces of a building meet at an exterior angle above 180 degrees: the rim of a flat roof and its
+upright corners. A path runs from the source, or its image in the ground, to the point of the edge where both legs make
+the same angle with it (Keller's cone), and on to the target or its image in the ground. It exists when that point lies
+on the edge, both legs are free, and the point is on no other building's wall or inside one.
+"""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import dataclass, fields
+
+import numpy as np
+
+from ..common.units import BoolArray, FloatArray, IntArray
+from .paths import Faces
+from .solids import Occlusion
+
+SHARPEST = 1e-6
+"""Exterior angles nearer than this to 180 degrees [rad] are a plane."""
+
+PROBE_M = 1e-3
+"""How far beside an edge point the air on both of its faces is looked for."""
+
+NEAREST_M = 0.01
+"""An end nearer than this to an edge has no path over it: there is no far field."""
+
+LINKS_AT_ONCE = 200_000
+"""Pairs of edge and pose that are looked at together."""
+
+
+@dataclass(frozen=True, slots=True)
+class Edges:
+    """Convex edges of a scene.
+
+    Parameters
+    ----------
+    start_m, end_m : (edges, 3)
+    along : (edges, 3)
+        Unit vector from start to end; ``face_axis x normal = along``.
+    face_axis : (edges, 3)
+        Unit vector in face 0, away from the edge.
+    normal : (edges, 3)
+        Outward normal of face 0.
+    normal_n : (edges, 3)
+        Outward normal of face n.
+    exterior : (edges,)
+        Exterior angle over pi, above 1.
+    face : (edges, 2) int
+        Faces 0 and n.
+    """
+
+    start_m: FloatArray
+    end_m: FloatArray
+    along: FloatArray
+    face_axis: FloatArray
+    normal: FloatArray
+    normal_n: FloatArray
+    exterior: FloatArray
+    face: IntArray
+
+    def __len__(self) -> int:
+        return len(self.start_m)
+
+    @property
+    def length_m(self) -> FloatArray:
+        """Lengths (edges,)."""
+        return np.asarray(np.linalg.norm(self.end_m - self.start_m, axis=1))
+
+    @classmethod
+    def of(cls, faces: Faces, ground_m: float = -np.inf) -> Edges:
+        """Edges of the solids of a scene.
+
+        Parameters
+        ----------
+        faces : Faces
+            Walls and roofs of prisms (``solid >= 0``).
+        ground_m : float
+            Upright corners begin here where their wall begins lower.
+
+        Returns
+        -------
+        Edges
+        """
+        rows = [row for solid in np.unique(faces.solid[faces.solid >= 0]) for row in _of_solid(faces, solid, ground_m)]
+        starts, ends = (np.array([row[i] for row in rows]).reshape(-1, 3) for i in (0, 1))
+        pairs = np.array([row[2] for row in rows], dtype=np.int64).reshape(-1, 2)
+        normal, normal_n = faces.normal[pairs[:, 0]], faces.normal[pairs[:, 1]]
+        along = ends - starts
+        along = along / np.linalg.norm(along, axis=1, keepdims=True)
+        turn = np.arctan2(np.linalg.norm(np.cross(normal_n, normal), axis=1), (normal * normal_n).sum(axis=1))
+        return cls(starts, ends, along, np.cross(normal, along), normal, normal_n, 1.0 + turn / np.pi, pairs)
+
+    def coordinates(self, points_m: FloatArray, edge: IntArray | slice = slice(None)) -> FloatArray:
+        """Points (..., 3) in the frames of edges: along, in face 0 away from the edge, out of face 0."""
+        frame = np.stack([self.along[edge], self.face_axis[edge], self.normal[edge]], axis=1)
+        return np.asarray(np.einsum("eij,...ej->...ei", frame, points_m - self.start_m[edge]))
+
+
+def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
+    """Start, end and faces of each edge, so that the outward normal of face 0 and the direction are as in Edges."""
+    members = np.flatnonzero(faces.solid == solid)
+    walls = [int(i) for i in members if faces.normal[i, 2] == 0.0]
+    roofs = {float(faces.offset_m[i]): int(i) for i in members if faces.normal[i, 2] == 1.0}
+    rows: list[tuple[FloatArray, FloatArray, tuple[int, int]]] = []
+    first = {_corner(faces, wall, 0): wall for wall in walls}
+    for wall in walls:
+        top = faces.upper[wall, 1]
+        near, far = (_point(faces, wall, end, top) for end in (0, 1))
+        if top in roofs and top > ground_m:
+            # t lies in the wall, pointing down: t x normal points along the wall
+            rows.append((far, near, (wall, roofs[top])))
+        following = first.get(_corner(faces, wall, 1))
+        low = max(float(faces.lower[wall, 1]), ground_m)
+        if following is None or top <= low:
+            continue
+        if np.cross(faces.along[wall], faces.along[following])[2] > np.sin(SHARPEST):
+            # t lies in the wall, away from the corner
+            rows.append((_point(faces, wall, 1, low), _point(faces, wall, 1, top), (wall, following)))
+    return rows
+
+
+def _point(faces: Faces, wall: int, end: int, height_m: float) -> FloatArray:
+    """Point of a wall's first or last upright at a height."""
+    at = (faces.lower, faces.upper)[end][wall, 0]
+    return np.asarray(faces.normal[wall] * faces.offset_m[wall] + at * faces.along[wall] + [0.0, 0.0, height_m])
+
+
+def _corner(faces: Faces, wall: int, end: int) -> tuple[float, float]:
+    """Corner of the footprint, to the tenth of a millimetre, as a key."""
+    point = _point(faces, wall, end, 0.0)
+    return round(float(point[0]), 4), round(float(point[1]), 4)
+
+
+@dataclass(frozen=True, slots=True)
+class EdgePaths:
+    """Paths over one edge, sorted by pose and tower.
+
+    Parameters
+    ----------
+    pose, tower, edge : (paths,) int
+    ground : (paths, 2) int
+        Ground faces that reflect before and after the edge, -1 where none does.
+    vertices_m : (paths, 3, 3)
+        Ground point, edge point, ground point for array centres; NaN where unused.
+    """
+
+    pose: IntArray
+    tower: IntArray
+    edge: IntArray
+    ground: IntArray
+    vertices_m: FloatArray
+
+    def __len__(self) -> int:
+        return len(self.pose)
+
+
+def find_edge_paths(
+    faces: Faces,
+    edges: Edges,
+    sources_m: FloatArray,
+    targets_m: FloatArray,
+    usable: BoolArray,
+    excluded: BoolArray,
+    hiding: Occlusion,
+) -> EdgePaths:
+    """All paths over one edge, with at most one ground reflection on either side of it.
+
+    Parameters
+    ----------
+    faces : Faces
+    edges : Edges
+    sources_m, targets_m : (towers, 3), (poses, 3)
+    usable : (towers, faces) bool
+        Faces that may reflect for each tower; its ground planes are meant.
+    excluded : (towers, poses) bool
+        Links without any path.
+    hiding : Occlusion
+        Of the faces.
+
+    Returns
+    -------
+    EdgePaths
+    """
+    exposed = _Exposed(faces, edges, hiding)
+    pieces = []
+    for tower, source in enumerate(sources_m):
+        grounds = [-1, *np.flatnonzero(usable[tower] & (faces.solid < 0)).tolist()]
+        for before, after in itertools.product(grounds, grounds):
+            pieces += _over_edges(
+                faces, edges, source, targets_m, ~excluded[tower], (before, after), hiding, exposed, tower
+            )
+    if not pieces:
+        none = np.zeros(0, dtype=np.int64)
+        return EdgePaths(none, none, none, np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))
+    columns = {f.name: np.concatenate([getattr(p, f.name) for p in pieces]) for f in fields(EdgePaths)}
+    before, after = columns["ground"].T
+    order = np.lexsort((after, before, columns["edge"], columns["tower"], columns["pose"]))
+    return EdgePaths(**{name: column[order] for name, column in columns.items()})
+
+
+class _Exposed:
+    """Whether both faces of an edge are in the air at a point: another building may touch one of them."""
+
+    def __init__(self, faces: Faces, edges: Edges, hiding: Occlusion) -> None:
+        own = np.unique(faces.solid[faces.solid >= 0])
+        solid = np.searchsorted(own, faces.solid[edges.face[:, 0]])
+        low = np.minimum(edges.start_m, edges.end_m) - 2.0 * PROBE_M
+        high = np.maximum(edges.start_m, edges.end_m) + 2.0 * PROBE_M
+        touch = (hiding.low[None] <= high[:, None]) & (hiding.high[None] >= low[:, None])
+        near = touch.all(axis=2)
+        near[np.arange(len(edges)), solid] = False
+        self.doubtful = near.any(axis=1)
+        axis_n = np.cross(edges.along, edges.normal_n)
+        self.beside = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
+        self.hiding = hiding
+
+    def at(self, edge: IntArray, points_m: FloatArray) -> BoolArray:
+        """Which points (paths, 3) of edges (paths,) have air beside both faces."""
+        good = np.ones(len(edge), dtype=np.bool_)
+        rows = np.flatnonzero(self.doubtful[edge])
+        for side in (0, 1):
+            step = PROBE_M * self.beside[edge[rows], side]
+            good[rows] &= ~self.hiding.segments(points_m[rows] + 0.5 * step, points_m[rows] + step)
+        return good
+
+
+def _over_edges(
+    faces: Faces,
+    edges: Edges,
+    source_m: FloatArray,
+    targets_m: FloatArray,
+    alive: BoolArray,
+    ground: tuple[int, int],
+    hiding: Occlusion,
+    exposed: _Exposed,
+    tower: int,
+) -> list[EdgePaths]:
+    """Paths of one tower with the given ground reflections before and after the edge."""
+    poses = np.flatnonzero(alive & np.isfinite(targets_m).all(axis=1))
+    source = _mirrored(faces, ground[0], source_m)
+    ends = _mirrored(faces, ground[1], targets_m[poses])
+    here = edges.coordinates(np.broadcast_to(source, (len(edges), 3)))
+    radius = np.hypot(here[:, 1], here[:, 2])
+    lit = np.flatnonzero((radius >= NEAREST_M) & _in_air(edges, source[None], here[:, 2]))
+    pieces = []
+    step = max(1, LINKS_AT_ONCE // max(1, len(lit)))
+    for first in range(0, len(poses), step):
+        some = ends[first : first + step]
+        there = edges.coordinates(some[:, None], lit)  # (poses, edges, 3)
+        reach = np.hypot(there[..., 1], there[..., 2])
+        at = here[lit, 0] + (there[..., 0] - here[lit, 0]) * (radius[lit] / (radius[lit] + reach))
+        good = (at >= 0.0) & (at <= edges.length_m[lit]) & (reach >= NEAREST_M)
+        good &= _in_air(edges, some[:, None], there[..., 2], lit)
+        row, column = np.nonzero(good)
+        edge, pose = lit[column], poses[first + row]
+        point = edges.start_m[edge] + at[row, column][:, None] * edges.along[edge]
+        bounce = [_on_ground(faces, index, end, point) for index, end in zip(ground, (source, some[row]), strict=True)]
+        vertices = np.stack([bounce[0], point, bounce[1]], axis=1)
+        good = np.ones(len(pose), np.bool_)
+        for index in ground:
+            good &= (index < 0) | (point @ faces.normal[index] - faces.offset_m[index] > NEAREST_M)
+        good[good] &= exposed.at(edge[good], point[good])
+        for leg in _legs(source_m, vertices, targets_m[pose]):
+            good[good] &= ~hiding.segments(leg[0][good], leg[1][good])
+        count = int(good.sum())
+        pieces.append(
+            EdgePaths(
+                pose[good], np.full(count, tower), edge[good], np.tile(np.array(ground), (count, 1)), vertices[good]
+            )
+        )
+    return pieces
+
+
+def _legs(source_m: FloatArray, vertices_m: FloatArray, targets_m: FloatArray) -> list[tuple[FloatArray, FloatArray]]:
+    """Straight pieces of the paths; where no ground point is, its leg is from the edge point to itself."""
+    before, point, after = (vertices_m[:, i] for i in range(3))
+    has_before, has_after = np.isfinite(before[:, :1]), np.isfinite(after[:, :1])
+    start = np.broadcast_to(source_m, point.shape)
+    return [
+        (np.where(has_before, before, start), point),
+        (np.where(has_before, start, point), np.where(has_before, before, point)),
+        (point, np.where(has_after, after, targets_m)),
+        (np.where(has_after, after, point), np.where(has_after, targets_m, point)),
+    ]
+
+
+def _in_air(
+    edges: Edges, points_m: FloatArray, height_m: FloatArray, some: IntArray | slice = slice(None)
+) -> BoolArray:
+    """Points outside the wedge: before face 0 (``height_m``) or before face n."""
+    over_n = ((points_m - edges.start_m[some]) * edges.normal_n[some]).sum(axis=-1)
+    return np.asarray((height_m >= 0.0) | (over_n >= 0.0))
+
+
+def _mirrored(faces: Faces, ground: int, points_m: FloatArray) -> FloatArray:
+    """Points (..., 3) mirrored in a ground plane; as they are for -1."""
+    if ground < 0:
+        return points_m
+    normal = faces.normal[ground]
+    return np.asarray(points_m - 2.0 * (points_m @ normal - faces.offset_m[ground])[..., None] * normal)
+
+
+def _on_ground(faces: Faces, ground: int, image_m: FloatArray, points_m: FloatArray) -> FloatArray:
+    """Where the lines from images to points (paths, 3) pass a ground plane; NaN for -1."""
+    if ground < 0:
+        return np.full_like(points_m, np.nan)
+    normal, offset = faces.normal[ground], faces.offset_m[ground]
+    below, above = image_m @ normal - offset, points_m @ normal - offset
+    with np.errstate(divide="ignore", invalid="ignore"):
+        share = below / (below - above)
+    return np.asarray(image_m + np.asarray(share)[..., None] * (points_m - image_m))

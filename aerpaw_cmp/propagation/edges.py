@@ -13,7 +13,7 @@ from dataclasses import dataclass, fields
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray, IntArray
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
 from .paths import Faces
 from .solids import Occlusion
 
@@ -92,10 +92,10 @@ class Edges:
         turn = np.arctan2(np.linalg.norm(np.cross(normal_n, normal), axis=1), (normal * normal_n).sum(axis=1))
         return cls(starts, ends, along, np.cross(normal, along), normal, normal_n, 1.0 + turn / np.pi, pairs)
 
-    def coordinates(self, points_m: FloatArray, edge: IntArray | slice = slice(None)) -> FloatArray:
-        """Points (..., 3) in the frames of edges: along, in face 0 away from the edge, out of face 0."""
+    def coordinates(self, points_m: FloatArray, edge: IntArray) -> FloatArray:
+        """Points (n, points, 3) in the frames of edges (n,): along, in face 0 away from the edge, out of face 0."""
         frame = np.stack([self.along[edge], self.face_axis[edge], self.normal[edge]], axis=1)
-        return np.asarray(np.einsum("eij,...ej->...ei", frame, points_m - self.start_m[edge]))
+        return np.asarray(np.einsum("nij,npj->npi", frame, points_m - self.start_m[edge][:, None]))
 
 
 def _of_solid(faces: Faces, solid: int, ground_m: float) -> list[tuple[FloatArray, FloatArray, tuple[int, int]]]:
@@ -154,6 +154,10 @@ class EdgePaths:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def select(self, rows: AnyArray) -> EdgePaths:
+        """The paths of a mask or of indices."""
+        return EdgePaths(**{f.name: getattr(self, f.name)[rows] for f in fields(self)})
 
 
 def find_edge_paths(
@@ -241,14 +245,14 @@ def _over_edges(
     poses = np.flatnonzero(alive & np.isfinite(targets_m).all(axis=1))
     source = _mirrored(faces, ground[0], source_m)
     ends = _mirrored(faces, ground[1], targets_m[poses])
-    here = edges.coordinates(np.broadcast_to(source, (len(edges), 3)))
+    here = edges.coordinates(np.broadcast_to(source, (len(edges), 1, 3)), np.arange(len(edges)))[:, 0]
     radius = np.hypot(here[:, 1], here[:, 2])
     lit = np.flatnonzero((radius >= NEAREST_M) & _in_air(edges, source[None], here[:, 2]))
     pieces = []
     step = max(1, LINKS_AT_ONCE // max(1, len(lit)))
     for first in range(0, len(poses), step):
         some = ends[first : first + step]
-        there = edges.coordinates(some[:, None], lit)  # (poses, edges, 3)
+        there = edges.coordinates(np.broadcast_to(some, (len(lit), *some.shape)), lit).swapaxes(0, 1)
         reach = np.hypot(there[..., 1], there[..., 2])
         at = here[lit, 0] + (there[..., 0] - here[lit, 0]) * (radius[lit] / (radius[lit] + reach))
         good = (at >= 0.0) & (at <= edges.length_m[lit]) & (reach >= NEAREST_M)

@@ -10,8 +10,8 @@ import pytest
 from scipy.special import jv
 
 from aerpaw_cmp.common.units import ComplexArray, FloatArray
-from aerpaw_cmp.propagation.channel import reflection_coefficients
-from aerpaw_cmp.propagation.wedge import wedge_matrix
+from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
+from aerpaw_cmp.propagation.field.wedge import wedge_matrix
 
 WAVELENGTH = 299792458.0 / 3.4e9
 K = 2.0 * np.pi / WAVELENGTH

@@ -1,141 +1,181 @@
 """Complex amplitudes of paths over an edge, for every pair of elements.
 
-The length is that of each pair of elements; the diffraction matrix is that of the array centres, as the paths are
-those of the centres: the field stays continuous where a direct or reflected path of the centres ends.
+As with reflections a bent leg is straight in the space of the mirrored end. The length is that of each pair of
+elements. Directions, patterns and the diffraction matrix are those of the array centres, as the paths are: the field
+stays continuous where a direct or reflected path of the centres ends.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
-from ..common.units import ComplexArray, FloatArray, IntArray, wavelength_m
-from .arrays import Array, Link, Poses
-from .channel import FaceMaterials, radiate, reflect, reflection_coefficients
-from .edges import EdgePaths, Edges
-from .paths import Faces
+from ...common.units import ComplexArray, FloatArray, IntArray, wavelength_m
+from ..arrays import Array, Link, Poses
+from ..edges import EdgePaths, Edges
+from ..paths import Faces
+from . import dyads
+from .fresnel import FaceMaterials, reflection_coefficients
+from .sum import radiated
 from .wedge import Fresnel, wedge_matrix
 
+PATHS_PER_CHUNK = 4096
 
-def edge_field(
+
+def edge_channels(
     paths: EdgePaths,
-    rows: IntArray,
-    geometry: tuple[Faces, Edges, FaceMaterials],
-    source_m: FloatArray,
-    array: Array,
+    edges: Edges,
+    faces: Faces,
+    sources_m: FloatArray,
     poses: Poses,
     link: Link,
-) -> ComplexArray:
-    """Complex amplitudes of some paths of one tower over an edge.
+    loss_db: FloatArray | None = None,
+) -> tuple[ComplexArray, FloatArray]:
+    """What paths over edges add to the channel matrices.
 
     Parameters
     ----------
     paths : EdgePaths
-    rows : (rows,) int
-        Which of them.
-    geometry : Faces, Edges, FaceMaterials
-        Of the scene, at the carrier of the link.
-    source_m : (3,)
-        Centre of the tower's array [m].
-    array : Array
-        Of the tower.
+    edges : Edges
+    faces : Faces
+        Of the scene.
+    sources_m : (towers, 3)
+        Centres of the tower arrays, in the order of ``link.tower_arrays`` [m].
+    poses : Poses
+    link : Link
+    loss_db : (paths,), optional
+        Further loss of each path, such as foliage.
+
+    Returns
+    -------
+    h : (poses, towers, n_rx, n_tx) complex
+    power : (poses, towers)
+        Sum over paths of the mean of ``|h|^2`` over element pairs.
+    """
+    arrays = list(link.tower_arrays.values())
+    ports, uavs = len(arrays[0]), len(link.uav_array)
+    h = np.zeros((len(poses) * len(arrays), uavs, ports), dtype=np.complex128)
+    power = np.zeros(len(poses) * len(arrays))
+    for tower in range(len(arrays)):
+        mine = np.flatnonzero(paths.tower == tower)
+        for start in range(0, len(mine), PATHS_PER_CHUNK):
+            rows = mine[start : start + PATHS_PER_CHUNK]
+            some = amplitudes(paths.select(rows), edges, faces, sources_m, poses, link)
+            if loss_db is not None:
+                some *= 10.0 ** (-loss_db[rows] / 20.0)[:, None, None]
+            key = paths.pose[rows] * len(arrays) + tower
+            np.add.at(h, key, some)
+            np.add.at(power, key, (np.abs(some) ** 2).mean(axis=(1, 2)))
+    matrices = h.swapaxes(1, 2) if link.uav_transmits else h
+    shape = (len(poses), len(arrays))
+    return np.ascontiguousarray(matrices).reshape(*shape, *matrices.shape[1:]), power.reshape(shape)
+
+
+def amplitudes(
+    paths: EdgePaths, edges: Edges, faces: Faces, sources_m: FloatArray, poses: Poses, link: Link
+) -> ComplexArray:
+    """Complex amplitudes (paths, uav elements, tower elements) of paths of one tower.
+
+    Parameters
+    ----------
+    paths : EdgePaths
+    edges : Edges
+    faces : Faces
+    sources_m : (towers, 3)
     poses : Poses
     link : Link
 
     Returns
     -------
-    (rows, uav elements, tower elements) complex
+    (paths, uav elements, tower elements) complex
 
     Notes
     -----
-    ``g_u . M_2 D M_1 . g_t  lambda / (4 pi) / sqrt(k s s' (s + s')) e^{-j k (s + s')}`` with s' and s the lengths before
-    and after the edge, D the diffraction matrix times the square root of k, and M the reflections off the ground.
+    ``g_u . M_2 D M_1 . g_t  lambda / (4 pi) / sqrt(k s s' (s + s')) e^{-j k (s + s')}`` with s' and s the lengths
+    before and after the edge, D the diffraction matrix times the square root of k, and M the dyads of the ground.
     """
-    faces, edges, tables = geometry
-    edge, k = paths.edge[rows], 2.0 * np.pi / wavelength_m(link.carrier_hz)
-    turn = poses.rotation[paths.pose[rows]] @ link.uav_array.mount
-    centre = poses.position_m[paths.pose[rows]]
-    normals = [np.where((index >= 0)[:, None], faces.normal[index], 0.0) for index in paths.ground[rows].T]
-    offsets = [np.where(index >= 0, faces.offset_m[index], 0.0) for index in paths.ground[rows].T]
-    start = source_m + array.positions_m @ array.mount.T
-    ends = centre[:, None] + link.uav_array.positions_m @ turn.transpose(0, 2, 1)
-    # in the space where the ground's mirror images stand in for bent legs the path is source - edge - target
-    images = [
-        _image(np.broadcast_to(start, (len(rows), *start.shape)), normals[0], offsets[0]),
-        _image(ends, normals[1], offsets[1]),
-        _image(np.broadcast_to(source_m, (len(rows), 1, 3)), normals[0], offsets[0]),
-        _image(centre[:, None], normals[1], offsets[1]),
-    ]
-    tower, uav, here, there = (_cylinder(edges, edge, points) for points in images)
-    length = np.hypot(uav[0][:, :, None] + tower[0][:, None], uav[2][:, :, None] - tower[2][:, None])
-    reach = here[0] + there[0]
-    whole = np.hypot(reach, there[2] - here[2])[:, 0]
-    sine, cosine = reach[:, 0] / whole, (there[2] - here[2])[:, 0] / whole
-    matrix = _matrices(edges, edge, tables, (here, there), cosine, k * (here[0] * there[0])[:, 0] / whole, link)
-    point = paths.vertices_m[rows, 1]
-    before, after = (_unit(v) for v in (point - images[2][:, 0], images[3][:, 0] - point))
-    leaving = _flip(before, normals[0])
-    wave = radiate(array, np.broadcast_to(array.mount, (len(rows), 3, 3)), leaving.T[:, :, None, None], 3)
-    wave = _off_ground(wave, leaving, normals[0], paths.ground[rows, 0], tables, link)
-    along = edges.along[edge]
-    into = np.stack([along - cosine[:, None] * before, np.cross(along, before)]) / sine[:, None]
-    out = np.stack([along - cosine[:, None] * after, np.cross(along, after)]) / sine[:, None]
-    wave = np.einsum("arv,rab,brw,wrij->vrij", out, matrix, into, wave, optimize=True)
-    wave = _off_ground(wave, after, normals[1], paths.ground[rows, 1], tables, link)
-    arriving = _flip(after, normals[1])
-    heard = radiate(link.uav_array, turn, -arriving.T[:, :, None, None], 2)
-    near, far = here[0][:, 0] / sine, there[0][:, 0] / sine
-    spread = 1.0 / (2.0 * np.sqrt(k * near * far)) / k  # lambda / 4 pi = 1 / 2k
-    amplitude = spread[:, None, None] / np.sqrt(length)
-    cycles = length * (k / (2.0 * np.pi))
-    return np.asarray((heard * wave).sum(axis=0) * amplitude * np.exp(-2j * np.pi * (cycles - np.round(cycles))))
-
-
-def _matrices(
-    edges: Edges,
-    edge: IntArray,
-    tables: FaceMaterials,
-    ends: tuple[tuple[FloatArray, ...], tuple[FloatArray, ...]],
-    cosine: FloatArray,
-    distance: FloatArray,
-    link: Link,
-) -> ComplexArray:
-    """Diffraction matrices (rows, 2, 2) at the array centres."""
+    array = list(link.tower_arrays.values())[paths.tower[0]]
     wavelength = wavelength_m(link.carrier_hz)
-
-    def fresnel(face: IntArray) -> Fresnel:
-        return lambda c: reflection_coefficients(c, tables.permittivity[face], tables.thickness_m[face], wavelength)
-
-    face = edges.face[edge]
-    angles = [np.mod(end[1][:, 0], 2.0 * np.pi) for end in ends]
-    return wedge_matrix(
-        angles[0], angles[1], cosine, edges.exterior[edge], distance, fresnel(face[:, 0]), fresnel(face[:, 1])
+    k, tables = 2.0 * np.pi / wavelength, FaceMaterials.of(faces, link.carrier_hz)
+    mount = np.broadcast_to(array.mount, (len(paths), 3, 3))
+    here = _end(paths, 0, edges, faces, sources_m[paths.tower], mount, array)
+    turn = poses.rotation[paths.pose] @ link.uav_array.mount
+    there = _end(paths, 1, edges, faces, poses.position_m[paths.pose], turn, link.uav_array)
+    point, edge = paths.vertices_m[:, 1], edges.along[paths.edge]
+    before, after = _unit(point - here.centre_m), _unit(there.centre_m - point)
+    sent = _off_ground(radiated(array, here.turn, before.T), before, here, tables, wavelength)
+    caught = _off_ground(radiated(link.uav_array, there.turn, -after.T), after, there, tables, wavelength)
+    near, far, rise = here.radius[:, 0], there.radius[:, 0], there.along[:, 0] - here.along[:, 0]
+    total = np.hypot(near + far, rise)
+    sine, cosine = (near + far) / total, rise / total
+    matrix = wedge_matrix(
+        here.angle, there.angle, cosine, edges.exterior[paths.edge], k * near * far / total,
+        *(_fresnel(tables, face, wavelength) for face in edges.face[paths.edge].T),
+    )  # fmt: skip
+    into, out = (np.stack([edge - cosine[:, None] * way, np.cross(edge, way)], axis=1) for way in (before, after))
+    joined = np.einsum("iru,rai,rab,rbj,jrt->rut", caught, out, matrix, into, sent, optimize=True)
+    # into and out lack a factor 1 / sine each; the legs are near / sine and far / sine long
+    spread = 1.0 / (2.0 * k * sine * np.sqrt(k * near * far))
+    length = np.hypot(
+        there.radius[:, 1:, None] + here.radius[:, None, 1:], there.along[:, 1:, None] - here.along[:, None, 1:]
     )
+    cycles = length / wavelength
+    carrier = np.exp(-2j * np.pi * (cycles - np.round(cycles)))
+    return np.asarray(joined * spread[:, None, None] / np.sqrt(length) * carrier)
 
 
-def _cylinder(edges: Edges, edge: IntArray, points_m: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
-    """Radius, angle and place along the edge (rows, points) of points (rows, points, 3)."""
-    local = edges.coordinates(points_m.transpose(1, 0, 2), edge).transpose(1, 0, 2)
-    return np.hypot(local[..., 1], local[..., 2]), np.arctan2(local[..., 2], local[..., 1]), local[..., 0]
+@dataclass(frozen=True, slots=True)
+class _End:
+    """One end of paths in the space where its leg is straight, and its place round the edge.
+
+    ``radius, along`` (paths, 1 + elements) are of the centre, then of each element [m], ``angle`` (paths,) of the
+    centre; ``normal`` (paths, 3) of the ground is zero where none reflects.
+    """
+
+    centre_m: FloatArray
+    turn: FloatArray
+    normal: FloatArray
+    ground: IntArray
+    radius: FloatArray
+    along: FloatArray
+    angle: FloatArray
 
 
-def _unit(vector: FloatArray) -> FloatArray:
-    return np.asarray(vector / np.linalg.norm(vector, axis=-1, keepdims=True))
-
-
-def _flip(vector: FloatArray, normal: FloatArray) -> FloatArray:
-    """Directions (rows, 3) mirrored at planes; as they are where the normal is zero."""
-    return np.asarray(vector - 2.0 * (vector * normal).sum(axis=1)[:, None] * normal)
-
-
-def _image(points_m: FloatArray, normal: FloatArray, offset: FloatArray) -> FloatArray:
-    """Points (rows, points, 3) mirrored in planes (rows,); as they are where the normal is zero."""
-    height = np.einsum("rpi,ri->rp", points_m, normal) - offset[:, None]
-    return np.asarray(points_m - 2.0 * height[..., None] * normal[:, None])
+def _end(
+    paths: EdgePaths, side: int, edges: Edges, faces: Faces, centre_m: FloatArray, turn: FloatArray, array: Array
+) -> _End:
+    """Source (side 0) or target (1) of paths, mirrored in the ground where that reflects its leg."""
+    ground = paths.ground[:, side]
+    normal = np.where((ground >= 0)[:, None], faces.normal[ground], 0.0)
+    height = (centre_m * normal).sum(axis=1) - np.where(ground >= 0, faces.offset_m[ground], 0.0)
+    centre_m = centre_m - 2.0 * height[:, None] * normal
+    turn = turn - 2.0 * np.einsum("ni,nj,njk->nik", normal, normal, turn)
+    places = np.concatenate(
+        [centre_m[:, None], centre_m[:, None] + array.positions_m @ turn.transpose(0, 2, 1)], axis=1
+    )
+    along, down, out = np.moveaxis(edges.coordinates(places, paths.edge), -1, 0)
+    angle = np.mod(np.arctan2(out[:, 0], down[:, 0]), 2.0 * np.pi)
+    return _End(centre_m, turn, normal, ground, np.hypot(down, out), along, angle)
 
 
 def _off_ground(
-    wave: ComplexArray, direction: FloatArray, normal: FloatArray, ground: IntArray, tables: FaceMaterials, link: Link
+    wave: ComplexArray, toward: FloatArray, end: _End, tables: FaceMaterials, wavelength: float
 ) -> ComplexArray:
-    """The wave (3, rows, uav, tower) after a reflection that arrives along ``direction``."""
-    arriving, upright = direction.T[:, :, None, None], normal.T[:, :, None, None]
-    return reflect(wave, arriving, upright, ground, tables, wavelength_m(link.carrier_hz))
+    """Field vectors (3, paths, elements) after the ground's dyad; as they are where no ground reflects."""
+    ray, normal = (v.T[:, :, None] for v in (toward, end.normal))
+    te, tm = _fresnel(tables, end.ground[:, None], wavelength)(dyads.incidence(tuple(ray), tuple(normal)))  # type: ignore[arg-type]
+    re, im = dyads.reflected(
+        tuple(wave.real), tuple(wave.imag), tuple(ray), tuple(normal), te.real, te.imag, tm.real, tm.imag  # type: ignore[arg-type]
+    )  # fmt: skip
+    after = np.stack([a + 1j * b for a, b in zip(re, im, strict=True)])
+    return np.asarray(np.where((end.ground >= 0)[:, None], after, wave))
+
+
+def _fresnel(tables: FaceMaterials, face: IntArray, wavelength: float) -> Fresnel:
+    eta, thickness = tables.permittivity[face], tables.thickness_m[face]
+    return lambda cosine: reflection_coefficients(cosine, eta, thickness, wavelength)
+
+
+def _unit(vector: FloatArray) -> FloatArray:
+    return np.asarray(vector / np.linalg.norm(vector, axis=1, keepdims=True))

@@ -17,7 +17,7 @@ from collections.abc import Callable
 import numpy as np
 from scipy.special import wofz
 
-from ..common.units import ComplexArray, FloatArray
+from ...common.units import ComplexArray, FloatArray
 
 Fresnel = Callable[[FloatArray], tuple[ComplexArray, ComplexArray]]
 """Reflection coefficients (TE, TM) of a face at a cosine of the angle of incidence."""

@@ -467,7 +467,7 @@ def replay_poses(
         _check_moving(rt, engine, name)
         run = Run(threads=rt.threads, progress=share_of(progress, f"replay {name}, which moves"))
         each = replay_pairs if rt.visibility == "pairs" else replay
-        search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt))
+        search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt), diffraction=rt.diffraction)
         field = Field(path_loss(site, rt, link.carrier_hz))
         return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
     # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
@@ -490,6 +490,7 @@ def replay_poses(
         crowns=reflecting_crowns(site.trees, rt),
         power_cut_db=rt.power_cut_db,
         check_power_cut=check_power_cut,
+        diffraction=rt.diffraction,
         interactions=rt.interactions if others else ("reflection",),
         scattering_coefficient=rt.scattering_coefficient if others else None,
         device=rt.device,

@@ -358,6 +358,8 @@ class RtSettings(Settings):
     batch: Annotated[int, Field(ge=1, le=100)] = 50
     interactions: Annotated[list[Interaction], Field(min_length=1)] = ["reflection"]
     """Besides reflections, engine sionna: their power is added to RSS; H and ranks leave them out."""
+    diffraction: Literal["none", "edges", "all"] = "none"
+    """Paths over one edge of a building, in H, levels and ranks; ``all``: also with a wall or roof on one side."""
     scattering_coefficient: Annotated[float, Field(gt=0, le=1)] | None = None
     """Share of the reflected amplitude that every material scatters; needed with ``scattering``."""
     attitude: Literal["logged", "level", "ignored"] = "ignored"
@@ -397,6 +399,8 @@ class RtSettings(Settings):
             raise ValueError("interactions must name reflection, and each interaction once")
         if self.other_interactions and self.max_depth == 0:
             raise ValueError("interactions besides reflection need max_depth of 1 or more: each counts in it")
+        if self.diffraction != "none" and (self.visibility == "pairs" or "diffraction" in asked):
+            raise ValueError("diffraction goes with visibility: centre, and without interactions: diffraction")
         if "scattering" in asked and self.scattering_coefficient is None:
             raise ValueError("interactions: scattering needs scattering_coefficient (materials of P.2040 state none)")
         if "scattering" not in asked and self.scattering_coefficient is not None:

@@ -14,7 +14,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .paths import Faces
+from .faces import inside
+from .image import scene_tolerance_m
+from .paths import Faces, PathSet
 from .solids import Occlusion
 
 SHARPEST = 1e-6
@@ -141,9 +143,9 @@ class EdgePaths:
     ----------
     pose, tower, edge : (paths,) int
     ground : (paths, 2) int
-        Ground faces that reflect before and after the edge, -1 where none does.
+        Faces that reflect before and after the edge, the ground as a rule; -1 where none does.
     vertices_m : (paths, 3, 3)
-        Ground point, edge point, ground point for array centres; NaN where unused.
+        Reflection, edge, reflection point for array centres; NaN where unused.
     """
 
     pose: IntArray
@@ -154,6 +156,14 @@ class EdgePaths:
 
     def __len__(self) -> int:
         return len(self.pose)
+
+    def as_path_set(self) -> PathSet:
+        """The same polylines without faces: what terrain and foliage ask for."""
+        used = np.isfinite(self.vertices_m).all(axis=2)
+        first = np.argsort(~used, axis=1, kind="stable")
+        vertices = np.take_along_axis(self.vertices_m, first[..., None], axis=1)
+        nothing = np.full(self.vertices_m.shape[:2], -1, dtype=np.int64)
+        return PathSet(self.pose, self.tower, used.sum(axis=1), nothing, vertices)
 
     def select(self, rows: AnyArray) -> EdgePaths:
         """The paths of a mask or of indices."""
@@ -167,7 +177,7 @@ def find_edge_paths(
     targets_m: FloatArray,
     usable: BoolArray,
     excluded: BoolArray,
-    hiding: Occlusion,
+    walls: bool = False,
 ) -> EdgePaths:
     """All paths over one edge, with at most one ground reflection on either side of it.
 
@@ -180,21 +190,23 @@ def find_edge_paths(
         Faces that may reflect for each tower; its ground planes are meant.
     excluded : (towers, poses) bool
         Links without any path.
-    hiding : Occlusion
-        Of the faces.
+    walls : bool
+        Also with one wall or roof, before or after the edge.
 
     Returns
     -------
     EdgePaths
     """
+    known = targets_m[np.isfinite(targets_m).all(axis=1)]
+    hiding = Occlusion(faces, scene_tolerance_m(faces, sources_m, known))
     exposed = _Exposed(faces, edges, hiding)
+    solid = np.flatnonzero(faces.solid >= 0).tolist() if walls else []
     pieces = []
     for tower, source in enumerate(sources_m):
         grounds = [-1, *np.flatnonzero(usable[tower] & (faces.solid < 0)).tolist()]
-        for before, after in itertools.product(grounds, grounds):
-            pieces += _over_edges(
-                faces, edges, source, targets_m, ~excluded[tower], (before, after), hiding, exposed, tower
-            )
+        sides = [*itertools.product(grounds, grounds), *((w, -1) for w in solid), *((-1, w) for w in solid)]
+        for mirrors in sides if len(edges) else ():
+            pieces += _over_edges(faces, edges, source, targets_m, ~excluded[tower], mirrors, hiding, exposed, tower)
     if not pieces:
         none = np.zeros(0, dtype=np.int64)
         return EdgePaths(none, none, none, np.zeros((0, 2), np.int64), np.zeros((0, 3, 3)))
@@ -213,9 +225,9 @@ class _Exposed:
         low = np.minimum(edges.start_m, edges.end_m) - 2.0 * PROBE_M
         high = np.maximum(edges.start_m, edges.end_m) + 2.0 * PROBE_M
         touch = (hiding.low[None] <= high[:, None]) & (hiding.high[None] >= low[:, None])
-        near = touch.all(axis=2)
+        near = np.asarray(touch.all(axis=2))
         near[np.arange(len(edges)), solid] = False
-        self.doubtful = near.any(axis=1)
+        self.doubtful = np.asarray(near.any(axis=1))
         axis_n = np.cross(edges.along, edges.normal_n)
         self.beside = np.stack([edges.face_axis + 0.1 * edges.normal, axis_n + 0.1 * edges.normal_n], axis=1)
         self.hiding = hiding
@@ -263,8 +275,12 @@ def _over_edges(
         bounce = [_on_ground(faces, index, end, point) for index, end in zip(ground, (source, some[row]), strict=True)]
         vertices = np.stack([bounce[0], point, bounce[1]], axis=1)
         good = np.ones(len(pose), np.bool_)
-        for index in ground:
-            good &= (index < 0) | (point @ faces.normal[index] - faces.offset_m[index] > NEAREST_M)
+        for index, spot, end in zip(ground, bounce, (source_m, targets_m[pose]), strict=True):
+            if index >= 0:
+                normal, offset = faces.normal[index], faces.offset_m[index]
+                good &= (point @ normal - offset > NEAREST_M) & (end @ normal - offset > 0.0)
+                rows = np.flatnonzero(good)
+                good[rows] = inside(faces, np.full(len(rows), index), spot[rows], 0.0)
         good[good] &= exposed.at(edge[good], point[good])
         for leg in _legs(source_m, vertices, targets_m[pose]):
             good[good] &= ~hiding.segments(leg[0][good], leg[1][good])

@@ -17,6 +17,7 @@ from .samples import Samples
 
 Engine = Literal["image", "sionna"]
 Device = Literal["auto", "cpu", "cuda"]
+Diffraction = Literal["none", "edges", "all"]
 Loss = Callable[[PathSet, FloatArray, FloatArray], FloatArray]
 """``loss(paths, sources_m, targets_m) -> (paths,)`` dB; segments run source, ``paths.vertices_m``, target."""
 
@@ -44,6 +45,9 @@ class Search:
         (:mod:`aerpaw_cmp.propagation.power_cut`).
     check_power_cut : bool
         Search a few poses without the cut and say in ``left_out`` what it costs.
+    diffraction : {"none", "edges", "all"}
+        Paths over one edge of a building: with the ground on either side ("edges"), and also with one wall or roof on
+        one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
     interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
         ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
         (:mod:`aerpaw_cmp.propagation.interactions`).
@@ -62,6 +66,7 @@ class Search:
     crowns: Crowns | None = None
     power_cut_db: float | None = None
     check_power_cut: bool = True
+    diffraction: Diffraction = "none"
     interactions: Sequence[str] = ("reflection",)
     scattering_coefficient: float | None = None
     device: Device = "auto"
@@ -89,6 +94,12 @@ class Search:
         """
         if self.engine not in ("image", "sionna"):
             raise UsageError(f"unknown engine {self.engine!r}", expected="'image' or 'sionna'")
+        if self.diffraction not in ("none", "edges", "all"):
+            raise UsageError(f"unknown diffraction {self.diffraction!r}", expected="'none', 'edges' or 'all'")
+        if self.diffraction != "none" and "diffraction" in self.interactions:
+            raise UsageError(
+                "diffraction by edges and by Sionna", expected="one of them: its power would be added twice"
+            )
         _check_positive("power_cut_db", self.power_cut_db)
         searches = other_searches(self.interactions, self.scattering_coefficient)
         if searches and (self.engine != "sionna" or self.max_depth == 0):

@@ -15,7 +15,9 @@ from ..site.site import Site
 from . import image
 from .arrays import Link, Poses
 from .cache import PathCache
+from .edges import EdgePaths, Edges, find_edge_paths
 from .engines import chosen_samples, other_paths, path_cache, search_or_read
+from .field.edges import edge_channels
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .interactions import OtherInteractions, OtherSearch, path_powers
 from .options import Field, Run, Search
@@ -66,6 +68,8 @@ class Replay:
         Links whose element pairs do not all have the paths of the array centres; only with ``visibility="pairs"``.
     surfaces : Surfaces, optional
         What the faces are made of, where the site is a scene of triangles.
+    edge_paths : EdgePaths, optional
+        Paths over edges, where diffraction was asked for; they are in H and both levels.
     other : OtherInteractions, optional
         What diffraction, scattering and refraction add to both levels and to ``has_path``, where they were asked for;
         ``h`` and ``paths`` are of reflections alone.
@@ -87,6 +91,7 @@ class Replay:
     samples_reason: str = ""
     pairs_differ: BoolArray | None = None
     surfaces: Surfaces | None = None
+    edge_paths: EdgePaths | None = None
     other: OtherInteractions | None = None
 
     def of_reflections(self) -> Replay:
@@ -185,8 +190,9 @@ def replay(
     notes += cache.warnings if cache else []
     notes += _checked_cut(site, scene, link, poses, search, field, cache)
     scene, paths, stopped = passed(site, scene, poses, paths, search)
-    result, idle = _evaluated(scene, link, poses, paths, search, field, run)
-    notes += stopped
+    bent, unmodelled = _bent(site, scene, link, poses, search, field)
+    result, idle = _evaluated(scene, link, poses, paths, search, field, run, bent)
+    notes += [*stopped, *unmodelled]
     if searches:
         power = _other_powers(site, scene, link, poses, search, searches, field, cache)
         result = _with_others(result, link, tuple(search.interactions), *power)
@@ -284,8 +290,45 @@ def _checked_cut(
     return [loss_in_words(cut_db, len(full), len(full) - len(left), len(some), level[1][both] - level[0][both], lost)]
 
 
+@dataclass(frozen=True, slots=True)
+class _Bent:
+    """Paths over edges, and what they add: ``h`` (poses, towers, n_rx, n_tx), ``power`` (poses, towers)."""
+
+    paths: EdgePaths
+    h: ComplexArray
+    power: FloatArray
+
+
+def _bent(
+    site: Site, scene: Scene, link: Link, poses: Poses, search: Search, field: Field
+) -> tuple[_Bent | None, list[str]]:
+    """What diffraction adds, and what of it is not modelled."""
+    if search.diffraction == "none":
+        return None, []
+    if scene.surfaces is not None:
+        return None, ["diffraction: edges of a scene of triangles are not searched"]
+    edges = Edges.of(scene.faces, float(scene.faces.offset_m[scene.faces.solid < 0].max(initial=0.0)))
+    paths = find_edge_paths(
+        scene.faces, edges, scene.sources_m, poses.position_m, scene.usable, scene.excluded, search.diffraction == "all"
+    )
+    bends = paths.as_path_set()
+    clear = _clear_of_terrain(site, scene, poses, bends)
+    loss_db = field.loss_db(bends, scene.sources_m, poses.position_m)
+    clear &= True if loss_db is None else np.isfinite(loss_db)
+    paths, loss_db = paths.select(clear), None if loss_db is None else loss_db[clear]
+    h, power = edge_channels(paths, edges, scene.faces, scene.sources_m, poses, link, loss_db)
+    return _Bent(paths, h, power), ["diffraction over two edges, and with more than one reflection on a side"]
+
+
 def _evaluated(
-    scene: Scene, link: Link, poses: Poses, paths: PathSet, search: Search, field: Field, run: Run
+    scene: Scene,
+    link: Link,
+    poses: Poses,
+    paths: PathSet,
+    search: Search,
+    field: Field,
+    run: Run,
+    bent: _Bent | None = None,
 ) -> tuple[Replay, list[str]]:
     """Fields of the paths, and which buildings hardly matter to them; times are the caller's."""
     loss_db = field.loss_db(paths, scene.sources_m, poses.position_m)
@@ -294,6 +337,9 @@ def _evaluated(
     has_path = np.zeros((len(poses), len(scene.sources_m)), dtype=np.bool_)
     open_ = slice(None) if loss_db is None else np.isfinite(loss_db)  # an infinite loss is an obstacle
     has_path[paths.pose[open_], paths.tower[open_]] = True
+    if bent is not None:
+        fields = Fields(fields.h + bent.h, fields.path_power, fields.power + bent.power)
+        has_path |= bent.power > 0.0
     idle: list[str] = []
     if field.relevance_db is not None:
         power = mean_pair_power(fields.h)
@@ -312,6 +358,7 @@ def _evaluated(
         engine=search.engine,
         towers=tuple(link.tower_arrays),
         surfaces=scene.surfaces,
+        edge_paths=None if bent is None else bent.paths,
     ), idle
 
 

@@ -12,7 +12,7 @@ from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
 from .crowns import Crowns
-from .options import Engine, Field, Loss, Search
+from .options import Diffraction, Engine, Field, Loss, Search
 from .replay import Replay, replay
 from .samples import Samples
 
@@ -27,6 +27,7 @@ def trace(
     loss: Loss | None = None,
     crowns: Crowns | None = None,
     samples: Samples = "auto",
+    diffraction: Diffraction = "none",
 ) -> Replay:
     """Paths, channel matrices and received power of poses at a site.
 
@@ -49,6 +50,8 @@ def trace(
         Tree crowns that reflect.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots agree.
+    diffraction : {"none", "edges", "all"}
+        Paths over one edge of a building, as :class:`~aerpaw_cmp.propagation.options.Search` has them.
 
     Returns
     -------
@@ -73,7 +76,7 @@ def trace(
     (1, 1)
     """
     place = site if isinstance(site, Site) else load_site(site)
-    search = Search(engine, max_depth=max_depth, samples=samples, crowns=crowns)
+    search = Search(engine, max_depth=max_depth, samples=samples, crowns=crowns, diffraction=diffraction)
     return replay(place, link, poses if isinstance(poses, Poses) else _level(poses), search, Field(loss))
 
 

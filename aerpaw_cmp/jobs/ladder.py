@@ -29,7 +29,7 @@ from ..flight.training import learned_here
 from ..propagation.arrays import Link, Poses
 from ..propagation.field.sum import mean_pair_power, rss_dbm
 from ..propagation.moving import replay_moving
-from ..propagation.options import Run, Search
+from ..propagation.options import Field, Run, Search
 from ..propagation.replay import Replay, replay
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern
@@ -65,6 +65,8 @@ class Model:
     ground: Ground = "none"
     buildings: bool = False
     trees: Trees = "none"
+    diffraction: bool = False
+    """Paths over one edge of a building, with the ground on either side."""
     roughness_m: float = 0.0
     """Of ``ground: rough``: that of the flight file, where it has one."""
 
@@ -79,6 +81,7 @@ class Model:
         if self.ground != "none":
             parts.append(f"ground ({self.ground})")
         parts += ["buildings"] if self.buildings else []
+        parts += ["diffraction"] if self.diffraction else []
         if self.trees != "none":
             parts.append("opaque trees" if self.trees == "opaque" else f"trees ({self.trees})")
         return FREE_SPACE if not parts else " + ".join(parts)
@@ -93,6 +96,8 @@ class Model:
             **({"ground_roughness_m": self.roughness_m} if self.ground == "rough" else {}),
             "foliage": "none" if self.trees == "none" else "opaque" if self.trees == "opaque" else "attenuating",
         }
+        if self.diffraction:
+            rt["diffraction"] = "edges"
         if self.trees in ("p833", "weissberger"):
             rt["foliage_model"] = self.trees
         return {
@@ -159,7 +164,7 @@ class _Climber:
         rungs = self._lines()
         models: list[Model | None] = [None] * len(rungs)
         best = Model()
-        for stage in (self._antennas, self._ground, self._buildings, self._trees):
+        for stage in (self._antennas, self._ground, self._buildings, self._edges, self._trees):
             for model in stage(best):
                 if model not in models:
                     models.append(model)
@@ -209,6 +214,12 @@ class _Climber:
         if not self._data.site.buildings:
             return []
         return [dataclasses.replace(best, buildings=True)]
+
+    def _edges(self, best: Model) -> list[Model]:
+        moving = any(s.replayed.tower_m is not None for s in self._series)
+        if not self._data.site.buildings or moving:
+            return []
+        return [dataclasses.replace(best, buildings=True, diffraction=True)]
 
     def _trees(self, best: Model) -> list[Model]:
         if not len(self._data.site.trees):
@@ -268,6 +279,11 @@ class _Climber:
         paths = traced.paths if model.ground != "none" else traced.paths.select(traced.paths.depth == 0)
         wanted = rt.model_copy(update={"ground_roughness_m": 0.0} | model.settings(rt.max_depth)["rt"])
         loss = path_loss(self._data.site, wanted, link.carrier_hz)
+        if model.diffraction:
+            search = Search(max_depth=traced.paths.faces.shape[1], diffraction="edges")
+            bent = replay(self._data.site, link, poses, search, Field(loss), Run(cache_dir=""))
+            level = bent.rss_power_dbm if model.ground == "power sum" else bent.rss_dbm
+            return level[:, 0], series.step * bent.seconds
         fields = fields_from(self._sources(series), traced.faces, paths, link, poses, loss)
         power = fields.power if model.ground == "power sum" else mean_pair_power(fields.h)
         level = rss_dbm(power, link.transmit_power_dbm)[:, 0]
@@ -334,6 +350,8 @@ def recommended_settings(settings: Mapping[str, Any], model: Model | None) -> di
         result[section] = {**result.get(section, {}), **change}
     if model.ground != "rough":
         result["rt"].pop("ground_roughness_m", None)
+    if not model.diffraction:
+        result["rt"].pop("diffraction", None)
     if model.trees not in ("p833", "weissberger"):
         result["rt"].pop("foliage_model", None)
     if model.antennas not in ("installed", "learned"):

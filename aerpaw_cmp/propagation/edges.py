@@ -92,7 +92,16 @@ class Edges:
         along = ends - starts
         along = along / np.linalg.norm(along, axis=1, keepdims=True)
         turn = np.arctan2(np.linalg.norm(np.cross(normal_n, normal), axis=1), (normal * normal_n).sum(axis=1))
-        return cls(starts, ends, along, np.cross(normal, along), normal, normal_n, 1.0 + turn / np.pi, pairs)
+        return cls(
+            start_m=starts,
+            end_m=ends,
+            along=along,
+            face_axis=np.cross(normal, along),
+            normal=normal,
+            normal_n=normal_n,
+            exterior=1.0 + turn / np.pi,
+            face=pairs,
+        )
 
     def coordinates(self, points_m: FloatArray, edge: IntArray) -> FloatArray:
         """Points (n, points, 3) in the frames of edges (n,): along, in face 0 away from the edge, out of face 0."""

@@ -187,3 +187,11 @@ def test_channels_that_share_a_replay_cost_it_once() -> None:
     series = [SimpleNamespace(tower=t, settings_key=k) for t, k in (("LW1", "a"), ("LW1", "a"), ("LW1", "b"))]
     climber = SimpleNamespace(_data=SimpleNamespace(rss=series))
     assert _Climber._of_flight(climber, [2.0, 3.0, 4.0]) == 7.0
+
+
+def test_a_rung_with_diffraction_states_its_key() -> None:
+    model = Model(ground="power sum", buildings=True, diffraction=True)
+    assert model.name == "ground (power sum) + buildings + diffraction"
+    assert recommended_settings({"rt": {"max_depth": 1}}, model)["rt"]["diffraction"] == "edges"
+    plain = Model(ground="power sum", buildings=True)
+    assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "all"}}, plain)["rt"]

@@ -156,7 +156,15 @@ def _end(
     )
     along, down, out = np.moveaxis(edges.coordinates(places, paths.edge), -1, 0)
     angle = np.mod(np.arctan2(out[:, 0], down[:, 0]), 2.0 * np.pi)
-    return _End(centre_m, turn, normal, ground, np.hypot(down, out), along, angle)
+    return _End(
+        centre_m=centre_m,
+        turn=turn,
+        normal=normal,
+        ground=ground,
+        radius=np.hypot(down, out),
+        along=along,
+        angle=angle,
+    )
 
 
 def _off_ground(

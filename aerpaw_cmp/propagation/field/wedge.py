@@ -34,6 +34,8 @@ def wedge_matrix(
 ) -> ComplexArray:
     """Diffraction matrix of a wedge in the edge-fixed basis.
 
+    Source: Kouyoumjian and Pathak, Proc. IEEE 62 (1974), 1448-1461, doi:10.1109/PROC.1974.9651.
+
     Parameters
     ----------
     phi_in, phi_out : (...)

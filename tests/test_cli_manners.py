@@ -18,6 +18,7 @@ import typer
 from aerpaw_cmp.__main__ import main
 from aerpaw_cmp.cli.app import app
 from aerpaw_cmp.common.commands import COMMANDS
+from aerpaw_cmp.common.outputs import OutputFolder
 
 ROOT = Path(__file__).parents[1]
 SAMPLE = ROOT / "sample_logs"
@@ -205,9 +206,9 @@ def test_a_file_that_ends_too_early_is_no_interrupt(
 
 
 def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
-    before = tmp_path / "r" / "note.txt"
-    before.parent.mkdir()
-    before.write_text("mine")
+    before = tmp_path / "r" / "a.html"
+    with OutputFolder(before.parent, job="report") as output, output.filling() as folder:
+        (folder / "a.html").write_text("an earlier report")
     flight = str(SAMPLE / "flight.yaml")
     line = [
         sys.executable,
@@ -219,7 +220,6 @@ def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
         "none",
         "-o",
         str(before.parent),
-        "--force",
     ]
     run = subprocess.Popen(
         line, stderr=subprocess.PIPE, stdout=subprocess.PIPE, text=True,
@@ -232,5 +232,5 @@ def test_an_interrupt_says_what_is_kept(tmp_path: Path) -> None:
     out, err = run.communicate(timeout=60)
     assert (run.returncode, out) == (130, "")
     assert err.splitlines()[-1] == f"aerpaw-cmp: interrupted; {before.parent} is as it was before"
-    assert [path.name for path in before.parent.iterdir()] == ["note.txt"]
+    assert before.read_text() == "an earlier report"
     assert [path.name for path in tmp_path.iterdir()] == ["r"]

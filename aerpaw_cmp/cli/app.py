@@ -38,7 +38,7 @@ app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
 Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
-Force = Annotated[bool, typer.Option("--force", help="Replace also what this tool did not write; never an input.")]
+Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     Optional[list[str]],  # noqa: UP045
     typer.Option(

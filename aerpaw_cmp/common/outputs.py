@@ -26,7 +26,7 @@ import errno
 import hashlib
 import json
 import os
-import shutil
+import re
 import stat
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping
@@ -43,9 +43,6 @@ SUMS = "SHA256SUMS"
 _SUMS_HEAD = "# aerpaw-cmp:"
 _SEAL = "# aerpaw-cmp wrote this file; SHA-256 of the lines below: "
 _UNFINISHED = ".unfinished"
-_MOST_CARRIED = 10_000
-"""Foreign files that are kept in a result folder; more mean that -o names the wrong folder."""
-
 _Identity = tuple[int, int]
 
 
@@ -120,16 +117,6 @@ def _identity(path: Path) -> _Identity | None:
 def _files_below(folder: Path) -> Iterator[Path]:
     for parent, _, names in os.walk(folder):
         yield from (Path(parent, name) for name in names)
-
-
-def _entries_below(folder: Path) -> Iterator[Path]:
-    """Files, links (to folders, too) and empty folders."""
-    for parent, folders, names in os.walk(folder):
-        yield from (Path(parent, name) for name in names)
-        for name in folders:
-            place = Path(parent, name)
-            if place.is_symlink() or not any(place.iterdir()):
-                yield place
 
 
 def _real(path: Path) -> Path:
@@ -290,7 +277,7 @@ class OutputFolder(_SeveralFiles):
     inputs : iterable of Path
         Files that the command reads; none of them may lie in the folder.
     force : bool
-        Take a folder that holds other files. They stay in it unless a result has the same name.
+        Replace files that were changed after this tool wrote them; never files of others.
 
     Raises
     ------
@@ -362,23 +349,17 @@ class OutputFolder(_SeveralFiles):
         """UsageError where the folder holds what this tool did not write, or what was changed since."""
         if not self.target.is_dir():
             return
-        inputs = {_identity(path) for path in self._inputs} - {None}
-        listed = read_sums(self.target)
-        if listed is None and not self._force and (first := next(iter(sorted(self.target.iterdir())), None)):
+        own = read_sums(self.target) or {}
+        if foreign := next(_foreign(self.target, own), None):
             raise UsageError(
-                f"the folder holds files that this tool did not write, {one_line(first.name)}"
-                + ("" if (rest := len(list(self.target.iterdir())) - 1) == 0 else f" and {rest} more"),
-                expected="a new or empty folder, or --force: it keeps them, and replaces only those whose name a "
-                "result has",
+                f"the folder holds what this tool did not write: {one_line(foreign)}",
+                expected="a new or empty folder after -o: a folder of results is replaced as a whole",
                 path=self.named,
             )
-        for number, file in enumerate(_files_below(self.target)):
-            if number > _MOST_CARRIED:
-                raise UsageError(
-                    f"the folder holds more than {_MOST_CARRIED} files", expected="a folder of its own", path=self.named
-                )
-            if _identity(file) in inputs:
-                raise _replaces_input(self.named, file)
+        inputs = {_identity(path) for path in self._inputs} - {None}
+        for name in own:
+            if _identity(self.target / name) in inputs:
+                raise _replaces_input(self.named, self.target / name)
         if not self._force and (changed := changed_files(self.target)):
             raise UsageError(
                 f"{one_line(changed[0])} was changed after this tool wrote it",
@@ -414,38 +395,42 @@ class OutputFolder(_SeveralFiles):
             place.part.rename(self.target)
             _sync_folder(self.target.parent)
             return
-        forced = self._carry(place.part, {*results, SUMS})
-        place.part.chmod(stat.S_IMODE(self.target.stat().st_mode))
+        for folder in (place.part, *(entry for entry in place.part.rglob("*") if entry.is_dir())):
+            before = self.target / folder.relative_to(place.part)
+            if before.is_dir():  # rights that somebody took away stay so
+                folder.chmod(stat.S_IMODE(before.stat().st_mode))
         (place.part / _UNFINISHED).unlink(missing_ok=True)
         _sync_folder(place.part)
         place.lock_too(self.target)
         _exchange(place.part, self.target)
         _sync_folder(self.target.parent)
         with contextlib.suppress(OSError):  # the results stand; the next run tries again
-            _clear(place.part, self.target, own=forced)
+            _clear(place.part)
 
-    def _carry(self, part: Path, results: set[str]) -> set[str]:
-        """Files that are not this tool's come along, as links: they stand under their name before and after.
 
-        Gives the names of those that give way to a result, with ``--force``.
-        """
-        own = {SUMS, *(read_sums(self.target) or ())}
-        forced = set()
-        for file in _entries_below(self.target):
-            name = file.relative_to(self.target).as_posix()
-            if name in own:
-                continue
-            if name not in results:
-                _link(file, part / name)
-            elif self._force:
-                forced.add(name)
-            else:
-                raise UsageError(
-                    f"{one_line(name)} is not this tool's, and a result has the same name",
-                    expected="a new folder, or --force to replace it",
-                    path=self.named,
-                )
-        return forced
+def _foreign(folder: Path, own: Iterable[str]) -> Iterator[str]:
+    """Entries of a result folder that its list does not name: files, links, folders, other file systems."""
+    known = {SUMS, *own}
+    parents = {parent.as_posix() for name in known for parent in Path(name).parents}
+    device = folder.stat().st_dev
+    yield from (f"{place.relative_to(folder)}, a mounted file system" for place in _mounted_below(folder))
+    for parent, folders, names in os.walk(folder):
+        for place in (Path(parent, name) for name in (*folders, *names)):
+            status, name = place.lstat(), place.relative_to(folder).as_posix()
+            expected = parents if stat.S_ISDIR(status.st_mode) else known if stat.S_ISREG(status.st_mode) else ()
+            if status.st_dev != device or name not in expected:
+                yield name
+
+
+def _mounted_below(folder: Path) -> list[Path]:
+    """Mount points below a folder, bind mounts of its own file system too; none where the system does not list them."""
+    try:
+        lines = Path("/proc/self/mountinfo").read_text(encoding="utf-8", errors="surrogateescape").splitlines()
+    except OSError:
+        return []
+    # blanks and the like stand there as octal numbers
+    points = (re.sub(r"\\(\d{3})", lambda code: chr(int(code[1], 8)), line.split(" ")[4]) for line in lines)
+    return [Path(point) for point in points if folder in Path(point).parents]
 
 
 def _make_folders(folder: Path, made: list[Path]) -> None:
@@ -461,18 +446,6 @@ def _remove_folders(made: list[Path]) -> None:
     for place in reversed(made):
         with contextlib.suppress(OSError):
             place.rmdir()
-
-
-def _link(file: Path, name: Path) -> None:
-    """The same file under a second name; a copy where links cannot be made."""
-    name.parent.mkdir(parents=True, exist_ok=True)
-    if file.is_dir() and not file.is_symlink():
-        name.mkdir(exist_ok=True)
-        return
-    try:
-        os.link(file, name, follow_symlinks=False)
-    except (OSError, NotImplementedError):
-        shutil.copy2(file, name, follow_symlinks=False)
 
 
 # --- several files beside files of others -----------------------------------------------------------
@@ -677,12 +650,23 @@ class _Place:
                 AT_END.append(self.leave)
             try:
                 if folder:
-                    _clear(self.part, target, keep=True)
+                    self._empty()
                 else:
                     os.ftruncate(self.descriptor, 0)
             except BaseException:
                 self.leave()
                 raise
+
+    def _empty(self) -> None:
+        """Clear what a killed run left; UsageError where something else is there."""
+        with contextlib.suppress(OSError):
+            _clear(self.part, keep=True)
+        if left := next(self.part.iterdir(), None):
+            raise UsageError(
+                f"the hidden place {one_line(str(self.part))} holds what is not this tool's: {one_line(left.name)}",
+                expected="a hidden place of this tool's alone: move that away",
+                path=self.named,
+            )
 
     def _claim(self, folder: bool) -> int:
         for _ in range(1000):  # another run may remove it between our steps
@@ -735,7 +719,7 @@ class _Place:
         descriptors = (self.descriptor, *self._further)
         if any(self._is_there(descriptor) for descriptor in descriptors):  # else another run's place, or none
             with contextlib.suppress(OSError):
-                _clear(self.part, self.target) if self.part.is_dir() else self.part.unlink()
+                _clear(self.part) if self.part.is_dir() else self.part.unlink()
         for descriptor in descriptors:
             os.close(descriptor)
 
@@ -753,49 +737,28 @@ def _lock(descriptor: int) -> bool:
     return True
 
 
-def _clear(part: Path, target: Path, *, own: Iterable[str] = (), keep: bool = False) -> None:
-    """Empty a place and, unless ``keep``, remove it. Files of others that the target has not are put there.
+def _clear(part: Path, *, keep: bool = False) -> None:
+    """Empty a place and, unless ``keep``, remove it; OSError where something is in it that is not this tool's.
 
-    A place with ``.unfinished`` was being filled: all in it is ours or a link to what the target has. Without it, it
-    is the set that was replaced; what its list does not name (nor ``own``) is somebody's. Both signs go last.
+    A place with ``.unfinished`` was being filled: all in it is ours. Without it, it is the set that was replaced, and
+    ours is what its list names. Both signs go last, so that a killed run can be gone on with.
     """
-    signs = {part / _UNFINISHED, part / SUMS}
-    unfinished = (part / _UNFINISHED).exists()
-    known = {*own, *(read_sums(part) or ())}
-    for parent, folders, names in os.walk(part, topdown=False):
-        for file in (Path(parent, name) for name in names):
-            name = file.relative_to(part).as_posix()
-            if file in signs:
-                continue
-            if unfinished or name in known or not target.is_dir():
-                file.unlink()
-            else:
-                _rescue(file, target / name)
+    if _mounted_below(part):
+        raise OSError(errno.EXDEV, "a file system is mounted there", str(part))
+    signs = [part / _UNFINISHED, part / SUMS]
+    names = _files_below(part) if signs[0].exists() else [part / name for name in read_sums(part) or ()]
+    for file in names:
+        if file not in signs:
+            file.unlink(missing_ok=True)
+    for parent, folders, _ in os.walk(part, topdown=False):
         for folder in (Path(parent, name) for name in folders):
-            folder.unlink() if folder.is_symlink() else folder.rmdir()
+            folder.unlink() if folder.is_symlink() and signs[0].exists() else folder.rmdir()
+    if not set(part.iterdir()) <= set(signs):
+        raise OSError(errno.ENOTEMPTY, "files of others are there", str(part))
     for sign in signs:
         sign.unlink(missing_ok=True)
     if not keep:
         part.rmdir()
-
-
-def _rescue(file: Path, name: Path) -> None:
-    """Give a file a name in the target, unless it was carried there."""
-    name.parent.mkdir(parents=True, exist_ok=True)
-    while os.path.lexists(name):
-        if _same_content(file, name):
-            file.unlink()
-            return
-        name = name.with_name(f"{name.name}.kept")
-    file.rename(name)
-
-
-def _same_content(one: Path, other: Path) -> bool:
-    if os.path.samestat(one.lstat(), other.lstat()):
-        return True
-    if one.is_symlink() or other.is_symlink():
-        return one.is_symlink() and other.is_symlink() and one.readlink() == other.readlink()
-    return one.is_file() and other.is_file() and file_digest(one) == file_digest(other)
 
 
 # --- names and disks ------------------------------------------------------------------------------
@@ -817,7 +780,7 @@ def _restore(target: Path) -> None:
     if not old.is_dir():
         return
     if os.path.lexists(target):
-        _clear(old, target)
+        _clear(old)
     else:
         old.rename(target)
 

@@ -404,9 +404,7 @@ class ModemSimulator:
         self._thread.join(timeout=5.0)
         with self._lock:
             self._close_master()
-        if self.settings.link is not None:
-            with contextlib.suppress(OSError):
-                self.settings.link.unlink()
+        self._unlink()
 
     @property
     def port(self) -> Path:
@@ -430,9 +428,7 @@ class ModemSimulator:
             self._pending = None  # nobody can tell whether it was read
             self.unplugs.append(time.monotonic_ns())
             old, self._master = self._master, -1
-            if self.settings.link is not None:
-                with contextlib.suppress(OSError):
-                    self.settings.link.unlink()
+            self._unlink()
             if old >= 0:
                 os.close(old)
 
@@ -461,13 +457,24 @@ class ModemSimulator:
         link = self.settings.link
         if link is not None:
             link.parent.mkdir(parents=True, exist_ok=True)
-            if link.is_symlink() and str(link.readlink()).startswith("/dev/"):  # of an earlier run
-                link.unlink()
-            elif link.exists() or link.is_symlink():
+            try:
+                link.symlink_to(node)
+            except FileExistsError:
                 os.close(master)
-                raise UsageError("the name is taken, and by no link to a port", expected="a new name", path=link)
-            link.symlink_to(node)
+                raise UsageError(
+                    "the name is taken",
+                    expected="a new name",
+                    cause="a simulator that was killed: remove it",
+                    path=link,
+                ) from None
         return node
+
+    def _unlink(self) -> None:
+        """Remove the link, if it is still the one to our node."""
+        link = self.settings.link
+        with contextlib.suppress(OSError):
+            if link is not None and link.readlink() == self._node:
+                link.unlink()
 
     def _close_master(self) -> None:
         if self._master >= 0:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 import shutil
+import stat
 import subprocess
 from collections.abc import Callable
 from pathlib import Path
@@ -129,36 +130,91 @@ def test_a_folder_is_replaced_as_a_whole_and_can_be_checked(tmp_path: Path) -> N
     assert done.returncode == 0, done
 
 
-def test_files_of_others_stay_in_the_folder(tmp_path: Path) -> None:
+@pytest.mark.parametrize("force", [False, True])
+@pytest.mark.parametrize("name", ["mine.txt", "figures/mine.txt", "notes/", "figures/notes/", "link@", "figures@"])
+def test_a_folder_with_something_of_others_is_refused_and_left_alone(tmp_path: Path, name: str, force: bool) -> None:
     target = tmp_path / "report"
-    write_folder(target, {"a.html": "1"})
-    (target / "notes" / "empty").mkdir(parents=True)
-    (target / "notes" / "mine.txt").write_text("mine")
-    (target / "link").symlink_to("nowhere")
-    inode = (target / "notes" / "mine.txt").stat().st_ino
-    write_folder(target, {"a.html": "2", "b.html": "2"})
-    assert content(target).keys() == {"a.html", "b.html", "notes/mine.txt", SUMS}
-    assert (target / "notes" / "mine.txt").stat().st_ino == inode
-    assert (target / "notes" / "empty").is_dir()
-    assert (target / "link").readlink() == Path("nowhere")
-    with pytest.raises(UsageError, match="a result has the same name"):
-        write_folder(target, {"notes/mine.txt": "3"})
-    assert (target / "notes" / "mine.txt").read_text() == "mine"
-    assert [p.name for p in tmp_path.iterdir()] == ["report"]
+    write_folder(target, {"a.html": "1", "figures/a.svg": "1"})
+    place = target / name.rstrip("/@")
+    if name.endswith("@"):
+        if place.is_dir():
+            place.rename(tmp_path / "away")
+        place.symlink_to(tmp_path / "away")
+    elif name.endswith("/"):
+        place.mkdir()
+    else:
+        place.write_text("mine")
+    before = sorted((path, path.lstat().st_mtime_ns) for path in tmp_path.rglob("*"))
+    with pytest.raises(UsageError, match="did not write"):
+        write_folder(target, {"a.html": "2", "b.html": "2"}, force=force)
+    assert sorted((path, path.lstat().st_mtime_ns) for path in tmp_path.rglob("*")) == before
 
 
-def test_a_folder_of_others_needs_force_and_keeps_their_files(tmp_path: Path) -> None:
+def test_a_folder_without_a_list_is_refused(tmp_path: Path) -> None:
     target = tmp_path / "home"
     target.mkdir()
     write_folder(target, {"a.html": "0"})  # an empty folder is free
-    shutil.rmtree(target)
-    target.mkdir()
-    (target / "thesis.tex").write_text("mine")
-    with pytest.raises(UsageError, match=r"did not write, thesis\.tex"):
-        write_folder(target, {"a.html": "1"})
-    assert content(target) == {"thesis.tex": b"mine"}
-    write_folder(target, {"a.html": "1"}, force=True)
-    assert content(target).keys() == {"a.html", "thesis.tex", SUMS}
+    (target / SUMS).unlink()
+    with pytest.raises(UsageError, match=r"did not write: a\.html"):
+        write_folder(target, {"a.html": "1"}, force=True)
+    assert content(target) == {"a.html": b"0"}
+
+
+def test_what_comes_between_check_and_exchange_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    target = tmp_path / "report"
+    write_folder(target, {"a": "1"})
+    plain = outputs._exchange
+
+    def late(part: Path, to: Path) -> None:
+        (to / "mine").write_text("mine")
+        plain(part, to)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(outputs, "_exchange", late)
+        write_folder(target, {"a": "2"})
+    assert content(target)["a"] == b"2"
+    (hidden,) = tmp_path.glob(".*")
+    assert (hidden / "mine").read_text() == "mine"
+    with pytest.raises(UsageError, match="holds what is not this tool's: mine"):
+        write_folder(target, {"a": "3"})
+    assert (hidden / "mine").read_text() == "mine"
+
+
+def test_rights_that_were_taken_away_stay_so(tmp_path: Path) -> None:
+    target = tmp_path / "report"
+    write_folder(target, {"a.html": "1", "figures/a.svg": "1"})
+    (target / "figures").chmod(0o700)
+    target.chmod(0o750)
+    write_folder(target, {"a.html": "2", "figures/a.svg": "2"})
+    assert [stat.S_IMODE(path.stat().st_mode) for path in (target, target / "figures")] == [0o750, 0o700]
+
+
+def mount(*words: object) -> bool:
+    return subprocess.run(["mount", *map(str, words)], capture_output=True, check=False).returncode == 0
+
+
+@pytest.mark.parametrize("kind", ["tmpfs", "bind"])
+def test_a_file_system_mounted_in_a_result_folder_keeps_its_files(tmp_path: Path, kind: str) -> None:
+    """A bind mount has the device of its folder, and here even the files that the list names."""
+    target, disk = tmp_path / "report", tmp_path / "disk"
+    write_folder(target, {"a.html": "1", "figures/a.svg": "1"})
+    disk.mkdir()
+    (disk / "a.svg").write_text("1")
+    point = target / "figures"
+    if not mount(*(["-t", "tmpfs", "none", point] if kind == "tmpfs" else ["--bind", disk, point])):
+        pytest.skip("only root can mount")
+    try:
+        (point / "a.svg").write_text("1")
+        with pytest.raises(UsageError, match="figures, a mounted file system"):
+            write_folder(target, {"a.html": "2"}, force=True)
+        assert (point / "a.svg").read_text() == "1"
+        hidden = outputs.beside(target, "part")
+        with pytest.raises(OSError, match="mounted"):
+            outputs._clear(target)
+        assert not hidden.exists()
+    finally:
+        subprocess.run(["umount", str(point)], check=True)
+    assert content(target).keys() == {"a.html", "figures/a.svg", SUMS}
 
 
 def test_a_changed_result_needs_force(tmp_path: Path) -> None:
@@ -256,7 +312,6 @@ def test_two_renames_where_the_system_cannot_exchange(
     monkeypatch.setattr(outputs, "_renamed_both", lambda *_: False)
     target = tmp_path / "report"
     write_folder(target, {"a": "1"})
-    (target / "mine").write_text("mine")
     rename, calls = Path.rename, []
 
     def killed(self: Path, to: Path) -> Path:
@@ -276,8 +331,7 @@ def test_two_renames_where_the_system_cannot_exchange(
     with OutputFolder(target, job="test"):  # any next run mends
         found = content(target)
     assert found["a"] == (b"2" if step == 2 else b"1")
-    assert found["mine"] == b"mine"
-    assert set(found) == {"a", "mine", SUMS}
+    assert set(found) == {"a", SUMS}
     assert [p.name for p in tmp_path.iterdir()] == ["report"]
 
 

@@ -128,17 +128,27 @@ def test_simulator_cleans_up(tmp_path):
         ModemSimSettings(kind="toaster")
 
 
-def test_simulator_never_removes_a_file_in_place_of_its_link(tmp_path):
+def test_simulator_never_removes_what_is_not_its_own_link(tmp_path):
     path = tmp_path / "precious"
     path.write_text("x")
-    with pytest.raises(UsageError, match="no link to a port"):
+    with pytest.raises(UsageError, match="the name is taken"):
         ModemSimulator(ModemSimSettings(link=path))
     assert path.read_text() == "x"
     name = tmp_path / "name"
     name.symlink_to(path)
-    with pytest.raises(UsageError, match="no link to a port"):
+    with pytest.raises(UsageError, match="the name is taken"):
         ModemSimulator(ModemSimSettings(link=name))
     assert name.is_symlink()
+    name.unlink()
+    name.symlink_to("/dev/ttyUSB2")  # the user's, to her modem
+    with pytest.raises(UsageError, match="the name is taken"):
+        ModemSimulator(ModemSimSettings(link=name))
+    assert str(name.readlink()) == "/dev/ttyUSB2"
+    name.unlink()
+    with ModemSimulator(ModemSimSettings(link=name)):
+        name.unlink()
+        name.symlink_to("/dev/ttyUSB2")
+    assert str(name.readlink()) == "/dev/ttyUSB2", "put there while it ran"
 
 
 # telemetry ---------------------------------------------------------------------------------------------------

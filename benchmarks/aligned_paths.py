@@ -19,7 +19,7 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.image import find_paths
+from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building, Site, Tower
 
 ROOT = Path(__file__).parents[1]

@@ -32,7 +32,7 @@ from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.flight.track import Track
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.site.siteyaml import load_site
 
 Level = Callable[[np.ndarray], np.ndarray]

@@ -37,8 +37,8 @@ from aerpaw_cmp.compare.rss import local_mean_db, stretch_means_db, stretches
 from aerpaw_cmp.flight.data import FlightData, gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.propagation.arrays import Isotropic, Link, Pattern, Poses, rotation_from_yaw_pitch_roll, single_element
-from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
-from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.antennas import read_gain_grid

@@ -47,7 +47,7 @@ TARGETS: dict[str, tuple[str, ...]] = {
         _PHYSICS + "test_channel.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_rank_field.py",
         _PHYSICS + "test_compiled.py",
     ),
-    "aerpaw_cmp/propagation/foliage.py": (
+    "aerpaw_cmp/propagation/field/foliage.py": (
         _PHYSICS + "test_foliage.py", _PHYSICS + "test_reference.py", _PHYSICS + "test_hard_cases.py",
         _PHYSICS + "test_crowns.py", _PHYSICS + "test_foliage_by_hand.py",
     ),

@@ -80,19 +80,19 @@ FAULTS = (
     Fault("permittivity with a gain", "aerpaw_cmp.site.materials", "Material.relative_permittivity", "-loss)", "loss)"),
     Fault("conductivity at 1 GHz", "aerpaw_cmp.site.materials", "Material.conductivity_s_per_m", "(frequency_hz / 1e9) ** d", "1.0 ** d"),
     Fault("walls 10 % thicker", f"{P}.field.fresnel", 'FaceMaterials.of', 'np.inf if t is None else t for t', 'np.inf if t is None else 1.1 * t for t'),
-    Fault("foliage 10 % stronger", f"{P}.foliage", "P833.loss_db", "-self.gamma_db_per_m * depth", "-1.1 * self.gamma_db_per_m * depth"),
-    Fault("foliage without its largest loss", f"{P}.foliage", "P833.loss_db", "-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db)", "self.gamma_db_per_m * depth"),
-    Fault("foliage at the last entry of the table", f"{P}.foliage", "P833.at", "_GAMMA_EXPONENT * (mhz - inside)", "0.0 * (mhz - inside)"),
-    Fault("crowns of twice the radius", f"{P}.foliage", "CrownIndex.__init__", "trees.crown_diameter_m / 2", "trees.crown_diameter_m"),
-    Fault("crowns from the ground", f"{P}.foliage", "CrownIndex.__init__", "base = trees.ground_m + trees.crown_base_m", "base = trees.ground_m + 0.0 * trees.crown_base_m"),
-    Fault("crowns as cylinders", f"{P}.foliage", "CrownIndex.__init__", "self.shape: Shape = shape", "self.shape: Shape = 'cylinder'"),
-    Fault("one segment of a path without foliage", f"{P}.foliage", "foliage_depth_m", "for k in range(last, -2, -1):", "for k in range(last, -1, -1):"),
-    Fault("paths of two reflections dropped", f"{P}.image", "find_paths", "for level in sequences(tower):", "for level in sequences(tower)[:2]:"),
-    Fault("every fifth path dropped", f"{P}.image", "find_paths", "return merge(pieces, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(pieces, max_depth, faces))"),
-    Fault("direct paths dropped", f"{P}.image", "find_paths", "for level in sequences(tower):", "for level in sequences(tower)[1:]:"),
-    Fault("nothing hides", f"{P}.solids", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
+    Fault("foliage 10 % stronger", f"{P}.field.foliage", "P833.loss_db", "-self.gamma_db_per_m * depth", "-1.1 * self.gamma_db_per_m * depth"),
+    Fault("foliage without its largest loss", f"{P}.field.foliage", "P833.loss_db", "-self.maximum_db * np.expm1(-self.gamma_db_per_m * depth / self.maximum_db)", "self.gamma_db_per_m * depth"),
+    Fault("foliage at the last entry of the table", f"{P}.field.foliage", "P833.at", "_GAMMA_EXPONENT * (mhz - inside)", "0.0 * (mhz - inside)"),
+    Fault("crowns of twice the radius", f"{P}.field.foliage", "CrownIndex.__init__", "trees.crown_diameter_m / 2", "trees.crown_diameter_m"),
+    Fault("crowns from the ground", f"{P}.field.foliage", "CrownIndex.__init__", "base = trees.ground_m + trees.crown_base_m", "base = trees.ground_m + 0.0 * trees.crown_base_m"),
+    Fault("crowns as cylinders", f"{P}.field.foliage", "CrownIndex.__init__", "self.shape: Shape = shape", "self.shape: Shape = 'cylinder'"),
+    Fault("one segment of a path without foliage", f"{P}.field.foliage", "foliage_depth_m", "for k in range(last, -2, -1):", "for k in range(last, -1, -1):"),
+    Fault("paths of two reflections dropped", f"{P}.search.mirror", "find_paths", "for level in sequences(tower):", "for level in sequences(tower)[:2]:"),
+    Fault("every fifth path dropped", f"{P}.search.mirror", "find_paths", "return merge(pieces, max_depth, faces)", "return (lambda p: p.select(np.arange(len(p)) % 5 > 0))(merge(pieces, max_depth, faces))"),
+    Fault("direct paths dropped", f"{P}.search.mirror", "find_paths", "for level in sequences(tower):", "for level in sequences(tower)[1:]:"),
+    Fault("nothing hides", f"{P}.search.occlusion", "Occlusion.segments", "if not self.pieces:", "if self.pieces:"),
     Fault("walls 5 m longer than they are", f"{P}.faces", "inside", "faces.upper[index] + tolerance_m", "faces.upper[index] + 5.0"),
-    Fault("reflection points off by 1 % of the way", f"{P}.image", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
+    Fault("reflection points off by 1 % of the way", f"{P}.search.mirror", "trace_back", "share = behind / (behind + ahead)", "share = 0.99 * behind / (behind + ahead)"),
     Fault("walls moved by 5 cm", f"{P}.faces", "_walls", "offset = float(normal[:2] @ start)", "offset = float(normal[:2] @ start) + 0.05"),
     Fault("antenna 30 cm higher", "aerpaw_cmp.site.site", "Tower.position_m", "self.ground_m + self.antenna_height_m", "self.ground_m + self.antenna_height_m + 0.3"),
     Fault("power summed over the receiving ports", f"{P}.field.sum", "mean_pair_power", "parts, parts) / pairs)", "parts, parts) / pairs * h.shape[-2])"),
@@ -120,7 +120,8 @@ def planted(fault: Fault) -> Iterator[None]:
 
 def _forget() -> None:
     """What the package keeps of the functions as they were."""
-    from aerpaw_cmp.propagation import faces, foliage
+    from aerpaw_cmp.propagation import faces
+    from aerpaw_cmp.propagation.field import foliage
 
     faces._building_faces.cache_clear()
     foliage._last_index.clear()
@@ -288,7 +289,7 @@ def failures(data: Any, replays: Any, *, sionna: bool = True) -> list[str]:
 def reference_only(data: Any, replays: Any) -> Any:
     """The audit without Sionna: the second implementation and the attitude."""
     from aerpaw_cmp.jobs.audit_flight import attitude_checked, expectations
-    from aerpaw_cmp.propagation.field_audit import against_reference, spread_over_paths
+    from aerpaw_cmp.propagation.check.field_audit import against_reference, spread_over_paths
 
     total = attitude_checked(data, replays)
     for one, expected in zip(replays, expectations(data, replays), strict=True):
@@ -301,7 +302,7 @@ def reference_only(data: Any, replays: Any) -> Any:
 
 def remembered() -> None:
     """Sionna's answers do not change with the faults: the same question is asked once."""
-    from aerpaw_cmp.propagation import sionna
+    from aerpaw_cmp.propagation.search import sionna
 
     known: dict[bytes, Any] = {}
     ask = sionna.own_coefficients

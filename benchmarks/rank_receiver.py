@@ -48,7 +48,7 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.geometries import Geometry, basis_fields, slant_basis
+from aerpaw_cmp.propagation.drivers.geometries import Geometry, basis_fields, slant_basis
 
 LW1 = (35.72750947, -78.69595819)
 ANTENNA_M = np.array([0.0, 0.0, 12.0])

@@ -33,8 +33,8 @@ from typing import Any
 import numpy as np
 from shapely.geometry import box
 
-from aerpaw_cmp.propagation.growth import grow_paths
-from aerpaw_cmp.propagation.merging import merged
+from aerpaw_cmp.propagation.search.beams import grow_paths
+from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.mitsuba import TriangleScene, read_scene
 
 SOURCES = {
@@ -145,9 +145,9 @@ def image_row(task: dict[str, Any]) -> dict[str, Any]:
 def prism_row(task: dict[str, Any]) -> dict[str, Any]:
     """A town of prisms through the replay's own search."""
     from aerpaw_cmp.common.geodesy import SiteFrame
-    from aerpaw_cmp.propagation import prisms
     from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
     from aerpaw_cmp.propagation.scene import Scene
+    from aerpaw_cmp.propagation.search import prisms
     from aerpaw_cmp.site.site import Building, Site, Tower
 
     compile_s = warm_up()
@@ -188,7 +188,7 @@ def prism_row(task: dict[str, Any]) -> dict[str, Any]:
 
 def sionna_row(task: dict[str, Any]) -> dict[str, Any]:
     """PathSolver on the same triangles, and what each has that the other lacks."""
-    from aerpaw_cmp.propagation import sionna
+    from aerpaw_cmp.propagation.search import sionna
 
     if task.get("limit"):
         sionna.MAXIMUM_PATHS = task["limit"]
@@ -238,7 +238,7 @@ def free_in_sionna(surfaces: Any, paths: Any, sources: np.ndarray, targets: np.n
     """Which paths (paths,) have no segment that Sionna's own scene cuts, and reflect on its surfaces."""
     import mitsuba as mi
 
-    from aerpaw_cmp.propagation import sionna
+    from aerpaw_cmp.propagation.search import sionna
 
     built = sionna._build(surfaces.faces, np.arange(len(surfaces)), 1e4, CARRIER_HZ, surfaces=surfaces)
     scene = built.scene.mi_scene

@@ -20,9 +20,9 @@ import numpy as np
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.crowns import FACES_PER_CROWN, Crowns
-from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_depth_m
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_depth_m
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.site.footprints import import_site, write_site_yaml
 from aerpaw_cmp.site.meshes import site_meshes
 from aerpaw_cmp.site.site import Site, Trees

@@ -158,7 +158,7 @@ def sionna() -> Any:
     let_sionna_load()
     pytest.importorskip("sionna.rt", reason="Sionna RT is not installed")
     from aerpaw_cmp.common.errors import CheckError, UsageError
-    from aerpaw_cmp.propagation import sionna
+    from aerpaw_cmp.propagation.search import sionna
 
     try:
         sionna.load_variant()

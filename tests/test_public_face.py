@@ -38,11 +38,11 @@ def test_using_one_name_loads_only_its_room() -> None:
 
 
 @pytest.mark.parametrize(
-    "name", ["propagation.trace", "propagation.audit", "propagation.replay", "logs.ingest", "compare.rank"]
+    "name", ["propagation.trace", "propagation.check.audit", "propagation.replay", "logs.ingest", "compare.rank"]
 )
 def test_no_function_hides_a_module(name: str) -> None:
     module = importlib.import_module(f"aerpaw_cmp.{name}")
-    package, _, last = name.partition(".")
+    package, _, last = name.rpartition(".")
     assert inspect.ismodule(getattr(importlib.import_module(f"aerpaw_cmp.{package}"), last))
     assert inspect.ismodule(module)
 

@@ -6,10 +6,10 @@ import numpy as np
 
 from ..common.errors import UsageError
 from ..common.units import FloatArray, wavelength_m
-from ..propagation.crowns import Crowns
-from ..propagation.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
+from ..propagation.field.foliage import crown_index, foliage_depth_m, foliage_loss_db, foliage_model
 from ..propagation.options import Loss
 from ..propagation.paths import PathSet
+from ..propagation.search.crowns import Crowns
 from ..site.site import Site, Trees
 from .settings import RtSettings
 
@@ -91,8 +91,8 @@ def roughness_loss(site: Site, rt: RtSettings, carrier_hz: float) -> Loss | None
     Notes
     -----
     Each reflection off the ground falls by ``exp(-2 (k sigma sin(grazing))^2)``, the grazing angle that of the array
-    centres (:func:`aerpaw_cmp.propagation.baselines.specular_factor`, here as a loss, which does not underflow); what
-    leaves the specular direction is not followed.
+    centres (:func:`aerpaw_cmp.propagation.field.baselines.specular_factor`, here as a loss, which does not underflow);
+    what leaves the specular direction is not followed.
     """
     sigma = rt.ground_roughness_m
     if sigma == 0.0:

@@ -13,7 +13,7 @@ import numpy as np
 from ..common.units import FloatArray
 from ..compare.locate import FEWEST, LevelTrack, level_track, locate
 from ..logs.records import Stream
-from ..propagation.baselines import free_space_dbm
+from ..propagation.field.baselines import free_space_dbm
 from ..site.site import Site
 from .scored import unscored
 from .track import Track

@@ -17,13 +17,13 @@ from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
+from ..propagation.drivers.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.drivers.pairs import replay_pairs
-from ..propagation.effort import Estimate
 from ..propagation.field.sum import Fields, channel_matrices
-from ..propagation.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.options import Engine, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet
 from ..propagation.replay import NOT_IN_RANKS, Replay, replay
+from ..propagation.search.effort import Estimate
 from ..site.site import Site
 from .clock import ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions

@@ -27,7 +27,7 @@ from ..propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from ..propagation.interactions import Interaction
+from ..propagation.search.interactions import Interaction
 from ..site.antennas import Isotropic
 
 Positive = Annotated[float, Field(gt=0)]

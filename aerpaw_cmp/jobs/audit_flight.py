@@ -25,13 +25,9 @@ from ..flight.replay import Replayed, attitude_rotation, may_share, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
-from ..propagation.audit import Audit, Second, audit
-from ..propagation.field.sum import mean_pair_power
-from ..propagation.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
-from ..propagation.interactions import summary
-from ..propagation.moving import site_with_tower_at
-from ..propagation.options import Field, Run, Search
-from ..propagation.reference import (
+from ..propagation.check.audit import Audit, Second, audit
+from ..propagation.check.field_audit import REFERENCE_LINKS, Expected, scalar_pattern
+from ..propagation.check.reference import (
     C_MPS,
     PATTERNS,
     ExpectedArray,
@@ -42,6 +38,10 @@ from ..propagation.reference import (
     layout_positions,
     turned,
 )
+from ..propagation.drivers.moving import site_with_tower_at
+from ..propagation.field.sum import mean_pair_power
+from ..propagation.options import Field, Run, Search
+from ..propagation.search.interactions import summary
 from ..site.site import Site
 
 ATTITUDE_ROWS = 200

@@ -35,7 +35,7 @@ from ..flight.data import RATIOS, SNR, FlightData, RssSeries, load_data
 from ..flight.settings import AntennaSettings, Settings, load_flight, load_pattern
 from ..flight.training import counted_once, flight_logs
 from ..propagation.arrays import rotation_from_yaw_pitch_roll
-from ..propagation.baselines import free_space_dbm, two_ray_dbm
+from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from .calibrate_rank import RankFitSettings
 from .workers import Lost, Workers
 

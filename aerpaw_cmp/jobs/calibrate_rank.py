@@ -40,7 +40,7 @@ from ..flight.replay import attitude_rotation
 from ..flight.settings import Settings
 from ..flight.training import logs_of
 from ..propagation.arrays import Link, Poses
-from ..propagation.geometries import Geometry, every_geometry, singular_values_of
+from ..propagation.drivers.geometries import Geometry, every_geometry, singular_values_of
 
 FORMAT = "aerpaw-cmp receiver 1"
 """First key of a receiver file."""

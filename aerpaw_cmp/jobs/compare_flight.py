@@ -48,7 +48,7 @@ from ..flight.losses import direct_foliage_m
 from ..flight.replay import FlightReplay, Replayed, may_share
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..flight.training import learned_here
-from ..propagation.baselines import free_space_dbm, two_ray_dbm
+from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
 from ..site.site import Site
 from .calibrate_rank import rank_samples, read_receiver
 from .levels import Levels, at_samples, levels_of, stated_spread

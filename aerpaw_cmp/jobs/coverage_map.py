@@ -50,13 +50,13 @@ from ..maps.netcdf import write_netcdf
 from ..maps.study import HeldOutStudy, Study, held_out_study, rank_fields, rank_study
 from ..maps.variogram import BinnedCorrelation, field_correlation, vertical_correlation
 from ..propagation.arrays import Link, Poses, linear_array, single_element
-from ..propagation.crowns import Crowns
+from ..propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ..propagation.field.sum import channel_matrices, rss_dbm
-from ..propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
 from ..propagation.options import Engine, Search
 from ..propagation.paths import PathSet
 from ..propagation.replay import Replay, replay
 from ..propagation.scene import Scene
+from ..propagation.search.crowns import Crowns
 from ..report import maps_data as page
 from ..site.site import Site
 from ..site.siteyaml import load_site

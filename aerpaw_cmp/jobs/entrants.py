@@ -17,7 +17,7 @@ from ..compare.forecast import constant_forecast
 from ..flight.data import FlightData
 from ..flight.replay import attitude_rotation
 from ..propagation.arrays import Poses
-from ..propagation.baselines import tr36777_loss_db, two_ray_dbm
+from ..propagation.field.baselines import tr36777_loss_db, two_ray_dbm
 from ..propagation.trace import trace
 from .benchmark import KEY, RANKS, Bench, Question, questions, utc_texts
 from .calibrate import rotation

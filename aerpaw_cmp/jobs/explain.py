@@ -20,7 +20,7 @@ from ..flight.losses import path_loss, roughness_loss
 from ..flight.replay import attitude_rotation, estimate_clocks, replay_poses, telemetry_time, valid_poses
 from ..flight.settings import RtSettings, load_flight
 from ..propagation.arrays import Link, Poses
-from ..propagation.explained import (
+from ..propagation.check.explain import (
     ExplainedPath,
     explain_paths,
     near_an_edge,
@@ -28,10 +28,10 @@ from ..propagation.explained import (
     simple_paths,
     why_not,
 )
-from ..propagation.image import planes_of
-from ..propagation.moving import site_with_tower_at
+from ..propagation.drivers.moving import site_with_tower_at
 from ..propagation.paths import joined
 from ..propagation.replay import Replay
+from ..propagation.search.mirror import planes_of
 from ..site.site import Site
 
 MORE_SAMPLES = 10

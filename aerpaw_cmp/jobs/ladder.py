@@ -27,8 +27,8 @@ from ..flight.replay import FlightReplay, Replayed, attitude_rotation, fields_fr
 from ..flight.settings import FlightFile, RssSettings
 from ..flight.training import learned_here
 from ..propagation.arrays import Link, Poses
+from ..propagation.drivers.moving import replay_moving
 from ..propagation.field.sum import mean_pair_power, rss_dbm
-from ..propagation.moving import replay_moving
 from ..propagation.options import Field, Run, Search
 from ..propagation.replay import Replay, replay
 from ..site.antennas import Isotropic

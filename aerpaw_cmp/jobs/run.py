@@ -427,7 +427,7 @@ def run_bench(
     dict
         ``conditions``, ``replay.rows``, ``ratios``, ``report`` and ``details``.
     """
-    from ..propagation.bench import random_scene, speed_against_error
+    from ..propagation.check.bench import random_scene, speed_against_error
 
     site, link, some = random_scene(poses)
     names = list(link.tower_arrays)

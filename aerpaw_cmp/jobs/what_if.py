@@ -18,8 +18,8 @@ from ..flight.losses import path_loss
 from ..flight.replay import Replayed, attitude_rotation, fields_from
 from ..flight.settings import PortSettings, ReferencePowers, RtSettings
 from ..propagation.arrays import Array, Link, Poses
+from ..propagation.field.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from ..propagation.field.sum import Fields, mean_pair_power, rss_dbm
-from ..propagation.foliage import LEAFLESS_FACTOR, P833, P833_TABLE
 from ..propagation.options import Loss
 from ..site.antennas import Isotropic
 from ..site.installed import InstalledPattern

@@ -17,10 +17,10 @@ import numpy as np
 from .. import __version__
 from ..common.files import read_sealed, write_sealed
 from ..common.units import AnyArray, FloatArray
-from .interactions import OtherPaths, OtherSearch
 from .options import Search
 from .paths import PathSet
 from .scene import Scene
+from .search.interactions import OtherPaths, OtherSearch
 
 LAYOUT = 4
 """Raised whenever the entries or the search change."""

@@ -34,10 +34,10 @@ from ..common.units import AnyArray
 
 ROOM = Path(__file__).parent
 SWITCH = "AERPAW_CMP_COMPILED"
-FIELD, BEAMS = "field.kernels", "growth"
+FIELD, BEAMS = "field.kernels", "search.beams"
 SOURCES = (
     "field/dyads.py", "field/fresnel.py", "field/kernels.py",
-    "growth.py", "merging.py", "boxtree.py", "image.py", "compiled.py", "numba_options.py",
+    "search/beams.py", "search/merging.py", "search/boxtree.py", "search/mirror.py", "compiled.py", "numba_options.py",
 )  # fmt: skip
 """Files of kernels, and those whose functions and constants they take in."""
 
@@ -115,7 +115,7 @@ def beams_for(links: int, faces: int) -> bool:
 
 
 def beams() -> State:
-    """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.growth`), or why it cannot run."""
+    """The search among thousands of faces (:mod:`aerpaw_cmp.propagation.search.beams`), or why it cannot run."""
     if switch() == "never":
         return State(None, f"{SWITCH}=never")
     return load(BEAMS)

@@ -15,17 +15,17 @@ import numpy as np
 
 from ..common.units import FloatArray
 from ..site.site import Site
-from . import image
 from .arrays import Link, Poses
 from .cache import PathCache
 from .compiled import beams, beams_for, switch, warn_once
-from .effort import Estimate
-from .interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
 from .options import Run, Search
 from .paths import PathSet
-from .power_cut import ROUNDING, longest_m, within_cut
-from .samples import Choice, enough_samples, spread
 from .scene import Scene, within_reach
+from .search import mirror as image
+from .search.effort import Estimate
+from .search.interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
+from .search.power_cut import ROUNDING, longest_m, within_cut
+from .search.samples import Choice, enough_samples, spread
 
 LONG_SEARCH_S = 60.0
 """A search that will take longer is a warning where nobody asked to be told."""
@@ -127,7 +127,8 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
     ends = scene.sources_m, poses.position_m
     extent = None if run.whole is None else run.whole.extent_m
     if by_beams(scene, search, _links(scene, run)):
-        from . import growth, prisms  # compiled: loaded where there are many faces
+        from .search import beams as growth  # compiled: loaded where there are many faces
+        from .search import prisms
 
         common |= {"longest_m": _longest_m(scene, poses, search), "threads": run.threads}
         common |= {"on_estimate": run.on_estimate or _long_search}
@@ -136,7 +137,7 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
         return prisms.find_paths(scene.faces, *ends, extent_m=extent, **common)[0]
     if search.engine == "image":
         return image.find_paths(scene.faces, *ends, extent_m=extent, **common)
-    from . import sionna
+    from .search import sionna
 
     return sionna.find_paths(scene.faces, *ends, **(common | _rays(scene, link, search)))
 
@@ -173,7 +174,7 @@ def other_paths(
     if kept is not None:
         yield kept
         return
-    from . import sionna
+    from .search import sionna
 
     rays = _rays(scene, link, search)
     if other.scattering:
@@ -251,7 +252,8 @@ def estimate_search(
     scene, search = Scene.of(site, link, poses), replace(search or Search(), engine="image")
     if not by_beams(scene, search):
         return None
-    from . import growth, prisms  # compiled: loaded where there are many faces
+    from .search import beams as growth  # compiled: loaded where there are many faces
+    from .search import prisms
 
     solids = scene.surfaces is None
     return growth.estimate(

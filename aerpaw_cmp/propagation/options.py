@@ -9,11 +9,11 @@ from typing import Literal
 
 from ..common.errors import UsageError
 from ..common.units import BoolArray, FloatArray
-from .crowns import Crowns
-from .effort import OnEstimate
-from .interactions import OtherSearch, other_searches
 from .paths import PathSet
-from .samples import Samples
+from .search.crowns import Crowns
+from .search.effort import OnEstimate
+from .search.interactions import OtherSearch, other_searches
+from .search.samples import Samples
 
 Engine = Literal["image", "sionna"]
 Device = Literal["auto", "cpu", "cuda"]
@@ -34,7 +34,7 @@ class Search:
         Largest number of reflections, 0 to 3.
     samples : int or "auto"
         ``sionna`` only: rays per tower; "auto" raises the number until two pilots find the same paths
-        (:mod:`aerpaw_cmp.propagation.samples`).
+        (:mod:`aerpaw_cmp.propagation.search.samples`).
     batch : int
         ``sionna`` only: poses per call.
     crowns : Crowns, optional
@@ -42,7 +42,7 @@ class Search:
         business of :class:`Field`.
     power_cut_db : float, optional
         Leave out paths at least this much weaker than free space over their link by their length alone
-        (:mod:`aerpaw_cmp.propagation.power_cut`).
+        (:mod:`aerpaw_cmp.propagation.search.power_cut`).
     check_power_cut : bool
         Search a few poses without the cut and say in ``left_out`` what it costs.
     diffraction : {"none", "edges", "all"}
@@ -50,7 +50,7 @@ class Search:
         one side ("all"). In H, levels and ranks, whichever engine finds the reflections.
     interactions : sequence of {"reflection", "diffraction", "scattering", "refraction"}
         ``sionna`` only, but for reflections: the others' power is added to RSS, never to H
-        (:mod:`aerpaw_cmp.propagation.interactions`).
+        (:mod:`aerpaw_cmp.propagation.search.interactions`).
     scattering_coefficient : float, optional
         Of every material, where "scattering" is asked for.
     device : {"auto", "cpu", "cuda"}
@@ -121,7 +121,8 @@ class Field:
     loss : callable, optional
         Further loss per path [dB], such as foliage; infinite where nothing gets through.
     relevance_db : float, optional
-        Say in ``left_out`` which buildings move no RSS by more than this (:mod:`aerpaw_cmp.propagation.relevance`).
+        Say in ``left_out`` which buildings move no RSS by more than this
+        (:mod:`aerpaw_cmp.propagation.field.relevance`).
     """
 
     loss: Loss | None = None

@@ -40,7 +40,7 @@ class Faces:
         The face in its plane, where it does not fill its bounds.
     solid : (faces,) int
         Index of the building, -1 for the ground, which never hides anything. Faces of crowns, which only the paths
-        of :mod:`aerpaw_cmp.propagation.crowns` bring along, count on from the last building by tree.
+        of :mod:`aerpaw_cmp.propagation.search.crowns` bring along, count on from the last building by tree.
     """
 
     normal: FloatArray

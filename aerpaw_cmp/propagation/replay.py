@@ -12,20 +12,21 @@ import numpy as np
 from ..common.errors import UsageError
 from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray, power_from_db
 from ..site.site import Site
-from . import image
 from .arrays import Link, Poses
 from .cache import PathCache
-from .edges import EdgePaths, Edges, find_edge_paths
+from .edges import EdgePaths, Edges
 from .engines import chosen_samples, other_paths, path_cache, search_or_read
 from .field.edges import edge_channels
+from .field.relevance import idle_objects, in_words
 from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
-from .interactions import OtherInteractions, OtherSearch, path_powers
 from .options import Field, Run, Search
 from .paths import Faces, PathSet
-from .power_cut import CHECKED_POSES, loss_in_words, within_cut
-from .relevance import idle_objects, in_words
-from .samples import spread
 from .scene import Scene, buried_towers, within_reach
+from .search import mirror as image
+from .search.edges import find_edge_paths
+from .search.interactions import OtherInteractions, OtherSearch, path_powers
+from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
+from .search.samples import spread
 from .surfaces import Surfaces
 
 LEVELS_AT_ONCE = 1024

@@ -16,9 +16,9 @@ from ..site.scenes import added
 from ..site.site import Site
 from . import compiled
 from .arrays import Link, Poses
-from .crowns import Crowns
 from .faces import inside_solids, site_faces
 from .paths import Faces, PathSet
+from .search.crowns import Crowns
 from .surfaces import Surfaces
 
 
@@ -124,7 +124,7 @@ def _merged(scene: TriangleScene, merge_m: float) -> Surfaces:
             expected="numba that works: pip install 'aerpaw-cmp[fast]'",
             cause="its thousands of faces are searched by compiled code alone",
         )
-    from .merging import merged  # compiled: loaded where there is a scene
+    from .search.merging import merged  # compiled: loaded where there is a scene
 
     return merged(scene, merge_m)
 

@@ -11,10 +11,10 @@ from ..common.errors import UsageError
 from ..site.site import Site
 from ..site.siteyaml import load_site
 from .arrays import Link, Poses
-from .crowns import Crowns
 from .options import Diffraction, Engine, Field, Loss, Search
 from .replay import Replay, replay
-from .samples import Samples
+from .search.crowns import Crowns
+from .search.samples import Samples
 
 
 def trace(

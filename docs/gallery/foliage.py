@@ -7,7 +7,7 @@ more than most measurements of one flight can decide.
 import matplotlib.pyplot as plt
 import numpy as np
 
-from aerpaw_cmp.propagation.foliage import P833, Weissberger
+from aerpaw_cmp.propagation.field.foliage import P833, Weissberger
 
 depth_m = np.linspace(0.0, 120.0, 400)
 figure, axes = plt.subplots(figsize=(7, 3.2))

@@ -21,10 +21,10 @@ from aerpaw_cmp.jobs import coverage_map as mapping
 from aerpaw_cmp.maps.grid import Grid
 from aerpaw_cmp.maps.job import rank_of_singular_values
 from aerpaw_cmp.propagation.arrays import Link, Poses, linear_array, single_element
-from aerpaw_cmp.propagation.crowns import Crowns
-from aerpaw_cmp.propagation.foliage import CrownIndex, Opaque, foliage_loss_db
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.site import Building, Site, Tower, Trees
 from tests.jobs.sent_by_pickle import SentByPickle

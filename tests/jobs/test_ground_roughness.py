@@ -11,10 +11,10 @@ from aerpaw_cmp.flight.replay import replay_poses
 from aerpaw_cmp.flight.settings import RtSettings
 from aerpaw_cmp.jobs.calibrate import GroundFit
 from aerpaw_cmp.jobs.ladder import Model, recommended_settings
-from aerpaw_cmp.propagation import reference
 from aerpaw_cmp.propagation.arrays import Link, Poses, single_element
-from aerpaw_cmp.propagation.baselines import two_ray_dbm
-from aerpaw_cmp.propagation.field_audit import Expected
+from aerpaw_cmp.propagation.check import reference
+from aerpaw_cmp.propagation.check.field_audit import Expected
+from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.site.siteyaml import load_site
 
 SITE = load_site("lake_wheeler")

@@ -16,7 +16,7 @@ from aerpaw_cmp.jobs.audit_flight import standing
 from aerpaw_cmp.jobs.compare_flight import compare_rank_series, compare_rss_series
 from aerpaw_cmp.jobs.explain import run_explain
 from aerpaw_cmp.jobs.ladder import flight_ladder
-from aerpaw_cmp.propagation.baselines import two_ray_dbm
+from aerpaw_cmp.propagation.field.baselines import two_ray_dbm
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.report import explorer

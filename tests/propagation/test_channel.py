@@ -20,8 +20,8 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field import sum as field_module
+from aerpaw_cmp.propagation.field.baselines import free_space_dbm, two_ray_dbm
 from aerpaw_cmp.propagation.field.fresnel import reflection_coefficients
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.options import Field, Search

@@ -21,15 +21,17 @@ from shapely.geometry import box
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.compare.rank import channel_rank
-from aerpaw_cmp.propagation import compiled, engines, image, prisms
+from aerpaw_cmp.propagation import compiled, engines
 from aerpaw_cmp.propagation import replay as replay_module
 from aerpaw_cmp.propagation.arrays import Array, Poses, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.bench import random_scene
+from aerpaw_cmp.propagation.check.bench import random_scene
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.field import sum as field_sum
 from aerpaw_cmp.propagation.options import Run
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search import mirror as image
+from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole, Isotropic, MeasuredPattern
 from aerpaw_cmp.site.installed import InstalledPattern
 from aerpaw_cmp.site.mitsuba import TriangleScene
@@ -394,7 +396,10 @@ def refuse(*args, **kwargs):
     raise OSError(30, "Read-only file system")
 tempfile.TemporaryFile = refuse  # how a folder for compiled code is tried
 import numpy as np
-from aerpaw_cmp.propagation import boxtree, growth, merging, prisms
+from aerpaw_cmp.propagation.search import boxtree
+from aerpaw_cmp.propagation.search import beams as growth
+from aerpaw_cmp.propagation.search import merging
+from aerpaw_cmp.propagation.search import prisms
 from aerpaw_cmp.propagation.field import kernels
 from aerpaw_cmp.propagation.numba_options import FOLDER
 height = growth._height(np.array([[0.0, 0.0, 1.0]]), np.array([2.0]), 0, np.array([5.0, 5.0, 7.0]))
@@ -421,7 +426,7 @@ def test_many_faces_without_compiled_code(monkeypatch, fresh, case, way):
 
     growth = types.ModuleType("growth")
     growth.try_out = broken
-    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.growth", growth)
+    monkeypatch.setitem(sys.modules, "aerpaw_cmp.propagation.search.beams", growth)
     for module in (compiled, engines):
         monkeypatch.setattr(module, "find_spec", lambda _: True)
     monkeypatch.setenv(compiled.SWITCH, "never" if way == "never" else "auto")

@@ -11,12 +11,12 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.propagation.arrays import Array
-from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.crowns import FACES_PER_CROWN, Crowns
+from aerpaw_cmp.propagation.check.audit import audit
+from aerpaw_cmp.propagation.field.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.foliage import P833, CrownIndex, NoFoliage, Opaque, foliage_loss_db
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search.crowns import FACES_PER_CROWN, Crowns
 from aerpaw_cmp.site.antennas import Isotropic
 from aerpaw_cmp.site.dem import Dem
 from aerpaw_cmp.site.materials import VEGETATION
@@ -228,7 +228,7 @@ def test_every_bounce_is_found_and_none_is_invented(scenes, seed, height, kind):
 
 def test_thinning_out_loses_nothing_in_a_wood(scenes):
     # without blocking, so that all specular points count: all facets against all poses, from the plane equations
-    from aerpaw_cmp.propagation import crowns as module
+    from aerpaw_cmp.propagation.search import crowns as module
 
     rng = np.random.default_rng(5)
     wood = Crowns(random_trees(rng, 60))
@@ -258,7 +258,7 @@ def test_thinning_out_loses_nothing_in_a_wood(scenes):
 
 def test_thinning_out_loses_no_pose_close_to_its_facet(scenes):
     # one pose at a time, between base and tip of the crown: the facet itself bounds what is lit
-    from aerpaw_cmp.propagation import crowns as module
+    from aerpaw_cmp.propagation.search import crowns as module
 
     rng = np.random.default_rng(6)
     stand = random_trees(rng, 20)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 from shapely.geometry import Polygon, box
 
-from aerpaw_cmp.propagation.explained import _chosen, near_an_edge, why_not
+from aerpaw_cmp.propagation.check.explain import _chosen, near_an_edge, why_not
 from aerpaw_cmp.propagation.faces import site_faces
-from aerpaw_cmp.propagation.image import find_paths
+from aerpaw_cmp.propagation.search.mirror import find_paths
 from aerpaw_cmp.site.site import Building
 
 

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation import foliage
-from aerpaw_cmp.propagation.foliage import (
+from aerpaw_cmp.propagation.field import foliage
+from aerpaw_cmp.propagation.field.foliage import (
     P833,
     P833_TABLE,
     CrownIndex,

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation import foliage
-from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_depth_m, foliage_loss_db
+from aerpaw_cmp.propagation.field import foliage
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_depth_m, foliage_loss_db
 from aerpaw_cmp.site.site import Trees
 
 SHAPES = ("cone", "ellipsoid", "cylinder")

@@ -7,7 +7,7 @@ import pytest
 
 from aerpaw_cmp.common.geodesy import SiteFrame
 from aerpaw_cmp.propagation.arrays import Link, Poses, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.geometries import basis_fields, every_geometry, singular_values_of
+from aerpaw_cmp.propagation.drivers.geometries import basis_fields, every_geometry, singular_values_of
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Site, Tower
@@ -59,7 +59,7 @@ def test_power_sum_is_the_mean_over_the_phases_of_the_ground_ray():
     (geometry, *_) = some("power_sum", 0.7)
     (sigma, *_) = singular_values_of([geometry], tower, centre, uav, at, CARRIER_HZ)
     from aerpaw_cmp.propagation.arrays import rotation_from_yaw_pitch_roll
-    from aerpaw_cmp.propagation.geometries import slant_basis
+    from aerpaw_cmp.propagation.drivers.geometries import slant_basis
 
     turn = rotation_from_yaw_pitch_roll(*np.radians([geometry.uav_yaw_deg, 0.0, geometry.uav_roll_deg]))
     los, ground = basis_fields(tower, centre, dataclasses.replace(uav, mount=turn), at, CARRIER_HZ)

@@ -11,15 +11,16 @@ from shapely.geometry import box
 pytest.importorskip("numba", reason="numba is not installed (extra 'fast')")
 
 from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.propagation import image, power_cut, prisms
+from aerpaw_cmp.propagation.check.obstacles import why_not_there
 from aerpaw_cmp.propagation.engines import estimate_search
-from aerpaw_cmp.propagation.growth import grow_paths, reflection_points
-from aerpaw_cmp.propagation.merging import merged
-from aerpaw_cmp.propagation.obstacles import why_not_there
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.paths import path_lengths
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search import mirror as image
+from aerpaw_cmp.propagation.search import power_cut, prisms
+from aerpaw_cmp.propagation.search.beams import grow_paths, reflection_points
+from aerpaw_cmp.propagation.search.merging import merged
 from aerpaw_cmp.site.export import export_scene
 from aerpaw_cmp.site.mitsuba import read_scene
 from aerpaw_cmp.site.scenes import placed_scene

@@ -7,16 +7,17 @@ import pytest
 
 from aerpaw_cmp.common.errors import CheckError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import bench, sionna
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,
     rotation_from_yaw_pitch_roll,
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.bench import random_scene, speed_against_error
+from aerpaw_cmp.propagation.check import bench
+from aerpaw_cmp.propagation.check.bench import random_scene, speed_against_error
 from aerpaw_cmp.propagation.faces import site_faces
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search import sionna
 
 SOURCES = np.array([[0.0, 0.0, 10.0]])
 TARGETS = np.array([[100.0, 0.0, 10.0], [0.0, 50.0, 10.0]])
@@ -102,7 +103,7 @@ def peak_bytes(poses, link, site):
 
 def test_memory_beyond_the_results_does_not_grow_with_the_poses(scenes, monkeypatch):
     monkeypatch.setattr("aerpaw_cmp.propagation.field.sum.PAIRS_PER_CHUNK", 4_000)
-    monkeypatch.setattr("aerpaw_cmp.propagation.image.CELLS_PER_CHUNK", 20_000)
+    monkeypatch.setattr("aerpaw_cmp.propagation.search.mirror.CELLS_PER_CHUNK", 20_000)
     site = scenes.site()
     link = scenes.link(site, tower_comparison_array(), uav_comparison_array(0.0882))
 

@@ -6,7 +6,7 @@ from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.image import find_paths, images_of, planes_of
+from aerpaw_cmp.propagation.search.mirror import find_paths, images_of, planes_of
 from aerpaw_cmp.site.site import Building
 
 SOURCE = np.array([[0.0, 0.0, 10.0]])
@@ -81,7 +81,7 @@ def test_chunks_do_not_change_the_paths(scenes, monkeypatch):
     site = scenes.site(scenes.buildings(np.random.default_rng(9), 8, spread_m=80.0))
     targets = np.random.default_rng(10).uniform([-90, -90, 15], [90, 90, 40], (100, 3))
     _, whole = search(site, targets)
-    monkeypatch.setattr("aerpaw_cmp.propagation.image.CELLS_PER_CHUNK", 150)
+    monkeypatch.setattr("aerpaw_cmp.propagation.search.mirror.CELLS_PER_CHUNK", 150)
     _, pieces = search(site, targets)
     assert (whole.faces == pieces.faces).all()
     assert (whole.pose == pieces.pose).all()

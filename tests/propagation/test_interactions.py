@@ -11,19 +11,19 @@ from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
 from aerpaw_cmp.flight.replay import check_interactions
 from aerpaw_cmp.flight.settings import RtSettings
-from aerpaw_cmp.propagation import interactions
 from aerpaw_cmp.propagation.arrays import (
     rotation_from_aircraft,
     single_element,
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.audit import audit
+from aerpaw_cmp.propagation.check.audit import audit
 from aerpaw_cmp.propagation.field.sum import channel_matrices
-from aerpaw_cmp.propagation.interactions import OtherPaths, other_searches, path_powers, summary
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import NOT_IN_RANKS, replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search import interactions
+from aerpaw_cmp.propagation.search.interactions import OtherPaths, other_searches, path_powers, summary
 from aerpaw_cmp.site.antennas import TR38901
 from aerpaw_cmp.site.materials import material
 from aerpaw_cmp.site.site import Building

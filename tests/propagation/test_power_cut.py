@@ -8,11 +8,12 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import engines, power_cut, samples
+from aerpaw_cmp.propagation import engines
 from aerpaw_cmp.propagation.drivers.pairs import replay_pairs
 from aerpaw_cmp.propagation.field.sum import channel_matrices
 from aerpaw_cmp.propagation.options import Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search import power_cut, samples
 from aerpaw_cmp.site.site import Building
 
 CUT_DB = 6.0

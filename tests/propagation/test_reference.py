@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import field_audit, reference, solids
 from aerpaw_cmp.propagation.arrays import (
     linear_array,
     rotation_from_aircraft,
@@ -14,11 +13,13 @@ from aerpaw_cmp.propagation.arrays import (
     tower_comparison_array,
     uav_comparison_array,
 )
-from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.check import field_audit, reference
 from aerpaw_cmp.propagation.field import dyads, sum
-from aerpaw_cmp.propagation.foliage import CrownIndex, foliage_loss_db, foliage_model
+from aerpaw_cmp.propagation.field.foliage import CrownIndex, foliage_loss_db, foliage_model
 from aerpaw_cmp.propagation.options import Field, Search
 from aerpaw_cmp.propagation.replay import replay
+from aerpaw_cmp.propagation.search import occlusion as solids
+from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.antennas import TR38901, HalfWaveDipole
 from aerpaw_cmp.site.materials import MATERIALS, VEGETATION, material
 from aerpaw_cmp.site.site import Trees

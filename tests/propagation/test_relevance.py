@@ -6,9 +6,9 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, uav_comparison_array
+from aerpaw_cmp.propagation.field.relevance import idle_objects
 from aerpaw_cmp.propagation.field.sum import channel_matrices, mean_pair_power
 from aerpaw_cmp.propagation.options import Field
-from aerpaw_cmp.propagation.relevance import idle_objects
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.site.site import Building
 

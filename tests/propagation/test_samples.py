@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 
 from aerpaw_cmp.propagation.paths import Faces, PathSet
-from aerpaw_cmp.propagation.samples import FIRST, MOST, enough_samples, spread
+from aerpaw_cmp.propagation.search.samples import FIRST, MOST, enough_samples, spread
 
 FACES = Faces(np.eye(3), np.zeros(3), ("concrete",) * 3, ("a", "b", "c"))
 

@@ -8,15 +8,15 @@ from shapely.geometry import box
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.common.units import wavelength_m
-from aerpaw_cmp.propagation import field_audit
 from aerpaw_cmp.propagation.arrays import rotation_from_aircraft, tower_comparison_array, uav_comparison_array
-from aerpaw_cmp.propagation.audit import audit
-from aerpaw_cmp.propagation.crowns import Crowns
+from aerpaw_cmp.propagation.check import field_audit
+from aerpaw_cmp.propagation.check.audit import audit
 from aerpaw_cmp.propagation.field import dyads
 from aerpaw_cmp.propagation.field.sum import mean_pair_power, rss_dbm
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 from aerpaw_cmp.propagation.scene import Scene
+from aerpaw_cmp.propagation.search.crowns import Crowns
 from aerpaw_cmp.site.site import Building, Trees
 
 pytestmark = pytest.mark.sionna

@@ -7,9 +7,9 @@ import shapely
 from shapely.geometry import Polygon, box
 
 from aerpaw_cmp.propagation.faces import inside_solids, site_faces
-from aerpaw_cmp.propagation.image import find_paths
 from aerpaw_cmp.propagation.replay import replay
-from aerpaw_cmp.propagation.solids import Occlusion, convex_pieces
+from aerpaw_cmp.propagation.search.mirror import find_paths
+from aerpaw_cmp.propagation.search.occlusion import Occlusion, convex_pieces
 from aerpaw_cmp.site.site import Building
 
 _spec = importlib.util.spec_from_file_location("replay_exact", Path(__file__).with_name("exact.py"))

@@ -6,7 +6,7 @@ import pytest
 
 from aerpaw_cmp.common.errors import UsageError
 from aerpaw_cmp.propagation.arrays import Link, single_element
-from aerpaw_cmp.propagation.audit import audit
+from aerpaw_cmp.propagation.check.audit import audit
 from aerpaw_cmp.propagation.options import Run, Search
 from aerpaw_cmp.propagation.replay import replay
 
@@ -57,7 +57,7 @@ def test_a_second_replay_searches_nothing(case, tmp_path, monkeypatch):
     def fail(*args, **settings):
         raise AssertionError("searched again")
 
-    monkeypatch.setattr("aerpaw_cmp.propagation.image.find_paths", fail)
+    monkeypatch.setattr("aerpaw_cmp.propagation.search.mirror.find_paths", fail)
     second = replay(*case, run=Run(cache_dir=tmp_path))
     assert second.from_cache
     assert not first.from_cache

@@ -1,4 +1,4 @@
-"""Loss in trees along traced paths, in closed form; crowns that reflect are in :mod:`aerpaw_cmp.propagation.crowns`.
+"""Loss in trees along traced paths, in closed form (crowns that reflect: :mod:`aerpaw_cmp.propagation.search.crowns`).
 
 Crowns are not in the traced scene. The polyline of each path (source, reflection points, target) is cut with every
 crown near it; the chords add up to the path's depth in foliage, and a model turns depth into loss. Nothing is traced
@@ -16,9 +16,9 @@ from typing import Literal, Protocol
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from ..site.site import Trees
+from ...common.errors import UsageError
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ...site.site import Trees
 
 Shape = Literal["cone", "ellipsoid", "cylinder"]
 """Form of a crown between its base and the tree's top; the paper's is the cone."""

@@ -3,8 +3,8 @@
 1. *Sionna* traces the audited links once more and gives, for each path, its own complex coefficient with one element at
    each array centre, in both slants, from its own materials, patterns and rotations. Float32: power within
    ``POWER_TOLERANCE_DB``, phase within ``PHASE_TOLERANCE_RAD`` on paths shorter than ``PHASE_RANGE_M``.
-2. :mod:`aerpaw_cmp.propagation.reference` computes a few links of each replay from the settings: which paths there are,
-   H of every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
+2. :mod:`aerpaw_cmp.propagation.check.reference` computes a few links of each replay from the settings: its paths, H of
+   every element pair with foliage, RSS and rank. Both are float64: the difference is rounding.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import BoolArray, ComplexArray, FloatArray, IntArray
-from ..compare.field_difference import FieldAudit
-from ..site.site import Site
-from .arrays import Array, Isotropic, Link, Poses
-from .drivers.pairs import replay_pairs
-from .field.sum import channel_matrices
-from .image import planes_of
-from .options import Field, Search
-from .paths import Faces, PathSet
+from ...common.units import BoolArray, ComplexArray, FloatArray, IntArray
+from ...compare.field_difference import FieldAudit
+from ...site.site import Site
+from ..arrays import Array, Isotropic, Link, Poses
+from ..drivers.pairs import replay_pairs
+from ..field.sum import channel_matrices
+from ..options import Field, Search
+from ..paths import Faces, PathSet
+from ..replay import Replay
+from ..scene import Scene
+from ..search.mirror import planes_of
 from .reference import ExpectedArray, ExpectedLink, ExpectedLoss, Mirror, Reference, matrix_of
-from .replay import Replay
-from .scene import Scene
 
 POWER_TOLERANCE_DB = 0.05
 """Of one path in one pair of slants. Float32 coordinates move an angle of incidence by 1e-5; near Brewster's angle and
@@ -234,7 +234,7 @@ class _OneLink:
 
     def field_checked(self, ks: Sequence[float]) -> FieldAudit:
         """H, RSS and rank from the replay's own list of paths."""
-        from ..compare.rank import channel_rank
+        from ...compare.rank import channel_rank
 
         paths, replay = [], self.replay
         if replay.pairs_differ is not None and replay.pairs_differ[self.row, self.tower]:
@@ -383,7 +383,7 @@ def against_sionna(
     FieldAudit
         Counts and largest errors over the paths that both have.
     """
-    from .sionna import own_coefficients
+    from ..search.sionna import own_coefficients
 
     few = Poses(poses.position_m[chosen], poses.rotation[chosen])
     scene = Scene.of(site, link, few)
@@ -434,7 +434,7 @@ def per_pair(
     FieldAudit
         Links that differ, the largest change of level [dB], and ranks that change.
     """
-    from ..compare.rank import channel_rank
+    from ...compare.rank import channel_rank
 
     arrays = (link.uav_array, *link.tower_arrays.values())
     if not any(np.any(array.positions_m) for array in arrays):
@@ -465,7 +465,7 @@ EXPLICIT_SAMPLES = 50_000
 
 def _explicit(site: Site, link: Link, few: Poses, max_depth: int) -> FieldAudit:
     """H with each pair's own paths against Sionna's explicit arrays at short range."""
-    from .sionna import own_channels
+    from ..search.sionna import own_channels
 
     arrays = list(link.tower_arrays.values())
     names = {pattern.name for array in (*arrays, link.uav_array) for pattern in array.patterns}
@@ -513,7 +513,7 @@ def _probe(link: Link) -> tuple[Link, tuple[str, ...]]:
 
 def _matched(ours: PathSet, our_faces: Faces, theirs: PathSet, their_faces: Faces) -> tuple[IntArray, IntArray]:
     """Indices of the paths that both have."""
-    from .paths import joined
+    from ..paths import joined
 
     plane = planes_of(joined(our_faces, their_faces))
 

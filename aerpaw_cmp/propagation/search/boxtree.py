@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray
-from .numba_options import kernel
-from .surfaces import BoxTree
+from ...common.units import FloatArray
+from ..numba_options import kernel
+from ..surfaces import BoxTree
 
 DEEPEST = 64
 """Nodes that wait while a tree is walked: twice its depth for 4e9 items."""

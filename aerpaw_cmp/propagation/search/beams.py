@@ -17,16 +17,16 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray
+from ...common.errors import UsageError
+from ...common.units import BoolArray, FloatArray, IntArray
+from ..compiled import in_threads, thread_count
+from ..numba_options import kernel
+from ..paths import PathSet
+from ..surfaces import Surfaces
 from .boxtree import box_missed, box_outside, box_tree, within_planes
-from .compiled import in_threads, thread_count
 from .effort import Effort, Estimate, OnEstimate
-from .image import MINIMUM_LENGTH_M, merge
 from .merging import WINDOW
-from .numba_options import kernel
-from .paths import PathSet
-from .surfaces import Surfaces
+from .mirror import MINIMUM_LENGTH_M, merge
 
 SIDE_M = 1e-6
 """Closer to a plane than this [m] is on it."""
@@ -124,7 +124,7 @@ def grow_paths(
         Called once, before the first source is searched, with the estimate of time and memory.
     solids : bool
         The faces are those of closed solids: they reflect in front only, and a segment is cut beyond doubt or not at
-        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.prisms`, coincident ones among them.
+        all. What is found are candidates for :mod:`aerpaw_cmp.propagation.search.prisms`, coincident ones among them.
 
     Returns
     -------

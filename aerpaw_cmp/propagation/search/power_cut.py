@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray, amplitude_from_db
-from .paths import PathSet, path_lengths
+from ...common.units import FloatArray, amplitude_from_db
+from ..paths import PathSet, path_lengths
 
 CHECKED_POSES = 12
 """Poses, spread over the flight, that are searched without the cut."""

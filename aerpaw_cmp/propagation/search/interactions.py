@@ -14,11 +14,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db
-from .arrays import Link, Poses
-from .field.sum import radiated
-from .paths import PathSet
+from ...common.errors import UsageError
+from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, amplitude_from_db
+from ..arrays import Link, Poses
+from ..field.sum import radiated
+from ..paths import PathSet
 
 Interaction = Literal["reflection", "diffraction", "scattering", "refraction"]
 

@@ -14,14 +14,14 @@ from typing import Any
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray
-from ..site.site import Site, Tower
-from .arrays import Link, Poses
-from .field.sum import Fields, channel_matrices
-from .options import Field, Loss, Run, Search, Whole
-from .paths import Faces, PathSet
-from .replay import Replay, replay
+from ...common.errors import UsageError
+from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray
+from ...site.site import Site, Tower
+from ..arrays import Link, Poses
+from ..field.sum import Fields, channel_matrices
+from ..options import Field, Loss, Run, Search, Whole
+from ..paths import Faces, PathSet
+from ..replay import Replay, replay
 
 PLACES_AT_ONCE = 64
 """Places of a node in one block: H of a block has this many times the links that count."""
@@ -237,7 +237,7 @@ def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
     least = min(len(part.faces) for part in parts)
     if all(len(part.faces) == least for part in parts):
         return parts[0].faces, [part.paths for part in parts]
-    from .paths import joined
+    from ..paths import joined
 
     common = least if least == min(_shared(parts[0].faces, part.faces) for part in parts) else 0
     faces, out = _face_part(parts[0].faces, 0, common), []

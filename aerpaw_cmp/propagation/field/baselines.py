@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray, db_from_amplitude, wavelength_m
-from ..site.materials import material
-from .field.fresnel import reflection_coefficients
+from ...common.units import FloatArray, db_from_amplitude, wavelength_m
+from ...site.materials import material
+from .fresnel import reflection_coefficients
 
 
 def free_space_dbm(

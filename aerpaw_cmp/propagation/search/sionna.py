@@ -26,16 +26,16 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from ..common.errors import CheckError, UsageError
-from ..common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
-from ..machine.llvm import let_sionna_load, prepare_llvm
-from ..site.materials import material
-from .arrays import Array, Link, Poses
-from .faces import inside, triangles
-from .image import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
+from ...common.errors import CheckError, UsageError
+from ...common.units import AnyArray, BoolArray, ComplexArray, FloatArray, IntArray, wavelength_m
+from ...machine.llvm import let_sionna_load, prepare_llvm
+from ...site.materials import material
+from ..arrays import Array, Link, Poses
+from ..faces import inside, triangles
+from ..paths import Faces, PathSet, path_lengths
+from ..surfaces import Surfaces
 from .interactions import DIFFRACTED, REFLECTED, OtherPaths, OtherSearch
-from .paths import Faces, PathSet, path_lengths
-from .surfaces import Surfaces
+from .mirror import MINIMUM_LENGTH_M, Progress, images_of, merge, planes_of, scene_tolerance_m, trace_back
 
 SPECULAR_TABLE_SLOTS = 2**24
 FEWEST_SLOTS = 2**20
@@ -443,7 +443,7 @@ def find_paths(
     Parameters
     ----------
     faces, sources_m, targets_m, max_depth, usable, excluded, progress
-        As in :func:`aerpaw_cmp.propagation.image.find_paths`.
+        As in :func:`aerpaw_cmp.propagation.search.mirror.find_paths`.
     carrier_hz : float
         Sionna shoots by reflection power, so materials matter to what it finds.
     samples : int
@@ -483,7 +483,7 @@ def find_paths(
     )
     paths = merge(pieces, max_depth, faces if surfaces is None else None)
     if surfaces is not None:
-        from .growth import without_coincident
+        from .beams import without_coincident
 
         paths = without_coincident(paths, surfaces)
     return paths if excluded is None else paths.select(~excluded[paths.tower, paths.pose])
@@ -865,7 +865,7 @@ def _refine(
     for number in np.unique(depth[depth > 0]):
         some = np.flatnonzero(depth == number)
         if surfaces is not None:
-            from .growth import reflection_points
+            from .beams import reflection_points
 
             ends = (sources_m[tower[some]], targets_m[pose[some]])
             sequence[some, :number], vertices[some, :number], fits = reflection_points(

@@ -11,8 +11,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray, amplitude_from_db
-from .paths import Faces, PathSet
+from ...common.units import FloatArray, amplitude_from_db
+from ..paths import Faces, PathSet
 
 MOST_NAMED = 20
 """Objects that are named; the others are counted."""

@@ -1,14 +1,14 @@
 """Why a sequence of open surfaces makes no path: for explanations, one path at a time, every triangle asked in NumPy.
 
-The same rules as the search in :mod:`aerpaw_cmp.propagation.growth`, by other code.
+The same rules as the search in :mod:`aerpaw_cmp.propagation.search.beams`, by other code.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import FloatArray, IntArray
-from .surfaces import Surfaces
+from ...common.units import FloatArray, IntArray
+from ..surfaces import Surfaces
 
 NEAR_END_M = 1e-3
 """A surface closer to an antenna than this hides nothing."""
@@ -30,7 +30,7 @@ def why_not_there(surfaces: Surfaces, source_m: FloatArray, target_m: FloatArray
     str
         The first reason that was met.
     """
-    from .growth import EDGE_M, reflection_points  # compiled: loaded where there is a scene
+    from ..search.beams import EDGE_M, reflection_points  # compiled: loaded where there is a scene
 
     sequence = sequence[sequence >= 0]
     points = np.zeros((0, 3))

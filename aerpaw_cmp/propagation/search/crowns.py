@@ -22,15 +22,15 @@ from itertools import pairwise
 import numpy as np
 import shapely
 
-from ..common.units import BoolArray, FloatArray, IntArray
-from ..site.dem import Dem
-from ..site.materials import CROWN
-from ..site.meshes import CROWN_SIDES, crown_corners_m
-from ..site.site import Trees
-from .foliage import crown_index
-from .image import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, merge
-from .paths import Faces, PathSet, joined
-from .solids import Occlusion
+from ...common.units import BoolArray, FloatArray, IntArray
+from ...site.dem import Dem
+from ...site.materials import CROWN
+from ...site.meshes import CROWN_SIDES, crown_corners_m
+from ...site.site import Trees
+from ..field.foliage import crown_index
+from ..paths import Faces, PathSet, joined
+from .mirror import CELLS_PER_CHUNK, MINIMUM_LENGTH_M, RELATIVE_TOLERANCE, merge
+from .occlusion import Occlusion
 
 FACES_PER_CROWN = CROWN_SIDES + 1
 """Sides, then the bottom."""
@@ -181,7 +181,7 @@ class Crowns:
         return self._beams[key]
 
     def _tolerance_m(self, *points_m: FloatArray) -> float:
-        """As :func:`aerpaw_cmp.propagation.image.scene_tolerance_m`, with the crowns in the scene."""
+        """As :func:`aerpaw_cmp.propagation.search.mirror.scene_tolerance_m`, with the crowns in the scene."""
         sizes = [1.0, *(float(np.nanmax(np.abs(p), initial=0.0, where=np.isfinite(p))) for p in points_m)]
         sizes += [float(np.abs(facets.corners_m).max()) for facets in self._families]
         return RELATIVE_TOLERANCE * max(sizes)

@@ -20,10 +20,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..common.units import ComplexArray, FloatArray
-from .arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
-from .field.sum import channel_matrices
-from .paths import Faces, PathSet
+from ...common.units import ComplexArray, FloatArray
+from ..arrays import Array, Link, Poses, rotation_from_yaw_pitch_roll
+from ..field.sum import channel_matrices
+from ..paths import Faces, PathSet
 
 Ground = Literal["coherent", "power_sum"]
 """How the ground ray is added to the direct one."""

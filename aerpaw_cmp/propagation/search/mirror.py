@@ -8,9 +8,9 @@ For a sequence of faces ``f1 .. fd`` the source is mirrored face by face. A path
 
 A sequence is followed only while the beam from the image through its last face can still reach the next one.
 Sides are decided with a tolerance relative to the size of the scene, far above the rounding of a reflection point.
-A solid hides with its open inside (:mod:`aerpaw_cmp.propagation.solids`), so a path along a wall stays, and there is no
-crack between two walls. An end that lies on a face reflects there like one a hair before it: nothing jumps when a UAV
-lands.
+A solid hides with its open inside (:mod:`aerpaw_cmp.propagation.search.occlusion`), so a path along a wall stays, and
+there is no crack between two walls. An end that lies on a face reflects there like one a hair before it: nothing jumps
+when a UAV lands.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..common.errors import UsageError
-from ..common.units import BoolArray, FloatArray, IntArray
-from .faces import corners, inside
-from .paths import Faces, PathSet
-from .solids import Occlusion
+from ...common.errors import UsageError
+from ...common.units import BoolArray, FloatArray, IntArray
+from ..faces import corners, inside
+from ..paths import Faces, PathSet
+from .occlusion import Occlusion
 
 RELATIVE_TOLERANCE = 1e-12
 """Of the largest coordinate: some thousand times the rounding error of a plane equation."""

@@ -14,9 +14,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..common.units import IntArray
-from .image import planes_of
-from .paths import Faces, PathSet
+from ...common.units import IntArray
+from ..paths import Faces, PathSet
+from .mirror import planes_of
 
 Samples = int | Literal["auto"]
 

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..common.errors import InputError
-from ..common.units import BoolArray, FloatArray, IntArray
-from ..site.mitsuba import TriangleScene
+from ...common.errors import InputError
+from ...common.units import BoolArray, FloatArray, IntArray
+from ...site.mitsuba import TriangleScene
+from ..numba_options import kernel
+from ..paths import Faces
+from ..surfaces import Surfaces
 from .boxtree import box_tree, overlapping
-from .numba_options import kernel
-from .paths import Faces
-from .surfaces import Surfaces
 
 MERGE_M = 1e-3
 """Triangles whose corners lie within this of one plane [m] are one face. The files hold float32: 0.1 mm at 1 km."""

@@ -7,10 +7,15 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..common.units import FloatArray, IntArray
-from ..compare.field_difference import FieldAudit
-from ..site.site import Site
-from .arrays import Link, Poses
+from ...common.units import FloatArray, IntArray
+from ...compare.field_difference import FieldAudit
+from ...site.site import Site
+from ..arrays import Link, Poses
+from ..options import Engine, Field, Run, Search
+from ..paths import PathSet, joined
+from ..replay import Replay
+from ..replay import replay as run_replay
+from ..search.mirror import planes_of
 from .field_audit import (
     REFERENCE_LINKS,
     Expected,
@@ -20,11 +25,6 @@ from .field_audit import (
     per_pair,
     spread_over_paths,
 )
-from .image import planes_of
-from .options import Engine, Field, Run, Search
-from .paths import PathSet, joined
-from .replay import Replay
-from .replay import replay as run_replay
 
 FIELD_SAMPLES = 100_000
 """Rays of the solve that gives Sionna's own coefficients: which paths there are is asked before, with all of them."""
@@ -137,7 +137,7 @@ class Second:
     Parameters
     ----------
     expected : Expected, optional
-        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.field_audit`).
+        What the settings say. With it fields are checked too (:mod:`aerpaw_cmp.propagation.check.field_audit`).
     ks : sequence of float
         Singular-value ratios of the rank comparison.
     reference_links : int
@@ -267,7 +267,7 @@ def compare(replay: Replay, reference: Replay, chosen: IntArray, ks: Sequence[fl
 
 
 def _rank_disagreement(h: object, reference: object, ks: Sequence[float]) -> dict[float, float]:
-    from ..compare.rank import channel_rank
+    from ...compare.rank import channel_rank
 
     return {float(k): float(np.mean(channel_rank(h, k) != channel_rank(reference, k))) for k in ks}  # type: ignore[arg-type]
 

@@ -14,9 +14,9 @@ import numpy as np
 import shapely
 from shapely.geometry import Polygon
 
-from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
-from .faces import corners
-from .paths import Faces
+from ...common.units import AnyArray, BoolArray, FloatArray, IntArray
+from ..faces import corners
+from ..paths import Faces
 
 CELLS_PER_CHUNK = 1_000_000
 """Segment-solid pairs looked at at once."""

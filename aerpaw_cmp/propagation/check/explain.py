@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from ..common.units import (
+from ...common.units import (
     SPEED_OF_LIGHT_MPS,
     AnyArray,
     FloatArray,
@@ -22,16 +22,16 @@ from ..common.units import (
     power_from_db,
     wavelength_m,
 )
-from .arrays import Link, Poses
-from .field.fresnel import FaceMaterials, reflection_coefficients
-from .field.geometry import Elements, geometry
-from .field.sum import amplitudes, pattern_ends
-from .image import images_of, scene_tolerance_m, trace_back
+from ..arrays import Link, Poses
+from ..field.fresnel import FaceMaterials, reflection_coefficients
+from ..field.geometry import Elements, geometry
+from ..field.sum import amplitudes, pattern_ends
+from ..paths import Faces, PathSet
+from ..replay import Replay
+from ..search.mirror import images_of, scene_tolerance_m, trace_back
+from ..search.occlusion import Occlusion
+from ..surfaces import Surfaces
 from .obstacles import first_obstacle, why_not_there
-from .paths import Faces, PathSet
-from .replay import Replay
-from .solids import Occlusion
-from .surfaces import Surfaces
 
 EDGE_M = 1e-3
 """A point this near the edge of its face, or a segment this near a building, is beyond what float32 can decide."""

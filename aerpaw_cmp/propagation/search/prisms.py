@@ -1,24 +1,24 @@
 """Thousands of prisms: candidates by compiled beams, decided by the exact rules of the image engine.
 
-The beams of :mod:`aerpaw_cmp.propagation.growth` are cut with tolerances a thousand times wider than those that decide,
-and a candidate is given up only where a segment runs through the middle of a wall or roof. What is left, hardly more
-than the paths, is decided as in :mod:`aerpaw_cmp.propagation.image`, so both have the same paths.
+The beams of :mod:`aerpaw_cmp.propagation.search.beams` are cut with tolerances a thousand times wider than those that
+decide, and a candidate is given up only where a segment runs through the middle of a wall or roof. What is left, hardly
+more than the paths, is decided as in :mod:`aerpaw_cmp.propagation.search.mirror`, so both have the same paths.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from ..common.units import BoolArray, FloatArray
+from ...common.units import BoolArray, FloatArray
+from ..faces import corners, triangles
+from ..paths import Faces, PathSet
+from ..surfaces import Surfaces
+from .beams import Progress, grow_paths
 from .boxtree import box_tree
 from .effort import Effort, OnEstimate
-from .faces import corners, triangles
-from .growth import Progress, grow_paths
-from .image import images_of, merge, planes_of, scene_tolerance_m, trace_back
 from .merging import WINDOW
-from .paths import Faces, PathSet
-from .solids import Occlusion
-from .surfaces import Surfaces
+from .mirror import images_of, merge, planes_of, scene_tolerance_m, trace_back
+from .occlusion import Occlusion
 
 REACH = 10.0
 """The ground is searched to this many times the largest coordinate: no reflection point lies further out."""
@@ -41,7 +41,7 @@ def find_paths(
     progress: Progress | None = None,
     on_estimate: OnEstimate | None = None,
 ) -> tuple[PathSet, Effort]:
-    """As :func:`aerpaw_cmp.propagation.image.find_paths`, for scenes with too many sequences for it.
+    """As :func:`aerpaw_cmp.propagation.search.mirror.find_paths`, for scenes with too many sequences for it.
 
     Parameters
     ----------

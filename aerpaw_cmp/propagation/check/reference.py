@@ -19,8 +19,8 @@ import numpy as np
 import shapely
 from shapely.geometry import LineString, Point, Polygon
 
-from ..common.units import ComplexArray, FloatArray
-from ..site.site import Site, Tower, Trees
+from ...common.units import ComplexArray, FloatArray
+from ...site.site import Site, Tower, Trees
 
 Vector = tuple[float, float, float]
 Matrix = tuple[Vector, Vector, Vector]

@@ -437,7 +437,8 @@ class TranscriptFramer:
         final = final_result(text)
         if final is not None:
             self._end(final[0], final[1], events, even_empty=True)
-        elif _ECHO.match(text):
+            return
+        if _ECHO.match(text):
             self._end("cut", None, events)
             self._command = text
         elif self._command is None and is_unsolicited(text):

@@ -487,10 +487,11 @@ def read_log(source: Path, bad: list[BadLine] | None = None) -> Iterator[Record]
             lines = path.read_bytes().split(b"\n")
         except OSError as error:
             raise InputError(f"cannot be read ({error.strerror})", expected="a tap log", path=path) from None
-        tail = len(lines)
         for number, line in enumerate(lines, 1):
             try:
-                if line.strip():
-                    yield decode_record(line)
+                record = decode_record(line) if line.strip() else None
             except ValueError as error:
-                bad.append(BadLine(path, number, str(error), number == tail))
+                bad.append(BadLine(path, number, str(error), number == len(lines)))
+                continue
+            if record is not None:
+                yield record

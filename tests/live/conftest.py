@@ -53,27 +53,28 @@ class Browser:
     """Reads the events of a page, or takes nothing; comes back when it is dropped."""
 
     def __init__(self, port, *, reads=True):
-        self.messages, self.connections = [], 0
+        self.messages, self.connections, self._cursor = [], 0, ""
         self._port, self._reads, self._stop = port, reads, threading.Event()
         self._thread = threading.Thread(target=self._run, daemon=True)
         self._thread.start()
 
     def _run(self):
-        cursor = ""
-        while not self._stop.is_set():
+        while not self._stop.wait(0.05):
             with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", self._port), 5) as link:
-                link.sendall(f"GET /events?from={cursor} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
+                link.sendall(f"GET /events?from={self._cursor} HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n".encode())
                 self.connections += 1
-                if not self._reads:
-                    self._stop.wait()
-                    return
-                link.settimeout(0.5)
-                for line in link.makefile("r", encoding="ascii"):
-                    if line.startswith("id: "):
-                        cursor = line[4:].strip()
-                    elif line.startswith("data: "):
-                        self.messages.append(json.loads(line[6:]))
-            self._stop.wait(0.05)
+                self._read(link)
+
+    def _read(self, link):
+        if not self._reads:
+            self._stop.wait()
+            return
+        link.settimeout(0.5)
+        for line in link.makefile("r", encoding="ascii"):
+            if line.startswith("id: "):
+                self._cursor = line[4:].strip()
+            elif line.startswith("data: "):
+                self.messages.append(json.loads(line[6:]))
 
     def close(self):
         self._stop.set()

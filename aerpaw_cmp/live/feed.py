@@ -40,7 +40,7 @@ STEP_SHOWN_S = 30.0
 
 MEASURED = ("t", "rank", "rsrp", "sinr")
 PREDICTED = ("t", "rank", "predicted", "low", "high", "rsrp", "level", "level_low", "level_high", "east", "north", "up")
-_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, OverflowError)
+_MALFORMED = (KeyError, TypeError, ValueError, AttributeError, ArithmeticError)
 """Faults that a crafted record of a played log can raise: the record is left out."""
 _CURSOR = re.compile(r"([0-9a-f]{8})((?:-[0-9]{1,9}){1,33})")
 
@@ -279,10 +279,11 @@ class Feed:
         decoded = record.get("decoded") or {}
         if record["query"] == "servingcell":
             cell = decoded.get("nr") or {}
-            modem.rsrp_dbm, modem.sinr_db = cell.get("rsrp_dbm"), cell.get("sinr_db")
+            modem.rsrp_dbm, modem.sinr_db = _finite(cell.get("rsrp_dbm")), _finite(cell.get("sinr_db"))
         elif record["query"] == RI_QUERY:
             t = self._seconds(modem, (record["sent_mono_ns"] + record["last_mono_ns"]) // 2)
-            modem.rank = decoded.get("rank")
+            rank = _finite(decoded.get("rank"))
+            modem.rank = None if rank is None else int(rank)
             if modem.rank is not None:
                 modem.rank_s = t
             if record["status"] == "ok":
@@ -295,9 +296,9 @@ class Feed:
         t = next((t for sent, t in modem.sent if sent == record["for_sent_utc_ns"]), None)
         if t is None:
             return
-        modem.age_s, modem.delay_s = record.get("telemetry_age_s"), record.get("telemetry_delay_s")
-        modem.fix, modem.inside = record.get("fix"), record.get("inside")
-        modem.offset_db = record.get("offset_db")
+        modem.age_s, modem.delay_s = _finite(record.get("telemetry_age_s")), _finite(record.get("telemetry_delay_s"))
+        modem.fix, modem.offset_db = _finite(record.get("fix")), _finite(record.get("offset_db"))
+        modem.inside = [int(count) for count in record.get("inside") or ()] or None
         if record.get("east_m") is not None and not (modem.fix is not None and 0 <= modem.fix < 3):
             modem.gps_s = t
         low, high = record.get("rank_interval") or (None, None)
@@ -356,6 +357,11 @@ class Feed:
                 if kind not in modem.open:
                     modem.open[kind], changed = self._raise(modem, kind, text), True
         return changed
+
+
+def _finite(value: Any) -> float | None:
+    """A number of a record; None for what is none, as a crafted log may hold."""
+    return value if isinstance(value, (int, float)) and math.isfinite(value) else None
 
 
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:

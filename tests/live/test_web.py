@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import contextlib
 import http.client
+import json
 import math
 import random
 import socket
@@ -474,9 +475,16 @@ def test_crafted_records_of_a_log_are_left_out():
         {"kind": "clock", "mono_ns": "x"},
         {"kind": "prediction", "for_sent_utc_ns": []},
         {"kind": ["header"]},
+        {"kind": "header", "utc_ns": hand.now_ns, "mono_ns": 0, "port": {}, "settings": {"ri_hz": 0}},
         {},
     ):  # fmt: skip
         hand.put(record)
+    hand.answer(query="servingcell", nr={"rsrp_dbm": math.nan, "sinr_db": "12"})
+    hand.predict(hand.answer(rank=3), offset_db=math.inf, telemetry_delay_s="late", level_dbm=1.0, inside=[math.nan])
+    hand.predict(hand.answer(rank=3), offset_db=math.inf, telemetry_delay_s="late", level_dbm=1.0)
+    message = hand.feed.after("")[0]
+    json.dumps(message, allow_nan=False)
+    assert (message["modems"][0]["rsrp_dbm"], message["modems"][0]["offset_db"]) == (None, None)
     hand.answer(rank=3)
     assert rows_of(hand.feed.after("")[0])[-1, 1] == 3
 

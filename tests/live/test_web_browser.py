@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
 import signal
@@ -255,6 +256,39 @@ def test_it_comes_back_by_itself_and_refills(driver, fly):
     times = driver.execute_script("return live.state.modems[0].rows.columns.t")
     assert np.allclose(np.diff(times), 500.0, atol=1.0)  # none missing, none twice
     until(driver, "live.poses().length === 13")
+
+
+def browsers_of(driver):
+    """Processes of the browser: all that come of chromedriver."""
+    parents = {}
+    for folder in Path("/proc").iterdir():
+        if folder.name.isdigit():
+            with contextlib.suppress(OSError):
+                parents[int(folder.name)] = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
+    found = [driver.service.process.pid]
+    for pid in found:
+        found += [child for child, parent in parents.items() if parent == pid]
+    return found[1:]
+
+
+def test_a_browser_that_is_stopped_misses_nothing(driver, fly):
+    flight = fly(background=made_map())
+    flight.fly(6)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 6")
+    stopped = browsers_of(driver)
+    assert stopped
+    try:
+        for pid in stopped:
+            os.kill(pid, signal.SIGSTOP)
+        for _ in range(20):
+            flight.fly(50)
+            time.sleep(0.1)
+    finally:
+        for pid in stopped:
+            os.kill(pid, signal.SIGCONT)
+    until(driver, "live.state.modems[0].rows.columns.t.length === 1006")
+    times = driver.execute_script("return live.state.modems[0].rows.columns.t")
+    assert np.allclose(np.diff(times), 500.0, atol=1.0)
 
 
 def test_a_tap_that_is_started_anew_goes_on_in_the_same_page(driver, fly):

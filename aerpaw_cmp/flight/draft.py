@@ -18,6 +18,7 @@ from ..common.yamlfile import parse_yaml
 from ..logs.ingest import IngestedFile, read_log
 from ..logs.records import Stream, has_wall_clock
 from ..site.siteyaml import load_site
+from .cross_checks import questions
 from .data import is_ratio
 from .dry_run import DryRun, dry_run
 from .grouping import flights
@@ -77,11 +78,18 @@ def draft(
         If no log has what a flight needs.
     """
     flown = _flown(files)
+    every = [stream for file in files for stream in file.result.streams]
     entries = _Entries(
-        folder, flown, _has_level(files, flown), time_origin, dict(mapping or {}),
-        positioned=any(_has_positions(s) for file in files for s in file.result.streams),
-        placer=_placer(files, flown), locks=any(may_lose_lock(s) for file in files for s in file.result.streams),
-    )  # fmt: skip
+        folder=folder,
+        flown=flown,
+        has_level=_has_level(files, flown),
+        time_origin=time_origin,
+        mapping=dict(mapping or {}),
+        timezone=timezone,
+        positioned=any(_has_positions(stream) for stream in every),
+        placer=_placer(files, flown),
+        locks=any(may_lose_lock(stream) for stream in every),
+    )
     for file in sorted(files, key=lambda f: (not entries.leads(f), -_samples(f))):  # of copies, the fullest
         entries.enter(file)
     entries.sort(files)
@@ -285,6 +293,7 @@ class _Entries:
     time_origin: str | None
     mapping: dict[str, Any]
     """Of generic CSVs."""
+    timezone: str | None = None
     lines: dict[str, str] = field(default_factory=dict)
     """By the path as it was given."""
     kinds: set[str] = field(default_factory=set)
@@ -334,8 +343,9 @@ class _Entries:
         streams = [s for s in file.result.streams if s.kind != "kpi"]  # no report compares these
         entry, asked = _entry(file, path)
         origin = None if self.time_origin else self._origin(streams)
-        if asked and self.placer is not None:
-            asked = self._place(entry, asked, [s for s in streams if s.kind == "rss" and not is_ratio(s)], self.placer)
+        if self.placer is not None:
+            levels = [s for s in streams if s.kind == "rss" and not is_ratio(s)]
+            asked = self._place(entry, asked, levels, self.placer) if asked else self._doubt(entry, levels, self.placer)
         refused = self._refused(streams, entry, shown, dated=origin is not None)
         kept = [s for s in streams if s.name not in refused]
         reasons = list(dict.fromkeys(refused.values()))
@@ -376,6 +386,8 @@ class _Entries:
             )
         if any(is_ratio(s) for s in kept):
             asked = _also(asked, "a ratio to the noise as a level?")
+        for question in questions(file, kept, self.timezone):
+            asked = _also(asked, question)
         self.lines[file.path] = f"  - {_flow(entry)}{asked}\n"
         if self.placer is not None:
             self.offsets_db += [o for s in kept if (o := self._offset_db(s, entry, self.placer)) is not None]
@@ -399,6 +411,15 @@ class _Entries:
                 return f"  # {place.question}" if place.tower is None and place.question else ""
             entry["cells"][pci] = place.node
         return asked
+
+    def _doubt(self, entry: Mapping[str, Any], levels: Sequence[Stream], placer: Placer) -> str:
+        """Ask about a tower that a name gives and the levels contradict."""
+        for level in levels:
+            node = str(entry.get("node") or level.attributes.get("node"))
+            other = placer.contradiction(placer.levels(level, self._floor_db(level)), node)
+            if other is not None:
+                return f"  # the name says {node}, the levels fit {other} far better: which tower?"
+        return ""
 
     def _floor_db(self, level: Stream) -> float:
         if self.locks and is_sounder_power(level):

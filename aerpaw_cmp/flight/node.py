@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from ..common.units import FloatArray
-from ..compare.locate import FEWEST, LevelTrack, level_track, locate
+from ..compare.locate import FEWEST, LevelTrack, fit_places, level_track, locate
 from ..logs.records import Stream
 from ..propagation.field.baselines import free_space_dbm
 from ..site.site import Site
@@ -20,6 +20,9 @@ from .track import Track
 
 TOWER_ODDS = 2.0
 """Log odds from which on a tower of the site is taken; the surveyed flights give 2.8 to 4.7, others at most 1.0."""
+
+CONTRADICTED = 8.0
+"""Log evidence by which another tower must explain the levels better before a named one is doubted."""
 
 UNDECIDED = 3.0
 """Places of a list whose log odds differ by less are both named."""
@@ -134,6 +137,15 @@ class Placer:
             f"path-loss exponent {estimate.slope:.1f} +- {2 * estimate.slope_sd:.1f}: where did the node stand?"
         )
         return self._node(estimate.place_m, float(latitude[0]), float(longitude[0]), float(estimate.place_m[2]), about)
+
+    def contradiction(self, track: LevelTrack, node: str) -> str | None:
+        """Tower that the levels fit far better than the one that is named; None where none does."""
+        if node not in self.site.towers or len(track.level_db) < FEWEST:
+            return None
+        names = list(self.site.towers)
+        evidence = fit_places(track, [self.site.towers[name].position_m for name in names]).evidence
+        best = int(evidence.argmax())
+        return names[best] if evidence[best] > evidence[names.index(node)] + CONTRADICTED else None
 
     def offset_db(self, track: LevelTrack, node: str) -> float | None:
         """Median of free space over the draft's link minus the level [dB]; None for an unknown node."""

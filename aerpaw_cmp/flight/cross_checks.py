@@ -1,0 +1,124 @@
+"""Questions about a log: what its name, files beside it or the ground at take-off contradict; what is assumed."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Sequence
+from datetime import datetime, timedelta, tzinfo
+from datetime import timezone as zones
+from pathlib import Path
+from zoneinfo import ZoneInfo
+
+import numpy as np
+
+from ..logs.ingest import IngestedFile
+from ..logs.records import Stream, has_wall_clock
+
+_IN_NAME = re.compile(
+    r"(?<!\d)(20\d\d)[-_]?([01]\d)[-_]?([0-3]\d)(?:[T_ -]([0-2]\d)[-_:]?([0-5]\d)(?:[-_:]?([0-5]\d))?)?(?!\d)"
+)
+_NEMO_START = re.compile(r"^Measurement start;(\d{4} \w{3} \d\d \d\d:\d\d)", re.MULTILINE)
+
+_OF_THE_DAY = timedelta(hours=36)
+"""A name with a date alone may be local or UTC, and of the start or the end."""
+
+_OF_THE_MINUTE = timedelta(minutes=15)
+"""A program is started before its radio is."""
+
+GROUND_M = 5.0
+"""A track whose lowest height [m] is farther from 0 does not begin at its take-off."""
+
+
+def questions(file: IngestedFile, kept: Sequence[Stream], timezone: str | None) -> list[str]:
+    """Questions of a draft about the streams of a log that it keeps, each with both values.
+
+    Parameters
+    ----------
+    file : IngestedFile
+    kept : sequence of Stream
+    timezone : str or None
+        Of clocks without a zone.
+    """
+    asked = []
+    start = _start(kept)
+    if start is not None:
+        zone = ZoneInfo(timezone) if timezone else None
+        told = [*_name_starts(file.path), *_summary_starts(Path(file.path))]
+        asked += [
+            f"{where} says {said:{form}}, the log begins at {start:%Y-%m-%d %H:%M} UTC: which is right?"
+            for where, said, form, slack in told
+            if _apart(said, start, zone, exact=slack == _OF_THE_MINUTE) > slack
+        ]
+        if any(s.attributes.get("clock_from") == "assumed" for s in kept):
+            asked.append(f"the times are read as {_source(kept, 'clock') or 'local wall time'}: right?")
+    if any(s.attributes.get("height_from") == "assumed" for s in kept):
+        asked.append(f"the heights are read as {_source(kept, 'height') or 'above take-off'}: right?")
+    for stream in kept:
+        if stream.kind == "telemetry" and (low := _lowest_m(stream)) is not None and abs(low) > GROUND_M:
+            asked.append(f"the lowest height is {low:.0f} m, expected 0 m: does the track begin in the air?")
+    return list(dict.fromkeys(asked))
+
+
+def _start(kept: Sequence[Stream]) -> datetime | None:
+    times = [s.frame["time"].min() for s in kept if len(s.frame) and s.frame["time"].notna().any()]
+    if not times or not has_wall_clock(np.datetime64(min(times))):
+        return None
+    first: datetime = min(times).to_pydatetime().replace(tzinfo=zones.utc)
+    return first
+
+
+def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:
+    """Date, or date and time, in the name of a file."""
+    starts = []
+    for match in _IN_NAME.finditer(Path(path).name):
+        parts = [int(part) for part in match.groups() if part is not None]
+        try:
+            said = datetime(*parts, tzinfo=zones.utc)  # type: ignore[misc, arg-type]
+        except ValueError:
+            continue
+        exact = len(parts) > 3
+        starts.append(
+            (
+                "the file's name",
+                said,
+                "%Y-%m-%d %H:%M" if exact else "%Y-%m-%d",
+                _OF_THE_MINUTE if exact else _OF_THE_DAY,
+            )
+        )
+    return starts
+
+
+def _summary_starts(path: Path) -> list[tuple[str, datetime, str, timedelta]]:
+    """Start of the measurement in a Nemo summary beside a log."""
+    starts = []
+    stem = path.name.split(".")[0]
+    for beside in sorted(path.parent.glob("*.csv")) if path.parent.is_dir() else []:
+        if beside == path or not beside.name.startswith(stem) or not beside.is_file():
+            continue
+        with beside.open("rb") as stream:
+            head = stream.read(2000).decode("utf-8", "replace")
+        if (match := _NEMO_START.search(head)) is not None:
+            said = datetime.strptime(match[1], "%Y %b %d %H:%M").replace(tzinfo=zones.utc)
+            starts.append((f"Measurement start in {beside.name}", said, "%Y-%m-%d %H:%M", _OF_THE_MINUTE))
+    return starts
+
+
+def _apart(said: datetime, start: datetime, zone: tzinfo | None, *, exact: bool) -> timedelta:
+    """Least distance of a time from the start, read as UTC and as local; without a zone in any zone."""
+    if not exact:
+        return abs(start - said - timedelta(hours=12))
+    if zone is not None:
+        offset = start.astimezone(zone).utcoffset() or timedelta(0)
+        return min(abs(start - said), abs(start + offset - said))
+    return min(abs(start - said + timedelta(minutes=30 * half)) for half in range(-28, 29))
+
+
+def _source(kept: Sequence[Stream], what: str) -> str:
+    sources = [s.attributes.get(f"{what}_source") for s in kept if s.attributes.get(f"{what}_from") == "assumed"]
+    return next((str(source) for source in sources if source), "")
+
+
+def _lowest_m(stream: Stream) -> float | None:
+    height = stream.frame["altitude_m"].to_numpy(np.float64)
+    height = height[np.isfinite(height)]
+    return float(np.percentile(height, 1.0)) if len(height) else None

@@ -1,0 +1,105 @@
+"""What contradicts a log is a question with both values; what agrees is none."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from aerpaw_cmp.flight.cross_checks import questions
+from aerpaw_cmp.flight.node import Placer
+from aerpaw_cmp.logs.ingest import IngestedFile
+from aerpaw_cmp.logs.records import COLUMNS, ReadResult, Stream
+from aerpaw_cmp.site.siteyaml import load_site
+
+ZONE = "America/New_York"
+
+
+def _log(path: Path | str, start: str, *, low_m: float = 0.0, **attributes: str) -> IngestedFile:
+    rows = 300
+    time = np.datetime64(start, "ns") + np.arange(rows) * np.timedelta64(1, "s")
+    frame = pd.DataFrame({"time": time, "line": np.arange(rows) + 1, "flag": ""})
+    height = np.concatenate([np.full(10, low_m), np.linspace(low_m, low_m + 40.0, rows - 10)])
+    frame = frame.assign(**dict.fromkeys(COLUMNS["telemetry"], 0.0)).assign(altitude_m=height)
+    stream = Stream("telemetry", "vehicle", frame, attributes)
+    return IngestedFile(str(path), "0" * 64, ReadResult("made_up", (stream,), rows, rows, 0))
+
+
+def _asked(file: IngestedFile, timezone: str | None = ZONE) -> list[str]:
+    return questions(file, file.result.streams, timezone)
+
+
+@pytest.mark.parametrize(
+    ("name", "start", "asked"),
+    [
+        ("2023-12-13_12_33_02_power_log.txt", "2023-12-13T17:33:07", False),  # local
+        ("2023-12-13_12_33_02_power_log.txt", "2023-12-13T12:33:07", False),  # UTC
+        ("2023-12-13_12_33_02_power_log.txt", "2023-12-13T21:33:07", True),
+        ("2023-12-13_12_33_02_power_log.txt", "2023-12-14T17:33:07", True),
+        ("july2_2024-07-02.csv", "2024-07-02T15:37:11", False),
+        ("july2_2024-07-02.csv", "2009-02-24T15:37:11", True),
+        ("results_20230230_1.csv", "2024-07-02T15:37:11", False),  # no date
+        ("plain.csv", "2024-07-02T15:37:11", False),
+        ("2023-12-13_12_33_02.txt", "1970-01-01T00:00:00", False),  # relative times
+    ],
+)
+def test_the_name_of_a_file_is_compared_with_its_start(name: str, start: str, asked: bool) -> None:
+    found = _asked(_log(name, start))
+    assert bool(found) is asked
+    if asked:
+        assert start.replace("T", " ")[:16] in found[0]
+        assert "the file's name says 20" in found[0]
+
+
+@pytest.mark.parametrize(("start", "asked"), [("2024-02-09T22:20:56", False), ("2009-02-24T22:20:56", True)])
+def test_a_nemo_summary_beside_a_log_is_compared_with_its_start(tmp_path: Path, start: str, asked: bool) -> None:
+    (tmp_path / "24Feb09_172055.1.csv").write_text("guid\nDevice ID;1\nMeasurement start;2024 Feb 09 17:20\n")
+    (tmp_path / "other.csv").write_text("Measurement start;2001 Jan 01 17:20\n")
+    found = _asked(_log(tmp_path / "24Feb09_172055.1.gpx", start))
+    assert bool(found) is asked
+    if asked:
+        assert "Measurement start in 24Feb09_172055.1.csv says 2024-02-09 17:20" in found[0]
+
+
+@pytest.mark.parametrize(("low_m", "asked"), [(0.4, False), (-2.0, False), (24.3, True), (110.0, True), (-40.0, True)])
+def test_a_track_that_does_not_begin_on_the_ground_is_asked_about(low_m: float, asked: bool) -> None:
+    found = _asked(_log("plain.csv", "2024-07-02T15:00:00", low_m=low_m))
+    assert bool(found) is asked
+    if asked:
+        assert f"the lowest height is {low_m:.0f} m" in found[0]
+
+
+def test_what_is_assumed_is_asked_and_what_is_written_is_not() -> None:
+    log = _log("plain.csv", "2024-07-02T15:00:00", clock_from="assumed", clock_source="local wall time",
+               height_from="assumed", height_source="above take-off")  # fmt: skip
+    clock, height = _asked(log)
+    assert "read as local wall time" in clock
+    assert "read as above take-off" in height
+    assert not _asked(_log("plain.csv", "2024-07-02T15:00:00", clock_from="written", height_from="program"))
+
+
+def test_levels_doubt_a_named_tower_only_where_another_fits_far_better() -> None:
+    site = load_site("lake_wheeler")
+    names = list(site.towers)
+    start = np.array(site.towers["LW1"].position_m)
+    along = np.linspace(0.0, 5.0, 500)
+    leg, part = np.divmod(along, 1.0)
+    east = start[0] + 400.0 * np.where(leg % 2 == 0, part, 1.0 - part) - 200.0
+    north = start[1] + 80.0 * leg - 200.0
+    latitude, longitude = site.frame.to_geographic(east, north)
+    log = _log("plain.csv", "2024-07-02T15:00:00")
+    frame = log.result.streams[0].frame
+    frame = pd.DataFrame({name: np.resize(frame[name].to_numpy(), 500) for name in frame.columns})
+    time = np.datetime64("2024-07-02T15:00:00", "ns") + np.arange(500) * np.timedelta64(1, "s")
+    frame = frame.assign(time=time, latitude_deg=latitude, longitude_deg=longitude, altitude_m=30.0)
+    placer = Placer(site, Stream("telemetry", "vehicle", frame))
+    away = np.linalg.norm(np.column_stack([east, north, np.full(500, 30.0)]) - start, axis=1)
+    level = frame[["time", "line", "flag"]].assign(rss_db=-60.0 - 30.0 * np.log10(away / 100.0))
+    track = placer.levels(Stream("rss", "power", level))
+    assert placer.contradiction(track, "LW1") is None
+    doubts = [placer.contradiction(track, name) for name in names if name != "LW1"]
+    assert "LW1" in doubts
+    assert set(doubts) <= {None, "LW1"}
+    assert placer.contradiction(track, "elsewhere") is None

@@ -10,10 +10,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-
-from . import _frames, _lines, _rows, _time
 
 NEAR_S = 0.5
 """An attitude farther in time than this from a position is not that of the position."""

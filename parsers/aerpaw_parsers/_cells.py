@@ -8,9 +8,9 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Stream
-
-from . import _lines, _rows
 
 RATS = ("", "lte", "nr")
 """Radio accesses; the first where a log does not say."""

@@ -7,9 +7,10 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Stream
 
-from . import _rows, _sheet
+from . import _sheet
 
 LATITUDE = (r"(osd |gps )?(lat|latitude)( deg| degrees)?", r".* (lat|latitude)")
 LONGITUDE = (r"(osd |gps )?(lon|lng|long|longitude)( deg| degrees)?", r".* (lon|lng|longitude)")

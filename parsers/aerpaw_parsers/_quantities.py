@@ -7,9 +7,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.records import Attribute, Kind, Stream
-
-from . import _rows
 
 
 @dataclass(frozen=True)

@@ -15,10 +15,12 @@ from functools import cache, cached_property
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, FloatArray, IntArray
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _lines, _rows, _stamps
+from . import _stamps
 from ._quantities import plain
 
 SEPARATORS = (",", ";", "\t", "|")

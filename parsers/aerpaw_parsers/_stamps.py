@@ -12,9 +12,8 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs.readers import ReadOptions
-
-from . import _time
 
 _CLOCK = r"[T _,]{0,2}(\d{1,2})[:.](\d\d)(?:[:.](\d\d(?:[.,:]\d{1,9})?))? ?([AaPp][Mm])?"
 _ZONE = r" ?(Z|UTC|GMT|[+-]\d\d:?\d\d)?"
@@ -103,7 +102,7 @@ def read(texts: Sequence[str], options: ReadOptions, *, unit: str | None = None)
     Returns
     -------
     clock : str
-        As :func:`_rows.times` takes it.
+        As :func:`aerpaw_cmp.logs.rows.times` takes it.
     cells : array, shape (n,)
         Bytes or floats for it.
     warnings : list of str

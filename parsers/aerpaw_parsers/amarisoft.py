@@ -16,10 +16,13 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _json, _lines, _rows, _time
+from . import _json
 
 _STAMP = rb"^\[(" + _time.TIME + rb")\] *"
 _TITLE = re.compile(

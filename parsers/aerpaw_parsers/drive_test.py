@@ -15,22 +15,12 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from aerpaw_cmp.common.units import FloatArray
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import (
-    _cells,
-    _lines,
-    _nemo,
-    _pose,
-    _quantities,
-    _rows,
-    _sheet,
-    aadm_snr,
-    own_csv,
-    pose_csv,
-    quectel_ri,
-)
+from . import _cells, _nemo, _pose, _quantities, _sheet, aadm_snr, own_csv, pose_csv, quectel_ri
 
 _PCI = re.compile(r"\b(\w{0,5}pci|pcid|pcell id|physical cell (id|identity)|phys(ical)? ?cell ?id|nci pci)\b")
 _ARFCN = re.compile(r"\b(nr ?|e ?|u ?)?arfcn\b|\bchannel number\b|\bfreq(uency)? channel\b")

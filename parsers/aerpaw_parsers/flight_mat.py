@@ -20,12 +20,13 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs.matfile import MAGIC as _MAGIC
 from aerpaw_cmp.logs.matfile import MAGIC_73, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import Attribute, ReadResult, RejectedLine, Stream
-
-from . import _frames, _lines, _time
 
 TELEMETRY = {
     "mX": "longitude_deg",

@@ -16,10 +16,12 @@ import pandas as pd
 
 from aerpaw_cmp.common.errors import InputError, UsageError
 from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
-from . import _frames, _lines, _time
 from ._sheet import SEPARATORS
 
 EXTRA = ("rsrp_dbm", "sinr_db", "cqi", "mcs", "latitude_deg", "longitude_deg", "altitude_m")

@@ -11,10 +11,12 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine
 
-from . import _lines, _pose, _rows, _stamps
+from . import _pose, _stamps
 
 _N = rb"(" + _lines.NUMBER + rb")"
 _POINT = re.compile(rb"<(?:trkpt|wpt|rtept)\b([^<>]{0,200})>(.{0,2000}?)(?:</(?:trkpt|wpt|rtept)>)", re.DOTALL)

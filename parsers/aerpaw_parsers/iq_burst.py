@@ -12,11 +12,14 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs.matfile import MAGIC, read_arrays
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _frames, _lines, _time, flight_mat
+from . import flight_mat
 
 _NAME = re.compile(r"(\d{6,12})(?:\.0)?_(\d{4,10})(?:\.0)?_(\d{4})_(\d\d)_(\d\d)_(\d\d)_(\d\d)_(\d\d)_?(\d{3,6})?")
 

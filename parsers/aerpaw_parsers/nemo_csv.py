@@ -11,9 +11,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
 
-from . import _lines, _nemo, _quantities, _rows, _text
+from . import _nemo, _quantities
 
 _COLUMNS = ("latitude_deg", "longitude_deg", "altitude_m", "ri_raw", "rsrp_dbm", "sinr_db", "cqi")
 _BESIDE = (("rsrp_dbm", "nr_rsrp"), ("sinr_db", "nr_sinr"), ("cqi", "wb_cqi"))

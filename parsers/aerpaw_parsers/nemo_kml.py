@@ -11,10 +11,12 @@ import re
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray, IntArray
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _lines, _quantities, _rows
+from . import _quantities
 from ._nemo import pdsch_rank
 
 _N = rb"(" + _lines.NUMBER + rb"|nan)"

@@ -9,11 +9,12 @@ import re
 from collections.abc import Callable
 
 from aerpaw_cmp.common.errors import InputError
+from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.matfile import MAGIC
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _lines, flight_mat, gpx, iq_burst, nemo_kml, oai_log, srsenb_log, srsran_gnb, srsue_log, vehicle_log
+from . import flight_mat, gpx, iq_burst, nemo_kml, oai_log, srsenb_log, srsran_gnb, srsue_log, vehicle_log
 
 _PATTERN = re.compile(rb"Frequency ?= ?\d{1,6} ?\(MHz\)")
 _CUT = re.compile(rb"Phi ?= ?-?\d{1,3}(?:\.\d{1,6})? ?\(deg\)")

@@ -10,10 +10,11 @@ from __future__ import annotations
 import numpy as np
 
 from aerpaw_cmp.common.units import BoolArray
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _rows, _sheet
+from . import _sheet
 
 _RSS = ("time utc", "tower", "channel", "unit", "measured db")
 _RANK = ("time utc", "tower", "measured rank")

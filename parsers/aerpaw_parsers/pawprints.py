@@ -12,10 +12,12 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, Stream
 
-from . import _cells, _json, _lines, _pose, _rows
+from . import _cells, _json, _pose
 
 _MARKS = (b'"cells"', b'"nr_signal_strength"', b'"connected_pci"', b'"companion_abs_time"')
 

@@ -11,10 +11,13 @@ import re
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-from . import _cells, _lines, _rows, _time
+from . import _cells
 
 _STAMP = re.compile(rb"^(" + _time.TIME + rb")")
 _ROW = re.compile(rb'\|\s*\d+\s*\|\s*"?\+?Q(ENG|NWCFG): ?"([A-Za-z0-9_-]+)"?"?\s*\|(.*)\|\s*$')

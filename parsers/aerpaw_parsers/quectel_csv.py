@@ -26,10 +26,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from aerpaw_cmp.common.units import AnyArray, FloatArray, IntArray
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
-
-from . import _frames, _lines, _time
 
 _C = rb"[^,\n]{0,80}"
 _V = rb'"{0,3}(-?\d{1,7}(?:\.\d{1,6})?|-|)"{0,3}'

@@ -11,9 +11,11 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
-
-from . import _lines, _rows, _text, _time
 
 _CELL = rb', ?"?(?P<%s>' + _lines.NUMBER + rb'|nan|NaN|)"?'
 _ROW = re.compile(

@@ -20,10 +20,13 @@ import numpy as np
 
 from aerpaw_cmp.common.errors import InputError
 from aerpaw_cmp.common.units import AnyArray, FloatArray
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult, RejectedLine, Stream
 
-from . import _frames, _json, _lines, _rows, _stamps
+from . import _json, _stamps
 
 _MOMENT = re.compile(r"\d{4}-\d\d-\d\d[T ]\d\d:\d\d:\d\d(\.\d{1,9})?Z?")
 BURST_S = 0.02

@@ -17,9 +17,10 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
-
-from . import _rows, _text, _time
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _ROW = re.compile(

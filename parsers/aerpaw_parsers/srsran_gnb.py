@@ -17,10 +17,13 @@ from typing import Any
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import ReadResult
 
-from . import _json, _lines, _rows, _stamps, _time
+from . import _json, _stamps
 
 _N = rb" +(?P<%s>-?\d{1,6}(?:\.\d{1,6})?|n/a)"
 _STAMP = rb"^\[?(?P<time>" + _time.TIME + _time.ZONE + rb")\]?"

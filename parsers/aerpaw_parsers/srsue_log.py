@@ -12,9 +12,12 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
 
-from . import _cells, _rows, _text, _time
+from . import _cells
 
 _N = rb" +(?P<%s>[-+]?\d{1,7}(?:\.\d{1,6})?[kMGmun]?|n/a|-?inf|nan)"
 _ROW = re.compile(

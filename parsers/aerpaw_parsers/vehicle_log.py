@@ -11,9 +11,11 @@ from __future__ import annotations
 import re
 from collections.abc import Iterator
 
+from aerpaw_cmp.logs import clocks as _time
+from aerpaw_cmp.logs import lines as _lines
+from aerpaw_cmp.logs import rows as _rows
+from aerpaw_cmp.logs import textlog as _text
 from aerpaw_cmp.logs.records import Stream
-
-from . import _lines, _rows, _text, _time
 
 _N = _lines.NUMBER
 _PLACE = rb'\{"lat": ?(?P<lat>%s), ?"lon": ?(?P<lon>%s), ?"alt": ?(?P<alt>%s)\}' % (_N, _N, _N)

@@ -6,8 +6,9 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs.records import ReadResult
-from aerpaw_parsers import _lines, sounder_log
+from aerpaw_parsers import sounder_log
 from tests.parsers.samples import OPTIONS
 
 BEGIN = np.datetime64("2025-03-02T15:00:00")

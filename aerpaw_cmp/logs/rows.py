@@ -14,11 +14,12 @@ from itertools import pairwise
 
 import numpy as np
 
-from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray, IntArray
-from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import Attribute, Kind, ReadResult, RejectedLine, Stream
-
-from . import _frames, _lines, _time
+from ..common.units import AnyArray, BoolArray, FloatArray, IntArray
+from . import clocks as _time
+from . import lines as _lines
+from . import make_frames as _frames
+from .readers import ReadOptions
+from .records import Attribute, Kind, ReadResult, RejectedLine, Stream
 
 NO_DATE = "the time stamp is no date of the calendar"
 NO_TIME = "the time is beyond any flight"
@@ -129,6 +130,7 @@ class Rows:
 
         Parameters
         ----------
+        kind, name : str
         values : mapping
             Columns of the kind, and any others, each of shape (n,).
         where : bool array, shape (n,), optional
@@ -138,6 +140,12 @@ class Rows:
             In place of the flags that all streams of the rows share.
         about : mapping, optional
             Further attributes.
+        **attributes
+            Attributes; None leaves one out.
+
+        Returns
+        -------
+        Stream or None
         """
         shown = self.flag if flag is None else flag
         time, row = self.time, self.row
@@ -208,6 +216,7 @@ def matched(
 
     Parameters
     ----------
+    data : bytes
     pattern : re.Pattern
         MULTILINE, from ``^`` to ``\r?$``, unable to cross a line end, every repetition bounded; named groups, one of
         them ``time``.
@@ -215,8 +224,15 @@ def matched(
         Why a line that does not match is rejected, or None for a header, a comment or a console's talk.
     skip : callable, optional
         Mask of the matching rows (0-based lines) that are comments.
+    options : ReadOptions
+    reader : str
+        Its name.
     clock : str
         See :func:`times`.
+
+    Returns
+    -------
+    Rows
 
     Raises
     ------
@@ -252,10 +268,21 @@ def built(
 
     Parameters
     ----------
+    lines : Lines
+    rows : int array, shape (n,)
+        0-based lines of the rows.
+    column : mapping of str to array, shape (n,)
+        Their cells as bytes or floats.
+    options, reader, reason, skip, clock
+        As of :func:`matched`.
     extra : iterable of RejectedLine
         Lines that were rejected before.
     markup : int array, optional
         0-based lines known to be comments.
+
+    Returns
+    -------
+    Rows
     """
     comment = np.zeros(len(rows), dtype=bool) if skip is None else skip(rows)
     before = list(extra)
@@ -310,9 +337,12 @@ def times(cells: AnyArray, options: ReadOptions, *, clock: str, reader: str) -> 
     Parameters
     ----------
     cells : bytes or float array, shape (n,)
+    options : ReadOptions
     clock : str
         ``wall`` (text, local unless it carries an offset), ``epoch_s``, ``epoch_ms``, ``epoch_us`` (UTC),
         ``relative_s`` or ``relative_ms`` (from ``time_origin``, else from 1970-01-01).
+    reader : str
+        Its name, for messages.
 
     Returns
     -------
@@ -355,6 +385,10 @@ def snr(rows: Rows, tower: str, values: FloatArray, where: BoolArray | None = No
         [dB].
     where : (n,) bool, optional
         Rows that are of this tower.
+
+    Returns
+    -------
+    Stream or None
     """
     level, flag = rows.level(values)
     return rows.stream(
@@ -376,6 +410,7 @@ def mean_rank(
 
     Parameters
     ----------
+    rows : Rows
     ri : float array, shape (m,)
     beside : mapping
         Further columns.
@@ -383,6 +418,11 @@ def mean_rank(
         Where the number means that nothing was reported.
     pick : int array, shape (m,), optional
         See :meth:`Rows.stream`.
+
+    Returns
+    -------
+    list of Stream or None
+        See :func:`of_ues`.
     """
     flag = (rows.flag if pick is None else rows.flag[pick]).copy()
     absent = np.isnan(ri) | none
@@ -415,6 +455,9 @@ def of_ues(
 
     Parameters
     ----------
+    rows : Rows
+    kind, name : str
+        Of the stream; of several each name ends in ``_rnti<hex>``.
     values : mapping
         Columns of shape (m,), ``rnti`` among them (NaN where the log names none).
     pick : int array, shape (m,), optional
@@ -422,6 +465,10 @@ def of_ues(
     flag : object array, shape (m,)
     about : mapping
         Attributes of all.
+
+    Returns
+    -------
+    list of Stream or None
     """
     pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
     known = np.unique(rnti[np.isfinite(rnti)]).astype(int).tolist()

@@ -13,11 +13,10 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import numpy as np
 
-from aerpaw_cmp.common.errors import UsageError
-from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
-from aerpaw_cmp.logs.readers import ReadOptions
-
-from ._lines import add_flag
+from ..common.errors import UsageError
+from ..common.units import AnyArray, BoolArray, IntArray
+from .lines import add_flag
+from .readers import ReadOptions
 
 AMBIGUOUS = "ambiguous_local_time"
 NONEXISTENT = "nonexistent_local_time"
@@ -375,6 +374,11 @@ def parsed_to_utc(
         Zone of the others.
     needed_by : str
         What the message names if there is no zone.
+
+    Returns
+    -------
+    Instants
+        The time of what is none is 1970-01-01.
     """
     naive = valid & ~zoned
     if len(wall) and naive.all():

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from aerpaw_cmp.common.units import AnyArray
-from aerpaw_cmp.logs.readers import ReadOptions
-from aerpaw_cmp.logs.records import COLUMNS, Attribute, Kind
+from ..common.units import AnyArray
+from .readers import ReadOptions
+from .records import COLUMNS, Attribute, Kind
 
 _INTEGERS = ("fix", "satellites")
 
@@ -35,6 +35,10 @@ def frame(
         Columns of the kind that the log has.
     own : bool
         Whether the arrays are given away: a log of 1 GB has no room for copies.
+
+    Returns
+    -------
+    pandas.DataFrame
     """
     array = np.asarray if own else np.array
     count = len(time)

@@ -13,8 +13,8 @@ from functools import cached_property
 
 import numpy as np
 
-from aerpaw_cmp.common.units import AnyArray, BoolArray, IntArray
-from aerpaw_cmp.logs.records import KEPT_REJECTED, RejectedLine, RejectedReason
+from ..common.units import AnyArray, BoolArray, IntArray
+from .records import KEPT_REJECTED, RejectedLine, RejectedReason
 
 TEXT_LIMIT = 500
 """Characters of a rejected line that are kept."""
@@ -214,6 +214,7 @@ def remainder(
 
     Parameters
     ----------
+    lines : Lines
     accepted : int array
         0-based numbers of the lines that gave records.
     reason : callable

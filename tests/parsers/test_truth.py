@@ -7,14 +7,19 @@ seconds after 2025-03-02 15:00:00 UTC, which is 10:00:00 in New York.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from datetime import datetime, timedelta, timezone
 from pathlib import Path
 from typing import Any
+from zoneinfo import ZoneInfo
 
 import numpy as np
+import pandas as pd
 import pytest
 
+from aerpaw_cmp.logs.chunks import whole_lines
 from aerpaw_cmp.logs.ingest import ingest
 from aerpaw_cmp.logs.readers import ReadOptions, identify
+from tests.frames import assert_same_result
 
 BEGIN = np.datetime64("2025-03-02T15:00:00")
 LOCAL = ReadOptions(timezone="America/New_York")
@@ -211,6 +216,149 @@ def test_what_a_file_says_comes_out(case: Case) -> None:
         assert name in streams, f"{name} is not among {list(streams)}"
         for column, expected in columns.items():
             assert shown(streams[name][column].to_numpy()) == pytest.approx(expected, nan_ok=True), f"{name}: {column}"
+
+
+# --- every format at every kind of time ---------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Form:
+    """A format of one row per instant: what stands above the rows, a row, and the column that ``v`` must come out in.
+
+    ``t`` is the wall clock (local, or UTC where ``utc``), ``s`` the seconds of the epoch, ``ms`` its milliseconds.
+    """
+
+    head: str
+    row: str
+    stream: str
+    column: str
+    utc: bool = False
+    name: str = "log.txt"
+
+
+RANKS, ENB = "rank", "| 31.5 12.5 40 15 38k"
+FORMS = {
+    "vehicle_out, 10 fields": Form(
+        "", '{i},-78.7,35.73,{v}.5,"(0.1,1.5,0.1)","(0.0,5.0,0.1)",48.1,{t},4,18\n', "vehicle", "altitude_m"
+    ),
+    "vehicle_out, 9 fields, titled": Form(
+        LOG2CSV.replace("Time,", ""), "{i},-78.7,35.73,{v}.5,48.1,90,{t},4,18\n", "vehicle", "altitude_m"
+    ),
+    "vehicle_out, 8 fields, UTC": Form(
+        "", "{i},-78.7,35.73,{v}.5,48.1,{t}+00:00,4,18\n", "vehicle", "altitude_m", utc=True
+    ),
+    "pose_csv, columns turned": Form(
+        "Heading (deg),Height above takeoff,Longitude,LATITUDE,Timestamp\n", "90,{v}.5,-78.7,35.73,{t}\n", "vehicle", "altitude_m"
+    ),
+    "pose_csv, UTC by the column's name": Form(
+        "Export of a flight\n\nLat;Lon;Rel Alt;datetime(utc)\n", "35,73;-78,7;{v},5;{t}\n", "vehicle", "altitude_m", utc=True
+    ),
+    "vehicle_log": Form(
+        "", '[{t}] Current location is {{"lat": 35.73, "lon": -78.7, "alt": {v}.5}}\n', "vehicle", "altitude_m"
+    ),
+    "gpx": Form(
+        "<gpx>\n", '<trkpt lat="35.73" lon="-78.7"><ele>{v}.5</ele><course>{v}</course><time>{t}Z</time></trkpt>\n',
+        "track", "above the first", utc=True,
+    ),
+    "sounder_log": Form("", "[{t}] {i:07o} {v:15d}.5\n", "power", "level", name="x_power_log.txt"),
+    "aadm_snr": Form("time,snr_lw3\n", "{t},{v}.5\n", "LW3", "level"),
+    "controller_log": Form(
+        "", "[{t}] [Controller-->UAV] SNR:\n[{t}] 2:{v}.5\n[{t}] [Controller-->UAV] Download:\n[{t}] 2:99.5\n", "LW2", "level"
+    ),
+    "quectel_csv": Form(
+        "OK\n", '{t},"+QNWCFG: ""lte_csi""",20,1,9,3,"+QNWCFG: ""nr5g_csi""",24,{v},12,5\n', "nr5g_csi", RANKS
+    ),
+    "quectel_ri": Form(
+        "ID,Time and date,Longitude,Latitude,Altitude,NR RI\n", "{i},{t},-78.7,35.73,30.1,{v}\n", "nr5g_csi", RANKS
+    ),
+    "quectel_console": Form(
+        "", '{t}\n|    |----+\n|  0 | +QNWCFG: "nr5g_csi" | 24 | {v} | 12 | 5 |\n', "nr5g_csi", RANKS
+    ),
+    "srsenb_log": Form(
+        "[2025-01-01 00:00:00.000000] rat rnti  cqi  ri  mcs  brate ok nok (%)\n",
+        "[{t}] lte   46   11   {v}    2   3.7k   14    0   0% " + ENB + "\n", "srsenb", RANKS,
+    ),
+    "srsue_log": Form(
+        "[2025-01-01 00:00:00.000000] cc pci rsrp pl cfo | mcs snr\n",
+        "[{t}]   0    7   -{v}   61 -4.3k |   0   25   1.0   4.5k    0%  1.6 |  23  83k  19M\n", "lte_pci7", "-level",
+    ),
+    "srsran_gnb": Form(
+        "[2025-01-01 00:00:00.000000]  pci rnti | cqi ri mcs\n",
+        "[{t}]   1 4601 |  15   {v}   28    17M  908    0   0%    44k |  26.7 -21.2\n", "gnb", RANKS,
+    ),
+    "srsran_json": Form(
+        "", '{{"timestamp": {s}, "ue_list": [{{"pci": 1, "rnti": 5, "dl_ri": {v}}}]}}\n', "gnb", RANKS, utc=True
+    ),
+    "amarisoft": Form(
+        "[2025-01-01 00:00:00.000000] UE_ID  CL RNTI C cqi  ri  mcs retx\n", "[{t}] 1 000 0046 1 15.0 {v} 27.5 0\n", "gnb", RANKS
+    ),
+    "amarisoft_json": Form(
+        "", '{{"message": "ue_get", "utc": {s}, "ue_list": [{{"rnti": 5, "cells": [{{"cqi": 9, "ri": {v}}}]}}]}}\n',
+        "gnb", RANKS, utc=True,
+    ),
+    "oai_log": Form("", "[{t}] [NR_MAC] UE 1f4d: CQI 15, RI {v}, PMI (14,1)\n", "oai", RANKS),
+    "pawprints": Form(
+        "", '{{"abs_time": 1, "companion_abs_time": {ms}, "cells": [{{"technology": "4G_LTE", "rsrp": -{v}, "pci": 7}}]}}\n',
+        "lte_pci7", "-level", utc=True,
+    ),
+    "drive_test, two carriers": Form(
+        "Timestamp,PCI,EARFCN,RSRP (dBm),N1 PCI,N1 EARFCN,N1 RSRP\n", "{t},7,1300,-{v},7,2850,-99\n", "pci7_arfcn1300", "-level"
+    ),
+    "own_csv": Form(
+        "time_utc,time_s,tower,channel,unit,measured_db\n", "{t}Z,0,LW1,USRP1,dB,{v}.5\n", "LW1_USRP1", "level", utc=True
+    ),
+}  # fmt: skip
+NEW_YORK = ZoneInfo("America/New_York")
+INSTANTS = {
+    "morning": datetime(2025, 3, 2, 10, tzinfo=NEW_YORK),
+    "over midnight": datetime(2025, 7, 2, 23, 59, 58, tzinfo=NEW_YORK),
+    "the hour that the clock had twice": datetime(2025, 11, 2, 1, 30, tzinfo=NEW_YORK),
+    "new year, in winter": datetime(2024, 12, 31, 18, 59, 59, tzinfo=NEW_YORK),
+}
+VALUES = [3, 1, 2, 4]
+COLUMNS = {
+    "level": ("rss_db", 1, 0.5),
+    "-level": ("rss_db", -1, 0.0),
+    "altitude_m": ("altitude_m", 1, 0.5),
+    "above the first": ("altitude_m", 1, -3.0),
+}
+"""Where a value comes out, its sign, and what the row writes above it."""
+
+
+def written(form: Form, begin: datetime) -> tuple[str, list[np.datetime64]]:
+    """The file, and the instants of its rows."""
+    text, instants = form.head, []
+    for i, v in enumerate(VALUES):
+        utc = begin.astimezone(timezone.utc) + timedelta(seconds=i, milliseconds=250)
+        wall = utc if form.utc else utc.astimezone(NEW_YORK)
+        stamp = wall.strftime("%Y-%m-%d %H:%M:%S.%f")[:23]
+        stamp += "000" if form.row.startswith("[{t}]") else ""
+        text += form.row.format(
+            i=4 * i if "07o" in form.row else i, v=v, t=stamp, s=utc.timestamp(), ms=round(1e3 * utc.timestamp())
+        )
+        instants.append(np.datetime64(utc.replace(tzinfo=None), "ns"))
+    return text, instants
+
+
+@pytest.mark.parametrize("when", INSTANTS)
+@pytest.mark.parametrize("name", FORMS)
+def test_every_format_at_every_kind_of_time(name: str, when: str) -> None:
+    form = FORMS[name]
+    text, instants = written(form, INSTANTS[when])
+    options = replace(LOCAL, file_name=form.name)
+    for data in (text.encode(), b"\r\n" + text.replace("\n", "\r\n").encode()):
+        reader = identify(data)
+        assert reader.name == name.split(",")[0]
+        result = reader.read(data, options)
+        (frame,) = (stream.frame for stream in result.streams if stream.name == form.stream)
+        assert frame["time"].tolist() == [pd.Timestamp(one) for one in instants]
+        column, sign, above = COLUMNS.get(form.column, (form.column, 1, 0.0))
+        assert (sign * frame[column] - above).tolist() == pytest.approx(VALUES)
+        twice = when.startswith("the hour") and not form.utc
+        assert frame["flag"].str.contains("ambiguous_local_time").tolist() == [twice] * len(VALUES)
+        if reader.read_pieces is not None:
+            pieces = whole_lines(data[i : i + 37] for i in range(0, len(data), 37))
+            assert_same_result(reader.read_pieces(pieces, options), result)
 
 
 ORIGINS = {

@@ -188,7 +188,6 @@ def blank_pictures() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(canvas, "save_as", save_as)
         patch.setattr(canvas, "smaller", cache(canvas.smaller))
-        patch.setattr(canvas, "FEWEST_FIGURES", 10_000)  # in this process: a further one costs more than it saves
         yield
 
 

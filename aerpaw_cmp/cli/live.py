@@ -114,7 +114,8 @@ def tap(
     summaries = tap_modems(settings, port or [None], shown, on_status=line)
     for summary in summaries:
         rates = ", ".join(f"{name} {rate:.2f} Hz" for name, rate in summary.rates_hz.items())
-        say(f"{line.end}ended: {summary.reason}; {summary.records} records, {summary.gaps} gaps; {rates}")
+        lost = f", {summary.lost_records} records lost (the disk did not take them)" if summary.lost_records else ""
+        say(f"{line.end}ended: {summary.reason}; {summary.records} records{lost}, {summary.gaps} gaps; {rates}")
     if as_json:
         print_json(json_safe(summaries[0] if len(summaries) == 1 else {"modems": summaries}))
     else:

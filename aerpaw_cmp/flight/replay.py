@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 from hashlib import sha256
 from typing import Any
 
 import numpy as np
 
 from ..common.errors import UsageError
-from ..common.forked import ahead
 from ..common.stages import Progress, Stages, share_of, silent
 from ..common.units import BoolArray, FloatArray
 from ..compare.result import APPLIED, GIVEN, ClockResult
@@ -96,7 +94,6 @@ def replay_flight(
     stages: Stages | None = None,
     *,
     clocks: Sequence[Clock | None] | None = None,
-    meanwhile: Callable[[], object] | None = None,
 ) -> FlightReplay:
     """Clocks and replay alone.
 
@@ -107,8 +104,6 @@ def replay_flight(
         Times "clocks" and "replay".
     clocks : sequence of Clock or None, optional
         One per RSS series, in place of what ``rss.lag`` asks for.
-    meanwhile : callable, optional
-        As for :func:`estimate_clocks`.
 
     Returns
     -------
@@ -117,7 +112,7 @@ def replay_flight(
     """
     stages = stages or Stages()
     with stages("clocks"):
-        known = estimate_clocks(data, stages.progress, meanwhile) if clocks is None else clocks
+        known = estimate_clocks(data, stages.progress) if clocks is None else clocks
     with stages("replay"):
         return FlightReplay(
             rss=tuple(replay_rss(data, stages.progress, known)), rank=tuple(replay_rank(data, stages.progress))
@@ -185,13 +180,10 @@ def telemetry_time(time: Times, clock: Clock | None) -> Times:
     return np.asarray(time - np.round(clock.applied_s * 1e9).astype("timedelta64[ns]"))
 
 
-def estimate_clocks(
-    data: FlightData, progress: Progress = silent, meanwhile: Callable[[], object] | None = None
-) -> list[Clock | None]:
+def estimate_clocks(data: FlightData, progress: Progress = silent) -> list[Clock | None]:
     """Clock of each RSS series against the telemetry, as ``rss.lag`` asks; the channels of a tower share one.
 
-    Predictions are the image engine's RSS along the track with at most one reflection. ``meanwhile`` is what this
-    process may do while others estimate; it is not called where there is nothing to estimate.
+    Predictions are the image engine's RSS along the track with at most one reflection.
     """
     wanted = data.settings.rss.lag
     if wanted == "off" or data.track is None:
@@ -200,13 +192,9 @@ def estimate_clocks(
         return [_given_clock(series.tower, wanted, len(series.time)) for series in data.rss]
     predict, estimated = _Predictions(data), dict[str, ClockEstimate]()
     towers = list(dict.fromkeys(series.tower for series in data.rss))
-    calls = [partial(_estimated_clock, data, [s for s in data.rss if s.tower == t], predict) for t in towers]
-    with ahead(calls) if may_share(data.rss) else ahead(calls, 1) as estimates:
-        if meanwhile is not None:
-            meanwhile()
-        for tower in towers:
-            progress(f"clock {tower}")
-            estimated[tower] = next(estimates)
+    for tower in towers:
+        progress(f"clock {tower}")
+        estimated[tower] = _estimated_clock(data, [s for s in data.rss if s.tower == tower], predict)
     return [_clock_of(series, estimated[series.tower], apply=wanted == "apply") for series in data.rss]
 
 
@@ -222,15 +210,6 @@ def _given_clock(receiver: str, radio_minus_telemetry_s: float, samples: int) ->
         applied=GIVEN,
     )
     return Clock(result=result, applied_s=np.full(samples, radio_minus_telemetry_s))
-
-
-SHARED_UP_TO = 200_000
-"""RSS samples of a flight up to which its series are shared by several processes."""
-
-
-def may_share(series: Sequence[RssSeries]) -> bool:
-    """Whether processes may share the series of a flight: not of a long one, where each would hold much memory."""
-    return sum(len(one.time) for one in series) <= SHARED_UP_TO
 
 
 BLOCK = 100_000

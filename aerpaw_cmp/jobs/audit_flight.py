@@ -14,14 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from ..common.forked import ahead
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, FloatArray
 from ..compare.field_difference import FieldAudit
 from ..compare.result import AuditResult, EngineResult
 from ..flight.data import FlightData
 from ..flight.losses import path_loss, reflecting_crowns
-from ..flight.replay import Replayed, attitude_rotation, may_share, part_of
+from ..flight.replay import Replayed, attitude_rotation, part_of
 from ..flight.settings import AntennaSettings, ArraySettings, LinkSettings, RtSettings, load_pattern
 from ..logs.ingest import IngestedFile
 from ..propagation.arrays import Poses
@@ -53,10 +52,7 @@ ATTITUDE_TOLERANCE_RAD = 1e-6
 REFERENCE_LINKS_AT_MOST = 64
 """Of all series together, at least three each: some 0.1 s apiece."""
 
-TIMES = (
-    "The time of the engine is its share for the audited links; that of the reference includes its start-up, and where "
-    "several processes share the series, that of each."
-)
+TIMES = "The time of the engine is its share for the audited links; that of the reference includes its start-up."
 
 NOT_COVERED = (
     "whether reflection off smooth half-spaces and flat walls is what the place does",
@@ -119,11 +115,9 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
     if not calls:
         return None
     parts: list[Audit] = []
-    # the processes that share the series load the other engine: this one stays free to share its drawings afterwards
-    with ahead(calls, None if may_share(data.rss) else 1) as audits:
-        for text in named:
-            progress(text)
-            parts.append(next(audits))
+    for text, call in zip(named, calls, strict=True):
+        progress(text)
+        parts.append(call())
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))

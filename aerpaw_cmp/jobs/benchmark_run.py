@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 from .. import __version__
+from ..common.cells import guarded
 from ..common.errors import InputError, OutputError, UsageError
 from ..common.outputs import OutputFile, OutputFolder, is_sealed
 from ..common.stages import Progress, silent
@@ -142,7 +143,7 @@ def _predicted(bench: Bench, task: str, name: str) -> Any:
 def _entry_text(name: str, frames: Sequence[Any]) -> str:
     import pandas as pd
 
-    text = pd.concat(frames).to_csv(index=False, float_format="%.4f", lineterminator="\n")
+    text = guarded(pd.concat(frames)).to_csv(index=False, float_format="%.4f", lineterminator="\n")
     return f"# entrant: {name}\n# who: aerpaw-cmp {__version__}\n{text}"
 
 

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping, Sequence
-from functools import partial
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -16,7 +15,6 @@ from typing import Any
 import numpy as np
 
 from ..common.errors import InputError
-from ..common.forked import in_order
 from ..common.stages import give_memory_back
 from ..common.units import BoolArray, FloatArray, IntArray, wavelength_m
 from ..compare import offset as offsets
@@ -45,7 +43,7 @@ from ..compare.spread import StatedSpread, inside_shares
 from ..flight.data import FlightData, RankSeries, RssSeries
 from ..flight.lock import LOCK_FLOOR_DB
 from ..flight.losses import direct_foliage_m
-from ..flight.replay import FlightReplay, Replayed, may_share
+from ..flight.replay import FlightReplay, Replayed
 from ..flight.settings import ReferencePowers, RssSettings, RtSettings
 from ..flight.training import learned_here
 from ..propagation.field.baselines import free_space_dbm, two_ray_dbm
@@ -74,16 +72,11 @@ PASSES_WITHIN_M = 3.0
 """Two passes of one place, first and second half of a flight, come this near."""
 
 
-FEWEST_SERIES = 4
-"""Series below which a further process does not pay."""
-
-
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
-    calls = [partial(compare_rss_series, data, s, r) for s, r in zip(data.rss, replays.rss, strict=True)]
     results = []
-    for one in in_order(calls, None if may_share(data.rss) else 1, fewest=FEWEST_SERIES):
-        results.append(one)
+    for series, replayed in zip(data.rss, replays.rss, strict=True):
+        results.append(compare_rss_series(data, series, replayed))
         give_memory_back()  # a series of ten hours leaves some 100 MiB of holes, and the ranks need room
     return FlightResult(
         rss=tuple(results),

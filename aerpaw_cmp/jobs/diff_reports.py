@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.cells import unguarded
 from ..common.errors import InputError, UsageError, one_line
 from ..common.files import LARGEST_TABLE, read_bounded
 from ..common.outputs import OutputFolder, changed_files
@@ -219,7 +220,7 @@ def _table(path: Path, kind: str, columns: Mapping[str, str]) -> Any:
         row = int(np.flatnonzero(torn.to_numpy())[0])
         raise InputError("a row without a tower or a time", cause="a torn line", path=path, line=row + 2)
     text = [name for name in texts if name in table]
-    table[text] = table[text].fillna("")
+    table[text] = table[text].fillna("").map(unguarded)
     return table
 
 

@@ -7,19 +7,15 @@ field of :class:`FlightRun` or of :class:`~aerpaw_cmp.compare.result.FlightResul
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import partial
 
-from ..common.forked import beside, in_order
 from ..common.stages import Stages
-from ..compare.ladder import LadderRow, series_rows
+from ..compare.ladder import series_rows
 from ..compare.result import FlightResult
 from ..flight.data import FlightData
-from ..flight.replay import FlightReplay, may_share, replay_flight
+from ..flight.replay import FlightReplay, replay_flight
 from .audit_flight import audit_replays
-from .compare_flight import FEWEST_SERIES, compare_flight
+from .compare_flight import compare_flight
 from .ladder import FlightLadder, flight_ladder
 
 
@@ -52,7 +48,6 @@ def run_flight(
     replays: FlightReplay | None = None,
     audit: bool = True,
     ladder: bool = False,
-    meanwhile: Callable[[], object] | None = None,
 ) -> FlightRun:
     """Clocks, replay, comparison, audit and ladder.
 
@@ -67,8 +62,6 @@ def run_flight(
         Also fill ``result.engine``, with the audit by the other engine where ``rt.audit_links`` asks for it.
     ladder : bool
         Also score simpler and richer models of the RSS on stretches left out.
-    meanwhile : callable, optional
-        As for :func:`~aerpaw_cmp.flight.replay.estimate_clocks`.
 
     Returns
     -------
@@ -76,30 +69,18 @@ def run_flight(
         Replays, numbers of the comparison, and the ladder where it was asked for.
     """
     stages = stages or Stages()
-    replays = replays or replay_flight(data, stages, meanwhile=meanwhile)
-    with ExitStack() as running:
-        # the ladder needs the replays alone: where a further core is free, it is climbed while the rest goes on
-        climb: Callable[[], FlightLadder | None] | None = None
-        if ladder:
-            climb = partial(flight_ladder, data, replays)
-            climb = running.enter_context(beside(climb)) if may_share(data.rss) else climb
-        with stages("compare"):
-            result = compare_flight(data, replays)
-        if audit:
-            with stages("audit"):
-                result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
-        climbed = None
-        if climb is not None:
-            with stages("ladder"):
-                stages.progress("ladder of models")
-                climbed = climb()
-                if climbed is not None:
-                    rows = _ladder_rows(climbed)
-                    result = dataclasses.replace(result, ladder=tuple(rows))
+    replays = replays or replay_flight(data, stages)
+    with stages("compare"):
+        result = compare_flight(data, replays)
+    if audit:
+        with stages("audit"):
+            result = dataclasses.replace(result, engine=audit_replays(data, replays.all, stages.progress))
+    climbed: FlightLadder | None = None
+    if ladder:
+        with stages("ladder"):
+            stages.progress("ladder of models")
+            climbed = flight_ladder(data, replays)
+            if climbed is not None:
+                rows = (series_rows(climbed.ladder, index, name) for index, name in enumerate(climbed.names))
+                result = dataclasses.replace(result, ladder=tuple(row for of_series in rows for row in of_series))
     return FlightRun(data=data, replays=replays, result=result, ladder=climbed)
-
-
-def _ladder_rows(climbed: FlightLadder) -> list[LadderRow]:
-    """The rows of all series in their order, several series at a time where that is safe."""
-    calls = [partial(series_rows, climbed.ladder, index, name) for index, name in enumerate(climbed.names)]
-    return [row for rows in in_order(calls, fewest=FEWEST_SERIES) for row in rows]

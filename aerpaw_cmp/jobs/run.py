@@ -8,7 +8,6 @@ from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass, replace
 from datetime import datetime, timezone
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -220,7 +219,7 @@ def run_report(
     from ..flight.settings import load_flight
     from ..report.export import metrics as metrics_of
     from ..report.exports.formats import chosen_formats
-    from ..report.write import FIGURES, STYLES, prepare_report, write_report
+    from ..report.write import FIGURES, STYLES, write_report
     from .flight_run import run_flight
     from .ladder import recommended_text
     from .later_audit import refuse_changed, with_later_audit
@@ -244,7 +243,7 @@ def run_report(
         stages = Stages(progress)
         with stages("read"):
             data = load_data(settings, flight.parent, logs_root)
-        replays = replay_flight(data, stages, meanwhile=partial(prepare_report, figures))
+        replays = replay_flight(data, stages)
         flight_run = run_flight(data, stages, replays=replays, ladder=True)
         record = report_record(flight_run, other_inputs(settings, flight, logs_root))
         asked = {"engine": engine, "figures": figures, "style": style, "export": list(export)}

@@ -18,6 +18,7 @@ from xml.sax.saxutils import escape
 
 import numpy as np
 
+from ..common.cells import guarded
 from ..common.cf import site_crs
 from ..common.errors import UsageError
 from ..common.geodesy import SiteFrame
@@ -69,7 +70,7 @@ def write_csv(path: str | Path, grid: Grid, frame: SiteFrame, layers: Sequence[L
         **{layer.name: layer.values for layer in layers},
     }
     target = Path(path)
-    pd.DataFrame(table).to_csv(target, index=False, lineterminator="\n")
+    guarded(pd.DataFrame(table)).to_csv(target, index=False, lineterminator="\n")
     return target
 
 

@@ -12,6 +12,7 @@ import numpy as np
 import pandas as pd
 from markupsafe import Markup
 
+from ..common.cells import guarded
 from ..common.jsonable import json_safe
 from ..common.stages import Progress, silent
 from ..compare.result import Repeated
@@ -407,12 +408,14 @@ def write_campaign(
     table = campaign_frame(data)
     written = [
         write_file(folder / "campaign.json", numbers),
-        write_file(folder / "campaign.csv", table.to_csv(index=False, lineterminator="\n")),
+        write_file(folder / "campaign.csv", guarded(table).to_csv(index=False, lineterminator="\n")),
         *write_parquet(table, folder / "campaign.parquet", progress),
     ]
     if data.repeats or data.rank_repeats:
         pairs = pair_frame(data)
-        written.append(write_file(folder / f"{PAIR_TABLE}.csv", pairs.to_csv(index=False, lineterminator="\n")))
+        written.append(
+            write_file(folder / f"{PAIR_TABLE}.csv", guarded(pairs).to_csv(index=False, lineterminator="\n"))
+        )
         written += write_parquet(pairs, folder / f"{PAIR_TABLE}.parquet", progress)
     tables = [path.name for path in written]
     drawn, pictures = canvas.write_figures(campaign_figures.figure_specs(data), folder / "figures")

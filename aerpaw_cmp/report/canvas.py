@@ -11,13 +11,11 @@ import io
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..common.forked import ahead
 from ..common.stages import Progress, silent
 from ..common.units import AnyArray, BoolArray, FloatArray
 from ..logs.records import has_wall_clock
@@ -211,8 +209,6 @@ def write_figures(
     formats: Sequence[str] = ("svg", "png"),
     kind: str = "screen",
     progress: Progress = silent,
-    *,
-    meanwhile: Callable[[], object] | None = None,
 ) -> tuple[list[Picture], list[Path]]:
     """Draw figures and write each in its formats; gives the pictures and the files.
 
@@ -227,8 +223,6 @@ def write_figures(
         Style, as in :func:`render`.
     progress : Progress
         Share of the figures that are drawn.
-    meanwhile : callable, optional
-        What this process may do while others draw.
 
     Returns
     -------
@@ -237,28 +231,14 @@ def write_figures(
     """
     drawn: list[Picture] = []
     written: list[Path] = []
-    if specs:
-        load_matplotlib()
-    with ahead([partial(render, spec, formats, kind) for spec in specs], fewest=FEWEST_FIGURES) as pictures:
-        if meanwhile is not None:
-            meanwhile()
-        for picture in pictures:
-            progress("figures", len(drawn) / len(specs))
-            drawn.append(picture)
-            written += [write_file(folder / f"{picture.name}.{kind}", one) for kind, one in picture.formats.items()]
+    for spec in specs:
+        progress("figures", len(drawn) / len(specs))
+        picture = render(spec, formats, kind)
+        drawn.append(picture)
+        written += [write_file(folder / f"{picture.name}.{form}", one) for form, one in picture.formats.items()]
     if specs:
         progress("figures", 1.0)
     return drawn, written
-
-
-def load_matplotlib() -> None:
-    """Import what every figure needs: once, before further processes are made."""
-    import matplotlib.backends.backend_agg
-    import matplotlib.figure  # noqa: F401
-
-
-FEWEST_FIGURES = 4
-"""Figures below which a further process does not pay."""
 
 
 # --- parts --------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from ..common.cells import guarded
 from ..common.jsonable import json_safe
 from ..common.provenance import KEY, union
 from ..logs.records import has_wall_clock
@@ -252,7 +253,8 @@ def _text(tables: Iterator[_Table], columns: Iterable[str]) -> Iterator[str]:
     head = True
     for table in tables:
         for start in range(0, len(table[0]), _ROWS):
-            yield _rows(table, slice(start, start + _ROWS)).to_csv(index=False, header=head, lineterminator="\n")
+            rows = guarded(_rows(table, slice(start, start + _ROWS)))
+            yield rows.to_csv(index=False, header=head, lineterminator="\n")
             head = False
     if head:
         yield _whole(iter(()), columns).to_csv(index=False, lineterminator="\n")

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ..common.stages import Stages
-from . import canvas, figures, html
+from . import figures, html
 from .canvas import FORMATS, STYLES, write_figures
 from .data import ReportData
 from .export import metrics, rank_csv, rss_csv, write_file
@@ -28,13 +28,6 @@ class WrittenReport:
 
     files: tuple[Path, ...]
     data: ReportData
-
-
-def prepare_report(drawn: str = PAGE) -> None:
-    """Load what :func:`write_report` will need: for a process that has nothing else to do."""
-    html.environment().get_template("report.html.jinja")
-    if drawn != "none":
-        canvas.load_matplotlib()
 
 
 def write_report(
@@ -76,13 +69,10 @@ def write_report(
     with stages("report"):
         specs = [] if drawn == "none" else [p for p in figures.figure_specs(data) if p.page or drawn != PAGE]
         formats = {PAGE: ("png",), "all": FORMATS}.get(drawn, (drawn,))
-
-        def tables() -> None:
-            for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
-                # written even without rows: a reader finds the same files in every report
-                written.append(write_file(folder / name, text))
-
-        pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress, meanwhile=tables)
+        for name, text in (("rss.csv", rss_csv(data.rss)), ("rank.csv", rank_csv(data.rank))):
+            # written even without rows: a reader finds the same files in every report
+            written.append(write_file(folder / name, text))
+        pictures, paths = write_figures(specs, folder / "figures", formats, style, stages.progress)
     written += paths
     if exports:
         from .exports.samples import of_report

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
-from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,7 +12,6 @@ import pytest
 import yaml
 
 from aerpaw_cmp.__main__ import main
-from aerpaw_cmp.common import forked
 from aerpaw_cmp.flight.data import gather, read_logs
 from aerpaw_cmp.flight.settings import load_flight
 from aerpaw_cmp.jobs.flight_run import run_flight
@@ -152,35 +149,6 @@ def test_every_model_is_a_flight_file(model: Model, tmp_path: Path) -> None:
     assert (found.rt.max_depth > 0) is (model.ground != "none")
     assert (found.rss.field == "power") is (model.ground == "power sum")
     assert (found.rt.foliage == "none") is (model.trees == "none")
-
-
-def test_several_processes_give_the_numbers_of_one(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Clocks, comparison and ladder of a flight of four towers: equal to the last digit, wherever they are computed."""
-    path = flight(tmp_path)
-    content = yaml.safe_load(path.read_text(encoding="utf-8"))
-    content["logs"] += [{**content["logs"][1], "node": tower} for tower in ("LW2", "LW3", "LW4")]
-    content["rss"] |= {"lag": "estimate", "lag_window_s": 2, "bootstrap": 20}
-    path.write_text(yaml.safe_dump(content), encoding="utf-8")
-    settings = load_flight(path)
-    data = gather(settings, tmp_path, read_logs(settings, tmp_path))
-    found, idle = [], list[int]()
-    for processes in (1, 2):
-        monkeypatch.setattr(forked, "usable_processes", lambda count=processes: count)
-        run = run_flight(data, audit=False, ladder=True, meanwhile=partial(idle.append, processes))
-        assert run.ladder is not None
-        rows = [dataclasses.replace(row, seconds=0.0) for row in run.result.ladder]
-        found.append((run.result.rss, rows, run.ladder.ladder.error_db, [r.clock.result for r in run.replays.rss]))
-    assert idle == [1, 2]
-    np.testing.assert_equal(_plain(found[1]), _plain(found[0]))
-
-
-def _plain(value: Any) -> Any:
-    """Nested records as mappings and lists."""
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return {f.name: _plain(getattr(value, f.name)) for f in dataclasses.fields(value)}
-    if isinstance(value, dict):
-        return {key: _plain(one) for key, one in value.items()}
-    return [_plain(one) for one in value] if isinstance(value, (tuple, list)) else value
 
 
 def test_channels_that_share_a_replay_cost_it_once() -> None:

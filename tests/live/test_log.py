@@ -462,3 +462,13 @@ def test_reader_refuses_a_later_schema():
     assert READER.sniff(data)
     with pytest.raises(InputError, match="another version"):
         READER.read(data, ReadOptions())
+
+
+def test_what_a_disk_that_stays_full_never_took_is_counted(tmp_path):
+    log, _ = make(tmp_path, backlog_records=30)
+    records = log.records
+    os.dup2(os.open("/dev/full", os.O_WRONLY), log._fd)
+    for i in range(80):
+        log.append({"kind": "x", "i": i})
+    log.close()
+    assert (log.records - records, log.lost) == (0, 80)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from hashlib import sha256
 from typing import Any
 
@@ -17,6 +18,7 @@ from ..compare.result import APPLIED, GIVEN, ClockResult
 from ..propagation.arrays import Link, Poses, rotation_from_aircraft
 from ..propagation.drivers.moving import loss_along, moving_matrices, replay_moving
 from ..propagation.drivers.pairs import replay_pairs
+from ..propagation.drivers.parts import Each, replay_in_parts
 from ..propagation.field.sum import Fields, channel_matrices
 from ..propagation.options import Engine, Field, Loss, Run, Search
 from ..propagation.paths import Faces, PathSet
@@ -26,7 +28,7 @@ from ..site.site import Site
 from .clock import ClockChannel, ClockEstimate, judge_clock
 from .data import FlightData, RssSeries, Times, rank_positions
 from .lag import DIRECTION_TERMS, terms_from
-from .losses import crowns_reflect, path_loss, reflecting_crowns
+from .losses import path_loss, reflecting_crowns
 from .settings import RtSettings
 from .track import TrackPoses
 
@@ -405,7 +407,6 @@ def replay_poses(
     towers_m: FloatArray | None = None,
     engine: Engine | None = None,
     others: bool | None = None,
-    check_power_cut: bool = True,
     progress: Progress = silent,
 ) -> Replay:
     """Replay poses as the flight's ``rt`` asks, foliage and crowns included; ``engine`` in place of ``rt.engine``.
@@ -423,8 +424,6 @@ def replay_poses(
     engine : {"image", "sionna"}, optional
     others : bool, optional
         Whether to search for the interactions of ``rt`` besides reflections. By default where no engine is named.
-    check_power_cut : bool
-        Say in ``left_out`` what ``rt.power_cut_db`` costs.
     progress : Progress
         Share done; of the sionna engine alone.
 
@@ -445,21 +444,10 @@ def replay_poses(
         name = "+".join(link.tower_arrays)
         _check_moving(rt, engine, name)
         run = Run(threads=rt.threads, progress=share_of(progress, f"replay {name}, which moves"))
-        each = replay_pairs if rt.visibility == "pairs" else replay
+        each: Each = replay_pairs if rt.visibility == "pairs" else replay
         search = Search(max_depth=rt.max_depth, crowns=reflecting_crowns(site.trees, rt), diffraction=rt.diffraction)
         field = Field(path_loss(site, rt, link.carrier_hz))
         return replay_moving(site, link, poses, towers_m, search, field, run, each=each)
-    # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
-    whole = rt.relevance_db is not None or crowns_reflect(site.trees, rt)
-    if len(poses) > BLOCK and engine == "image" and not whole:
-        parts: list[Replay] = []
-        for rows in _in_blocks(np.arange(len(poses))):
-            progress(f"replay {'+'.join(link.tower_arrays)}", float(rows[0]) / len(poses))
-            some = Poses(poses.position_m[rows], poses.rotation[rows])
-            first, listener = not parts, silent if parts else progress
-            parts.append(replay_poses(site, rt, link, some, engine=engine, check_power_cut=first, progress=listener))
-        progress(f"replay {'+'.join(link.tower_arrays)}", 1.0)
-        return _joined_replays(parts)
     name = f"{engine} {'+'.join(link.tower_arrays)}"
     search = Search(
         engine,
@@ -468,21 +456,25 @@ def replay_poses(
         batch=rt.batch,
         crowns=reflecting_crowns(site.trees, rt),
         power_cut_db=rt.power_cut_db,
-        check_power_cut=check_power_cut,
         diffraction=rt.diffraction,
         interactions=rt.interactions if others else ("reflection",),
         scattering_coefficient=rt.scattering_coefficient if others else None,
         device=rt.device,
     )
+    # the image engine finds the paths of a pose whatever the others are; faces of crowns are numbered as they are met
+    alone = engine == "image" and rt.relevance_db is None and search.crowns is None
+    long = alone and len(poses) > BLOCK
     run = Run(
         cache_dir=None if rt.cache else "",
         threads=rt.threads,
         # the image engine is done before a bar could be seen
-        progress=share_of(progress, name) if engine == "sionna" else None,
+        progress=share_of(progress, name) if engine == "sionna" or long else None,
         on_estimate=lambda estimate: _tell(progress, name, estimate),
     )
     field = Field(path_loss(site, rt, link.carrier_hz), rt.relevance_db)
     each = replay_pairs if rt.visibility == "pairs" and engine == "image" else replay
+    if long:
+        each = partial(replay_in_parts, size=BLOCK, each=each)
     replayed = each(site, link, poses, search, field, run)
     if rt.other_interactions and not others:
         replayed.left_out.append(NOT_IN_RANKS)
@@ -558,25 +550,3 @@ def check_interactions(rt: RtSettings) -> None:
             expected="rt.engine: sionna (or --engine sionna), or reflection alone",
             cause="the image engine searches reflections exactly and knows no other interaction",
         )
-
-
-def _joined_replays(parts: list[Replay]) -> Replay:
-    """One replay of parts that follow each other; the parts are taken apart, so that memory holds them once."""
-    first, starts = parts[0], np.cumsum([0, *(len(p.rss_dbm) for p in parts)])
-    arrays: dict[str, Any] = {}
-    for name in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
-        arrays[name] = np.concatenate([getattr(p, name) for p in parts])
-    differ = [p.pairs_differ for p in parts if p.pairs_differ is not None]
-    seconds, search = sum(p.seconds for p in parts), sum(p.search_seconds for p in parts)
-    left_out = list(dict.fromkeys(text for p in parts for text in p.left_out))
-    sets = [dataclasses.replace(p.paths, pose=p.paths.pose + s) for p, s in zip(parts, starts, strict=False)]
-    parts.clear()
-    return dataclasses.replace(
-        first,
-        **arrays,
-        pairs_differ=np.concatenate(differ) if differ else None,
-        paths=PathSet.one_after_another(sets),
-        seconds=seconds,
-        search_seconds=search,
-        left_out=left_out,
-    )

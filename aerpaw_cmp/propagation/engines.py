@@ -21,7 +21,7 @@ from .compiled import beams, beams_for, switch, warn_once
 from .options import Run, Search
 from .paths import PathSet
 from .scene import Scene, within_reach
-from .search import mirror as image
+from .search import mirror
 from .search.effort import Estimate
 from .search.interactions import SCATTERING_SAMPLES, OtherPaths, OtherSearch
 from .search.power_cut import ROUNDING, longest_m, within_cut
@@ -127,16 +127,16 @@ def _by_engine(scene: Scene, link: Link, poses: Poses, search: Search, run: Run)
     ends = scene.sources_m, poses.position_m
     extent = None if run.whole is None else run.whole.extent_m
     if by_beams(scene, search, _links(scene, run)):
-        from .search import beams as growth  # compiled: loaded where there are many faces
-        from .search import prisms
+        from .search import beams as search_beams
+        from .search import prisms  # compiled: loaded where there are many faces
 
         common |= {"longest_m": _longest_m(scene, poses, search), "threads": run.threads}
         common |= {"on_estimate": run.on_estimate or _long_search}
         if scene.surfaces is not None:
-            return growth.grow_paths(scene.surfaces, *ends, **common)[0]
+            return search_beams.grow_paths(scene.surfaces, *ends, **common)[0]
         return prisms.find_paths(scene.faces, *ends, extent_m=extent, **common)[0]
     if search.engine == "image":
-        return image.find_paths(scene.faces, *ends, extent_m=extent, **common)
+        return mirror.find_paths(scene.faces, *ends, extent_m=extent, **common)
     from .search import sionna
 
     return sionna.find_paths(scene.faces, *ends, **(common | _rays(scene, link, search)))
@@ -252,11 +252,11 @@ def estimate_search(
     scene, search = Scene.of(site, link, poses), replace(search or Search(), engine="image")
     if not by_beams(scene, search):
         return None
-    from .search import beams as growth  # compiled: loaded where there are many faces
-    from .search import prisms
+    from .search import beams as search_beams
+    from .search import prisms  # compiled: loaded where there are many faces
 
     solids = scene.surfaces is None
-    return growth.estimate(
+    return search_beams.estimate(
         scene.surfaces or prisms.solid_surfaces(scene.faces, scene.sources_m, poses.position_m),
         scene.sources_m,
         poses.position_m,

@@ -22,7 +22,7 @@ from .field.sum import Fields, channel_matrices, mean_pair_power, rss_dbm
 from .options import Field, Run, Search
 from .paths import Faces, PathSet
 from .scene import Scene, buried_towers, within_reach
-from .search import mirror as image
+from .search import mirror
 from .search.edges import find_edge_paths
 from .search.interactions import OtherInteractions, OtherSearch, path_powers
 from .search.power_cut import CHECKED_POSES, loss_in_words, within_cut
@@ -240,7 +240,7 @@ def passed(site: Site, scene: Scene, poses: Poses, paths: PathSet, search: Searc
         bounces = within_cut(bounces, scene.sources_m, poses.position_m, search.power_cut_db)
     if search.max_depth > 1:
         notes = [*notes, "paths over a crown and a building, or over two crowns"]
-    return scene, image.merge([paths, bounces], search.max_depth, None), notes
+    return scene, mirror.merge([paths, bounces], search.max_depth, None), notes
 
 
 def _clear_of_terrain(site: Site, scene: Scene, poses: Poses, paths: PathSet) -> BoolArray:

@@ -357,15 +357,14 @@ def path_search(
         ``seconds_image``, ``seconds_sionna``, ``ratio``, ``paths_image``, ``paths_sionna``, ``missing_paths``,
         ``extra_paths`` and ``rss_max_error_db`` (image against Sionna), and the conditions.
     """
-    from ..search import mirror as image
-    from ..search import sionna
+    from ..search import mirror, sionna
 
     site, link, some = random_scene(poses, buildings=buildings)
     scene = Scene.of(site, link, some)
 
     def search() -> float:
         started = time.perf_counter()
-        image.find_paths(
+        mirror.find_paths(
             scene.faces,
             scene.sources_m,
             some.position_m,

@@ -8,9 +8,8 @@ node that stands still is replayed as a fixed tower is, bit by bit.
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,7 @@ from ..field.sum import Fields, channel_matrices
 from ..options import Field, Loss, Run, Search, Whole
 from ..paths import Faces, PathSet
 from ..replay import Replay, replay
+from .parts import Each, put_together
 
 PLACES_AT_ONCE = 64
 """Places of a node in one block: H of a block has this many times the links that count."""
@@ -95,7 +95,7 @@ def replay_moving(
     field: Field = Field(),  # noqa: B008
     run: Run = Run(),  # noqa: B008
     *,
-    each: Callable[[Site, Link, Poses, Search, Field, Run], Replay] = replay,
+    each: Each = replay,
 ) -> Replay:
     """Replay a flight against one tower that has a place of its own at every pose.
 
@@ -149,7 +149,7 @@ def replay_moving(
         done += len(block.rows)
         if progress is not None:
             progress(done / max(len(poses), 1))
-    return _put_together(parts, [block.rows for block in blocks], name)
+    return put_together(parts, [block.rows for block in blocks])
 
 
 def _whole(link: Link, poses: Poses, sources_m: FloatArray) -> Whole:
@@ -183,7 +183,7 @@ def _scene_of(
 
 def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
     """Replay of a block as of one tower, which had its own place at each pose."""
-    row = np.arange(len(block.rows))
+    row, bent = np.arange(len(block.rows)), replayed.edge_paths
 
     def own(values: AnyArray) -> AnyArray:
         return np.ascontiguousarray(values[row, block.own][:, None])
@@ -196,87 +196,10 @@ def _of_one_tower(replayed: Replay, name: str, block: _Block) -> Replay:
         has_path=own(replayed.has_path),
         pairs_differ=None if replayed.pairs_differ is None else own(replayed.pairs_differ),
         paths=replace(replayed.paths, tower=np.zeros_like(replayed.paths.tower)),
+        edge_paths=None if bent is None else replace(bent, tower=np.zeros_like(bent.tower)),
         towers=(name,),
         left_out=[re.sub(re.escape(name) + "@[0-9]+", name, text) for text in replayed.left_out],
     )
-
-
-def _put_together(parts: list[Replay], rows: list[IntArray], name: str) -> Replay:
-    """One replay of blocks, poses in their order."""
-    first, count = parts[0], sum(map(len, rows))
-    # faces of crowns are numbered as they are met: other blocks have others
-    faces, shifted = _joined_faces(parts)
-    arrays: dict[str, Any] = {}
-    for column in ("rss_dbm", "rss_power_dbm", "h", "has_path"):
-        values = [getattr(part, column) for part in parts]
-        whole = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
-        for at, value in zip(rows, values, strict=True):
-            whole[at] = value
-        arrays[column] = whole
-    if first.pairs_differ is not None:
-        differ: BoolArray = np.zeros((count, 1), dtype=np.bool_)
-        for at, part in zip(rows, parts, strict=True):
-            differ[at] = part.pairs_differ
-        arrays["pairs_differ"] = differ
-    in_flight = [replace(paths, pose=at[paths.pose]) for at, paths in zip(rows, shifted, strict=True)]
-    paths = PathSet.one_after_another(in_flight)
-    return replace(
-        first,
-        **arrays,
-        paths=paths.select(np.argsort(paths.pose, kind="stable")),
-        faces=faces,
-        seconds=sum(part.seconds for part in parts),
-        search_seconds=sum(part.search_seconds for part in parts),
-        towers=(name,),
-        left_out=_counted(parts),
-    )
-
-
-def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
-    """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
-    least = min(len(part.faces) for part in parts)
-    if all(len(part.faces) == least for part in parts):
-        return parts[0].faces, [part.paths for part in parts]
-    from ..paths import joined
-
-    common = least if least == min(_shared(parts[0].faces, part.faces) for part in parts) else 0
-    faces, out = _face_part(parts[0].faces, 0, common), []
-    for part in parts:
-        shift = len(faces) - common
-        own = part.paths.faces
-        out.append(replace(part.paths, faces=np.where(own >= common, own + shift, own)))
-        faces = joined(faces, _face_part(part.faces, common, len(part.faces)))
-    return faces, out
-
-
-def _shared(one: Faces, other: Faces) -> int:
-    """How many faces from the first on are the same in both."""
-    count = min(len(one), len(other))
-    same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
-    return count if same.all() else int(np.argmin(same))
-
-
-def _face_part(faces: Faces, start: int, stop: int) -> Faces:
-    arrays = {
-        name: getattr(faces, name)[start:stop]
-        for name in ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
-    }
-    tuples = {name: getattr(faces, name)[start:stop] for name in ("material", "label", "polygon")}
-    return Faces(**arrays, **tuples)
-
-
-_COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
-
-
-def _counted(parts: list[Replay]) -> list[str]:
-    """What was left out, each message once; counts at the front of a message are added up."""
-    counts: dict[str, list[int]] = {}
-    for text in (text for part in parts for text in part.left_out):
-        match = _COUNT.fullmatch(text)
-        key, numbers = (match[3], [int(n) for n in match.groups()[:2] if n]) if match else (text, [])
-        kept = counts.get(key, [0] * len(numbers))
-        counts[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
-    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in counts.items()]
 
 
 def moving_matrices(

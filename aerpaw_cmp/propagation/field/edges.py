@@ -14,8 +14,8 @@ import numpy as np
 from ...common.units import ComplexArray, FloatArray, IntArray, wavelength_m
 from ..arrays import Array, Link, Poses
 from ..edges import EdgePaths, Edges
-from ..field import dyads
 from ..paths import Faces
+from . import dyads
 from .fresnel import FaceMaterials, reflection_coefficients
 from .sum import radiated
 from .wedge import Fresnel, wedge_matrix

@@ -9,8 +9,8 @@ import numpy as np
 from ...common.units import AnyArray, FloatArray, IntArray
 from ...site.antennas import Isotropic
 from ..arrays import Array, Link, Pattern, Poses
-from ..field import dyads
 from ..paths import Faces, PathSet
+from . import dyads
 
 
 class Geometry(NamedTuple):

@@ -13,8 +13,8 @@ import numpy as np
 from numba.extending import overload
 
 from ...common.units import FloatArray
-from ..field import dyads, fresnel
 from ..numba_options import kernel, law
+from . import dyads, fresnel
 from .geometry import Elements, Ends, Geometry
 
 LANES = 64

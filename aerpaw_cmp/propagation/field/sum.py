@@ -23,8 +23,8 @@ from ...common.errors import UsageError
 from ...common.units import AnyArray, ComplexArray, FloatArray, IntArray, amplitude_from_db, db_from_power, wavelength_m
 from ...propagation import compiled
 from ..arrays import Array, Link, Poses
-from ..field import dyads
 from ..paths import Faces, PathSet
+from . import dyads
 from .fresnel import FaceMaterials, coefficients
 from .geometry import Elements, Ends, Geometry, directions, geometry, parts_of, pattern_fields, plain, rows_of
 

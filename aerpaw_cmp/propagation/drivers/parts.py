@@ -1,0 +1,137 @@
+"""A replay in parts of its poses, put together again: bounds the memory of long flights."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import fields, replace
+from typing import Any
+
+import numpy as np
+
+from ...common.units import IntArray
+from ...site.site import Site
+from ..arrays import Link, Poses
+from ..edges import EdgePaths
+from ..options import Field, Run, Search, Whole
+from ..paths import Faces, PathSet, joined
+from ..replay import Replay, replay
+
+Each = Callable[[Site, Link, Poses, Search, Field, Run], Replay]
+"""How a part is replayed: :func:`replay`, or :func:`aerpaw_cmp.propagation.drivers.pairs.replay_pairs`."""
+
+
+def replay_in_parts(
+    site: Site, link: Link, poses: Poses, search: Search, field: Field, run: Run, *, size: int, each: Each = replay
+) -> Replay:
+    """Replay at most ``size`` poses at once.
+
+    Parameters
+    ----------
+    site, link, poses, search, field, run
+        As for :func:`aerpaw_cmp.propagation.replay.replay`, engine ``image``.
+    size : int
+        Most poses of a part; the parts are of about one size.
+    each : callable
+        How a part is replayed.
+
+    Returns
+    -------
+    Replay
+        That of all poses at once.
+    """
+    rows = np.array_split(np.arange(len(poses)), max(1, -(-len(poses) // size)))
+    if len(rows) == 1:
+        return each(site, link, poses, search, field, run)
+    good = poses.position_m[np.isfinite(poses.position_m).all(axis=1)]
+    links = len(poses) * len(link.tower_arrays)
+    pairs = links * len(link.uav_array) * len(next(iter(link.tower_arrays.values())))
+    whole = Whole(np.stack([good.min(axis=0), good.max(axis=0)]) if len(good) else good, links, pairs)
+    progress, run = run.progress, replace(run, progress=None, whole=whole)
+    parts: list[Replay] = []
+    for at in rows:
+        parts.append(each(site, link, Poses(poses.position_m[at], poses.rotation[at]), search, field, run))
+        search = replace(search, check_power_cut=False)  # one part tells what a cut costs
+        if progress is not None:
+            progress(float(at[-1] + 1) / len(poses))
+    return put_together(parts, rows)
+
+
+def put_together(parts: list[Replay], rows: list[IntArray]) -> Replay:
+    """One replay of parts, poses in their order; the parts are taken apart, so that memory holds them once."""
+    first, count = parts[0], sum(map(len, rows))
+    # faces of crowns are numbered as they are met: other blocks have others
+    faces, shifted = _joined_faces(parts)
+    bent = [part.edge_paths for part in parts]
+    rest: dict[str, Any] = {
+        "faces": faces,
+        "seconds": sum(part.seconds for part in parts),
+        "search_seconds": sum(part.search_seconds for part in parts),
+        "left_out": _counted(parts),
+        "edge_paths": None if first.edge_paths is None else _edge_paths([b for b in bent if b is not None], rows),
+    }
+    names = ["rss_dbm", "rss_power_dbm", "h", "has_path", *(["pairs_differ"] if first.pairs_differ is not None else [])]
+    columns = {name: [getattr(part, name) for part in parts] for name in names}
+    parts.clear()
+    arrays: dict[str, Any] = {}
+    for name in names:
+        values = columns.pop(name)
+        arrays[name] = np.empty((count, *values[0].shape[1:]), dtype=values[0].dtype)
+        for at, value in zip(rows, values, strict=True):
+            arrays[name][at] = value
+    in_flight = [replace(paths, pose=at[paths.pose]) for at, paths in zip(rows, shifted, strict=True)]
+    paths = PathSet.one_after_another(in_flight)
+    if (np.diff(paths.pose) < 0).any():
+        paths = paths.select(np.argsort(paths.pose, kind="stable"))
+    return replace(first, **arrays, **rest, paths=paths)
+
+
+def _edge_paths(parts: list[EdgePaths], rows: list[IntArray]) -> EdgePaths:
+    moved = [replace(part, pose=at[part.pose]) for at, part in zip(rows, parts, strict=True)]
+    whole = EdgePaths(**{f.name: np.concatenate([getattr(p, f.name) for p in moved]) for f in fields(EdgePaths)})
+    return whole.select(np.argsort(whole.pose, kind="stable"))
+
+
+def _joined_faces(parts: list[Replay]) -> tuple[Faces, list[PathSet]]:
+    """Faces of all blocks and their paths over them; faces that all blocks share are held once."""
+    least = min(len(part.faces) for part in parts)
+    if all(len(part.faces) == least for part in parts):
+        return parts[0].faces, [part.paths for part in parts]
+    common = least if least == min(_shared(parts[0].faces, part.faces) for part in parts) else 0
+    faces, out = _face_part(parts[0].faces, 0, common), []
+    for part in parts:
+        shift = len(faces) - common
+        own = part.paths.faces
+        out.append(replace(part.paths, faces=np.where(own >= common, own + shift, own)))
+        faces = joined(faces, _face_part(part.faces, common, len(part.faces)))
+    return faces, out
+
+
+def _shared(one: Faces, other: Faces) -> int:
+    """How many faces from the first on are the same in both."""
+    count = min(len(one), len(other))
+    same = (one.normal[:count] == other.normal[:count]).all(axis=1) & (one.offset_m[:count] == other.offset_m[:count])
+    return count if same.all() else int(np.argmin(same))
+
+
+def _face_part(faces: Faces, start: int, stop: int) -> Faces:
+    arrays = {
+        name: getattr(faces, name)[start:stop]
+        for name in ("normal", "offset_m", "along", "across", "lower", "upper", "solid")
+    }
+    tuples = {name: getattr(faces, name)[start:stop] for name in ("material", "label", "polygon")}
+    return Faces(**arrays, **tuples)
+
+
+_COUNT = re.compile(r"(\d+)(?: of (\d+))? (.*)", re.DOTALL)
+
+
+def _counted(parts: list[Replay]) -> list[str]:
+    """What was left out, each message once; counts at the front of a message are added up."""
+    counts: dict[str, list[int]] = {}
+    for text in (text for part in parts for text in part.left_out):
+        match = _COUNT.fullmatch(text)
+        key, numbers = (match[3], [int(n) for n in match.groups()[:2] if n]) if match else (text, [])
+        kept = counts.get(key, [0] * len(numbers))
+        counts[key] = [one + other for one, other in zip(kept, numbers, strict=False)]
+    return [" of ".join(map(str, numbers)) + (" " if numbers else "") + text for text, numbers in counts.items()]

@@ -41,6 +41,7 @@ from ..propagation.drivers.moving import site_with_tower_at
 from ..propagation.field.sum import mean_pair_power
 from ..propagation.options import Field, Run, Search
 from ..propagation.search.interactions import summary
+from ..propagation.search.sionna import free_memory
 from ..site.site import Site
 
 ATTITUDE_ROWS = 200
@@ -118,6 +119,7 @@ def _audit(data: FlightData, replays: Sequence[Replayed], progress: Progress) ->
     for text, call in zip(named, calls, strict=True):
         progress(text)
         parts.append(call())
+    free_memory()
     errors = [p.rss_max_error_db for p in parts if np.isfinite(p.rss_max_error_db)]
     links = sum(p.links for p in parts)
     fields = sum((p.field for p in parts if p.field is not None), attitude_checked(data, replays))

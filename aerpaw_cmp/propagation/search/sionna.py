@@ -19,6 +19,7 @@ from __future__ import annotations
 import gc
 import inspect
 import re
+import sys
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from importlib import metadata
@@ -106,6 +107,12 @@ def load_variant(prefer: str | None = None) -> str:
     raise UsageError(
         f"Dr.Jit finds no {' and no '.join(kinds)} device", cause="'aerpaw-cmp doctor' says what is missing"
     )
+
+
+def free_memory() -> None:
+    """Give back what Dr.Jit keeps for further searches, if it was ever loaded."""
+    if "drjit" in sys.modules:
+        sys.modules["drjit"].flush_malloc_cache()
 
 
 def engine_versions() -> dict[str, str]:
@@ -298,6 +305,8 @@ class _Finder:
         for i in range(batch):
             scene.add(rt.Receiver(name=f"rx{i}", position=[0.0, 0.0, 1.0]))
         self.limit, self.slots, self.candidates = MAXIMUM_PATHS, _slots(built, batch * len(elements_m)), None
+        if not synthetic:  # each element of a tower is a source, with a table of its own
+            self.slots //= 2 ** int(np.ceil(np.log2(len(sources.elements_m))))
         SBCandidateGenerator.MIN_SPEC_COUNT_SIZE = self.slots
         self.sources = sources.arguments(synthetic)
         self.targets = _Ends.points(np.zeros((batch, 3))).arguments(True)

@@ -404,6 +404,7 @@ class Reference:
     loss: ExpectedLoss = field(default_factory=ExpectedLoss)
     mirrors: tuple[Mirror, ...] = field(init=False)
     blocks: Blocks = field(init=False)
+    _chains: dict[tuple[int, int], list[tuple[Mirror, ...]] | None] = field(init=False, default_factory=dict)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "mirrors", mirrors_of(self.site, self.site.towers[self.tower]))
@@ -417,7 +418,15 @@ class Reference:
 
     def sequences(self, target: Vector, max_depth: int, budget: int = 20_000) -> list[tuple[Mirror, ...]] | None:
         """All sequences whose images lie on the right sides; None when there are more than the budget."""
-        facing = [m for m in self.mirrors if m.height(target) >= -MARGIN_M]
+        if (max_depth, budget) not in self._chains:
+            self._chains[max_depth, budget] = self._from_source(max_depth, budget)
+        chains = self._chains[max_depth, budget]
+        # by identity: mirrors are compared field by field else
+        facing = {id(m) for m in self.mirrors if m.height(target) >= -MARGIN_M}
+        return None if chains is None else [s for s in chains if not s or id(s[-1]) in facing]
+
+    def _from_source(self, max_depth: int, budget: int) -> list[tuple[Mirror, ...]] | None:
+        """The sequences that the tower can begin, wherever the other end is."""
         chains: list[tuple[Mirror, ...]] = [()]
         level: list[tuple[tuple[Mirror, ...], Vector]] = [((), self.source)]
         for depth in range(1, max_depth + 1):
@@ -428,7 +437,7 @@ class Reference:
                         grown.append(((*past, mirror), mirror.mirrored(image)))
             if len(grown) > budget:
                 return None
-            chains += [s for s, _ in grown if s[-1] in facing]
+            chains += [s for s, _ in grown]
             level = grown if depth < max_depth else []
         return chains
 

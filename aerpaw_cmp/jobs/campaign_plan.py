@@ -268,7 +268,7 @@ def kept_outcomes(tasks: Sequence[Task], keep: str | None, progress: Progress) -
             key = task_facts(task).key
             orders[number] = Order(task=task, key=key, keep=keep)
             outcome = store.load(key) if key in there else None
-            if outcome is not None:
+            if isinstance(outcome, Outcome):
                 outcomes.put(number, outcome)
                 del orders[number]
     for text in store.warnings:

@@ -9,6 +9,8 @@ import io
 import json
 import math
 import os
+import re
+import zipfile
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib import import_module, metadata
@@ -28,6 +30,8 @@ LAYOUT = 4
 """Raised whenever the form of an entry changes."""
 
 _SEAL = b"aerpaw-cmp outcome"
+
+_TORN = (OSError, EOFError, RecursionError, zipfile.BadZipFile)
 
 READERS = "aerpaw_cmp.readers"
 """Entry points of readers: those of other packages count with their version."""
@@ -66,8 +70,12 @@ class OutcomeStore:
                 f"a damaged outcome was not used, its task is computed anew: {self.place.url}/{key}.npz"
             )
             return None
-        with np.load(io.BytesIO(content), allow_pickle=False) as parts:
-            return self._decode(json.loads(parts["content"].tobytes()), _Packed(parts["arrays"]))
+        try:
+            with np.load(io.BytesIO(content), allow_pickle=False) as parts:
+                return self._decode(json.loads(parts["content"].tobytes()), _Packed(parts["arrays"]))
+        except (ValueError, LookupError, TypeError, ArithmeticError, AttributeError, *_TORN):
+            self.warnings.append(f"an outcome that this tool did not write was not used: {self.place.url}/{key}.npz")
+            return None
 
     def _knows(self, value: Any) -> bool:
         """Whether :meth:`load` could give a record back."""
@@ -150,7 +158,25 @@ class OutcomeStore:
             return tuple(items) if kind == "tuple" else items
         if kind == "dict":
             return {self._decode(k, arrays): self._decode(v, arrays) for k, v in content}
-        return self._types[kind](**{name: self._decode(item, arrays) for name, item in content.items()})
+        fields = {name: self._decode(item, arrays) for name, item in content.items()}
+        for field in dataclasses.fields(self._types[kind]):
+            if field.name in fields and not _may_be(fields[field.name], str(field.type)):
+                raise TypeError(f"{kind}.{field.name} is no {field.type}")
+        return self._types[kind](**fields)
+
+
+_KINDS: dict[str, type | tuple[type, ...]] = {
+    "float": (int, float), "int": int, "str": str, "bool": bool, "tuple": tuple, "dict": dict, "Mapping": dict,
+    "AnyArray": np.ndarray, "FloatArray": np.ndarray, "IntArray": np.ndarray, "BoolArray": np.ndarray,
+}  # fmt: skip
+
+
+def _may_be(value: Any, annotation: str) -> bool:
+    """Whether a value can stand in a field: a forged entry must not fail where its numbers are used."""
+    kinds = [_KINDS.get(part.strip().split("[")[0]) for part in re.split(r"\|(?![^\[]*\])", annotation)]
+    if value is None:
+        return "None" in annotation or None in kinds
+    return None in kinds or any(isinstance(value, kind) for kind in kinds if kind is not None)
 
 
 class _Packed:

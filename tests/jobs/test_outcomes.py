@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import multiprocessing
 import os
@@ -14,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from aerpaw_cmp.common.files import seal
 from aerpaw_cmp.flight.overrides import overridden
 from aerpaw_cmp.flight.settings import FlightFile, load_flight
 from aerpaw_cmp.jobs import campaign_tasks, sample
@@ -83,6 +85,32 @@ def test_a_damaged_entry_is_told_and_not_used(tmp_path: Path, place: int) -> Non
     file.write_bytes(content)
     assert store.load("a") is None
     assert "damaged" in store.warnings[0]
+
+
+@pytest.mark.parametrize(
+    "forged",
+    [
+        b"",
+        b"no archive",
+        {"content": b"[", "arrays": b""},
+        {"content": b'{"is": "NoSuchRecord", "of": {}}', "arrays": b""},
+        {"content": b'{"is": "FlownTrack", "of": {"flight": 3, "time_s": 1, "position_m": 2}}', "arrays": b""},
+        {"content": b'{"is": "FlownTrack", "of": {"nothing": 3}}', "arrays": b""},
+        {"content": b'{"is": "array", "of": {"from": 0, "kind": "f8", "shape": [1000000]}}', "arrays": b"12345678"},
+        {"content": b'{"is": "array", "of": {"from": 0, "kind": "O", "shape": [1]}}', "arrays": b"12345678"},
+        {"content": b'{"is": "tuple"}', "arrays": b""},
+        {"content": b"[" * 100_000 + b"]" * 100_000, "arrays": b""},
+    ],
+)
+def test_a_forged_entry_is_told_and_not_used(tmp_path: Path, forged: bytes | dict[str, bytes]) -> None:
+    """Sealed as ours is: anybody who can write there can do that."""
+    entry = io.BytesIO(forged) if isinstance(forged, bytes) else io.BytesIO()
+    if isinstance(forged, dict):
+        np.savez(entry, **{name: np.frombuffer(part, dtype=np.uint8) for name, part in forged.items()})
+    (tmp_path / "a.npz").write_bytes(seal(entry.getvalue(), b"aerpaw-cmp outcome"))
+    store = OutcomeStore(tmp_path, TYPES)
+    assert store.load("a") is None
+    assert "that this tool did not write was not used" in store.warnings[0]
 
 
 def key_of(settings: FlightFile, flight: Path) -> str:

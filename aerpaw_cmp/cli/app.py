@@ -37,7 +37,7 @@ site_app = typer.Typer(no_args_is_help=True, rich_markup_mode=None)
 app.add_typer(site_app, name="site", help=COMMANDS["site"])
 
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output and nothing else there.")]
-Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Where the results go.")]  # noqa: UP045  typer on 3.10
+Out = Annotated[Optional[Path], typer.Option("-o", "--out", help="Output folder.")]  # noqa: UP045  typer on 3.10
 Force = Annotated[bool, typer.Option("--force", help="Replace files that this tool did not write; never an input.")]
 Export = Annotated[
     Optional[list[str]],  # noqa: UP045
@@ -62,7 +62,7 @@ DryRun = Annotated[
 ]
 Quiet = Annotated[
     bool,
-    typer.Option("-q", "--quiet", help="No progress and no remarks; results, warnings and failures are still shown."),
+    typer.Option("-q", "--quiet", help="Results, warnings and failures only."),
 ]
 
 

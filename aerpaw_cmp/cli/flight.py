@@ -80,13 +80,25 @@ def report(
         print_json(outcome.metrics)
     else:
         _print_report_summary(outcome)
-    return _verdict(outcome, strict)
+    return max(_verdict(outcome, strict), _nothing_compared(outcome.metrics))
+
+
+def _nothing_compared(metrics: Mapping[str, Any]) -> int:
+    """1 where no channel and no rank has samples enough to compare, which is said; 0 else."""
+    from ..compare.memory import FEWEST
+
+    channels = [m for channels in metrics["rss"].values() for m in channels.values()]
+    most = max([m["n"] for m in (*channels, *metrics["rank"].values())], default=0)
+    if most >= FEWEST or any(m.get("trained_on") for m in channels):
+        return 0
+    say.warn(f"check failed: nothing was compared: {most} samples have measurement, pose and path; expected {FEWEST}")
+    return 1
 
 
 def _verdict(outcome: Any, strict: bool) -> int:
     """Say each stated check that failed; 1 where that is asked to be a failure."""
     for check in outcome.failed_checks:
-        say.warn(f"check failed: {check}")
+        say.warn(f"{'note' if check.startswith('audit pending') else 'check failed'}: {check}")
     return 1 if strict and outcome.failed_checks else 0
 
 
@@ -121,7 +133,7 @@ def audit(
         field = recorded["field"] or {}
         print(
             f"audit: {recorded['links']} links against {recorded['reference']}, {recorded['missing_paths']} paths "
-            f"missing, {recorded['extra_paths']} that it lacks; fields: {field.get('failed', 0)} checks failed"
+            f"missing, {recorded['extra_paths']} only in our engine; fields: {field.get('failed', 0)} checks failed"
         )
     print(f"report: {outcome.folder / 'report.html'}")
     return _verdict(outcome, strict)
@@ -145,10 +157,11 @@ def _print_ladder(ladder: Sequence[Mapping[str, Any]]) -> None:
         rows.append([star + model, shown, number(max(m["seconds"] for m in mine), "{:.1f}")])
     if rows:
         heads = ["model", "RMSE dB", "s"]
-        table(heads, rows, "Models on stretches left out; * simplest within one standard error of the best")
+        table(heads, rows, "Model comparison (cross-validated); * simplest replay within 1 SE of the best")
 
 
 def _print_report_summary(outcome: Any) -> None:
+    from ..compare.memory import FEWEST
     from ..compare.result import BASELINE_TITLE
 
     rows = []
@@ -160,7 +173,7 @@ def _print_report_summary(outcome: Any) -> None:
                     tower,
                     channel,
                     number(m["offset_db"], "{:.1f}"),
-                    number(m["rmse_db"], "{:.2f}"),
+                    number(m["rmse_db"] if m["n"] >= FEWEST else None, "{:.2f}"),
                     f"{number(ci[0], '{:.2f}')} .. {number(ci[1], '{:.2f}')}",
                     *(number(m["baselines"][name]["rmse_db"], "{:.2f}") for name in BASELINE_TITLE),
                     number(m["correlation"], "{:.2f}"),

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Mapping
+from typing import Annotated, Any
 
 import typer
 
@@ -60,12 +61,18 @@ def bench(
         "missing / extra",
         "RSS error dB max / rms",
     ]
-    table([*header, "rank disagreement per K"], rows, f"Speed against error; {result['conditions']}")
+    table([*header, "rank disagreement per K"], rows, f"Speed against error ({_conditions(result['conditions'])})")
     for name, ratio in result["ratios"].items():
         print(f"{name}: {ratio:.3g} times")
     if result["report"]:
         seconds = {name.removeprefix("seconds_"): value for name, value in result["report"].items()}
         print("report: " + ", ".join(f"{name} {value:.1f} s" for name, value in seconds.items()))
+
+
+def _conditions(made: Mapping[str, Any]) -> str:
+    """Conditions of a benchmark in words."""
+    towers = ", ".join(made["towers"])
+    return f"{made['poses']} positions, towers {towers}, {made['buildings']} buildings, {made['cpus']} CPUs"
 
 
 @command(

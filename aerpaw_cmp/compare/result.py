@@ -146,8 +146,10 @@ class RssFurther:
 
     A field without a default is always written; one whose default is None only where the flight has it.
     ``n_flagged`` is by reason; ``compared_with`` says by the name of each baseline and of each other assumption whether
-    the replay is better or worse on the same samples; ``averaged`` is by simulation and window; ``trimmed``,
-    ``identifiable_db``, ``block_length`` and the counts are those of :class:`~aerpaw_cmp.compare.rss.RssComparison`.
+    the replay is better or worse on the same samples; ``averaged`` is by simulation and window.
+    ``n_outliers`` samples lie far outside the distribution of the channel's own levels: they count in all numbers but
+    ``rmse_without_outliers_db``. ``trimmed``, ``identifiable_db``, ``block_length`` and the other counts are those of
+    :class:`~aerpaw_cmp.compare.rss.RssComparison`.
     """
 
     n_measured_out: int
@@ -157,6 +159,8 @@ class RssFurther:
     trimmed: Fit
     n_too_low: int
     n_no_pose: int
+    n_outliers: int
+    rmse_without_outliers_db: float
     n_flagged: Mapping[str, int]
     clock: ClockResult | None
     baseline_rmse_ci95_db: Mapping[str, Interval]

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from ..common.units import FloatArray, IntArray, db_from_power, power_from_db
+from ..common.units import BoolArray, FloatArray, IntArray, db_from_power, power_from_db
 from .offset import SPAN_DB, STEP_DB, OffsetFit, grid_offset, identifiable_range, offset_curve, trimmed_offset
 from .statistics import (
     NO_INTERVAL,
@@ -230,6 +230,31 @@ def without_errors(score: RssComparison) -> RssComparison:
         trimmed=replace(score.trimmed, rmse_db=float("nan")),
         fitted_on_scored=(*score.fitted_on_scored, LEARNED_HERE),
     )
+
+
+_FENCE = 4.0
+"""Levels farther than this many interquartile ranges outside the quartiles are outlying: of a normal distribution one
+in 10^9, and a deep fade of a real flight is not."""
+
+_NARROWEST_DB = 5.0
+"""Least interquartile range that counts: a UAV that hovers has next to none."""
+
+
+def outliers(level_db: ArrayLike) -> BoolArray:
+    """Samples (n,) whose level lies far outside the flight's own distribution; they are flagged, not dropped.
+
+    Examples
+    --------
+    >>> outliers([-70.0, -72.0, -69.0, 99.0]).tolist()
+    [False, False, False, True]
+    """
+    level = _levels(level_db)
+    if not np.isfinite(level).any():
+        return np.zeros(len(level), np.bool_)
+    low, high = np.nanquantile(level, [0.25, 0.75])
+    reach = _FENCE * max(high - low, _NARROWEST_DB)
+    with np.errstate(invalid="ignore"):
+        return np.asarray((level < low - reach) | (level > high + reach))
 
 
 def _levels(values: ArrayLike) -> FloatArray:

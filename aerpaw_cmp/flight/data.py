@@ -502,7 +502,7 @@ def _idle_attitude(data: FlightData) -> tuple[str, ...]:
                 if pose is None or data.track is None
                 else "the telemetry holds no attitude: level flight along the course stands in"
                 if pose.valid.any()
-                else f"the telemetry covers none of its instants: {data.track.why_not(pose)}"
+                else f"no sample lies in the telemetry: {data.track.why_not(pose)}"
             )
             messages.append(f"rt.attitude: {mode} has no effect on {kind} of {tower}: {why}.")
         elif pose is not None and kind == "rank" and not pose.valid.all():

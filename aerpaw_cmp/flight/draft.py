@@ -207,6 +207,12 @@ FLOWN_ABOVE_M = 15.0
 """A flight that never got higher has no part that is better than its start."""
 
 
+QUICK_AUDIT = 24
+"""Links that the audit of a first report checks."""
+
+_QUICK = "  # a quick audit of the ray tracing; report --audit 200 for numbers to publish"
+
+
 def _settings(entries: _Entries) -> list[str]:
     """Lines for ``rt``, ``rss`` and ``rank`` that real logs ask for."""
     if entries.flown is None:
@@ -214,10 +220,14 @@ def _settings(entries: _Entries) -> list[str]:
     frame, lines = entries.flown[0].frame, []
     if "rank" in entries.kinds:
         lines.append("# rt.attitude: logged needs link.rank.uav mounted as seen from the aircraft's nose.\n")
+        lines.append(f"rt: {{audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
     elif _has_attitude(frame):
-        lines.append("rt: {attitude: logged}\n")
+        lines.append(f"rt: {{attitude: logged, audit_links: {QUICK_AUDIT}}}{_QUICK}\n")
     else:
-        lines.append("rt: {attitude: level}  # no attitude in the telemetry: the nose points along the track?\n")
+        lines.append(
+            f"rt: {{attitude: level, audit_links: {QUICK_AUDIT}}}"
+            "  # a quick audit; no attitude in the telemetry: the nose points along the track?\n"
+        )
     low: dict[str, Any] = {}
     if float(np.nanmax(frame["altitude_m"].to_numpy(np.float64), initial=-np.inf)) > FLOWN_ABOVE_M:
         low = {"minimum_height_m": MINIMUM_HEIGHT_M}

@@ -72,6 +72,10 @@ PASSES_WITHIN_M = 3.0
 """Two passes of one place, first and second half of a flight, come this near."""
 
 
+SHORTEST_S = 5.0
+"""A shorter stretch of large error is a fade."""
+
+
 def compare_flight(data: FlightData, replays: FlightReplay) -> FlightResult:
     """Every series against its replay, and every two channels of a tower against each other."""
     results = []
@@ -140,6 +144,12 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
         lag_s=float("nan") if clock is None else clock.result.radio_minus_telemetry_s,
         fitted_on_scored=("lag_s",) if clock is not None and clock.result.applied == APPLIED else (),
     )
+    wild = rss.outliers(levels.measured_db)
+    without = score.rmse_db
+    if wild.any():
+        kept = np.where(wild, np.nan, levels.measured_db)
+        rest = offsets.grid_offset(kept, levels.simulated_db, step_db=settings.step_db, span_db=settings.span_db)
+        without = rest.rmse_db
     direct = replayed.spread(_has_direct(replayed).astype(np.float64), np.nan)
     other = rss_alternatives(data.site, data.settings.rt, replayed, settings.field)
     alternatives = {name: at_samples(series, replayed, level, settings) for name, level in other.items()}
@@ -179,6 +189,8 @@ def compare_rss_series(data: FlightData, series: RssSeries, replayed: Replayed) 
             trimmed=Fit(offset_db=score.trimmed.offset_db, rmse_db=score.trimmed.rmse_db, n=score.trimmed.n),
             n_too_low=int((replayed.valid & ~levels.posed).sum()),
             n_no_pose=int((~replayed.valid).sum()),
+            n_outliers=int(wild.sum()),
+            rmse_without_outliers_db=without,
             n_flagged=dict(series.flagged),
             clock=None if clock is None else clock.result,
             baseline_rmse_ci95_db=score.baseline_intervals,
@@ -513,7 +525,8 @@ def _worst(
     for ours, theirs in (("heading_deg", "heading_deg"), ("foliage_depth_m", "foliage_m")):
         if ours in geometry:
             context[theirs] = geometry[ours]
-    return rss.error_spans(time, residual_db, position_m=position_m, context=context, largest=6)
+    spans = rss.error_spans(time, residual_db, position_m=position_m, context=context, largest=len(residual_db))
+    return [span for span in spans if span.end_s - span.start_s >= SHORTEST_S][:6]
 
 
 # --- rank ----------------------------------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """The ladder of models of a flight: which antennas, attitude, ground, buildings and trees its measurement asks for.
 
 Stages come one after the other (antennas, ground, buildings, trees); each adds its variants to the best model so far,
-by the RMSE on stretches left out. Everything but the offset is fixed beforehand.
+by the RMSE on held-out segments. Everything but the offset is fixed beforehand.
 """
 
 from __future__ import annotations
@@ -55,6 +55,9 @@ Antennas = Literal["isotropic", "measured", "installed", "learned"]
 Ground = Literal["none", "coherent", "weakened", "rough", "power sum"]
 Trees = Literal["none", "p833", "weissberger", "opaque"]
 
+GROUND_WORDS = {"coherent": "coherent", "weakened": "attenuated", "rough": "rough", "power sum": "incoherent"}
+"""What the ladder calls the sums and losses of the ground reflection."""
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Model:
@@ -79,7 +82,7 @@ class Model:
         }[self.antennas]  # fmt: skip
         parts += {"ignored": [], "level": ["heading"], "logged": ["attitude"]}[self.attitude]
         if self.ground != "none":
-            parts.append(f"ground ({self.ground})")
+            parts.append(f"{GROUND_WORDS[self.ground]} ground reflection")
         parts += ["buildings"] if self.buildings else []
         parts += ["diffraction"] if self.diffraction else []
         if self.trees != "none":
@@ -402,7 +405,7 @@ def recommended_text(settings: FlightFile, ladder: FlightLadder | None, name: st
     changed = recommended_settings(stated, ladder.recommended)
     chosen = ladder.ladder.rungs[ladder.ladder.recommended].model
     rmse = ladder.ladder.rmse_db[ladder.ladder.recommended]
-    head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on stretches left out).\n"
+    head = f"# {name} with the model that its ladder recommends: {chosen} ({rmse:.2f} dB on held-out segments).\n"
     text = head + yaml.safe_dump(changed, sort_keys=False, allow_unicode=True, width=120)
     parse_yaml(text, FlightFile)  # a flight file that its own reader refuses is a fault of ours
     return text

@@ -394,7 +394,7 @@ def _failed_checks(metrics: dict[str, Any]) -> tuple[str, ...]:
             elif m["at_search_edge"]:
                 failed.append(f"{tower} {channel}: the best offset lies at the edge of the searched span")
     if metrics.get("audit_command"):
-        failed.append(f"the replay engine is not audited yet: run {metrics['audit_command']}")
+        failed.append(f"audit pending; run `{metrics['audit_command']}`")
     audit = (metrics.get("rt") or {}).get("audit") or {}
     if audit.get("missing_paths"):
         failed.append(f"audit: the engine misses {audit['missing_paths']} paths that {audit['reference']} finds")

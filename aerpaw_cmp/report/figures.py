@@ -50,9 +50,9 @@ def figure_specs(data: ReportData) -> list[FigureSpec]:
                 name="ladder",
                 section="ladder",
                 title="Models from the simplest to the richest",
-                caption="RMSE on stretches left out, a line per tower and channel. Whiskers: 95 % interval of the "
+                caption="RMSE on held-out segments, a line per tower and channel. Whiskers: 95 % interval of the "
                 "difference to the best model on the same samples. Filled: the recommended model.",
-                alt=f"RMSE of {len({row.model for row in data.ladder})} models on stretches left out.",
+                alt=f"RMSE of {len({row.model for row in data.ladder})} models on held-out segments.",
                 draw=lambda: ladder(data.ladder),
                 page=True,
             )

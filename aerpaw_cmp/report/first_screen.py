@@ -9,18 +9,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..common.provenance import KEY, union
+from ..compare.memory import FEWEST
 from ..compare.result import AuditResult
 from .data import Baseline, RankAtK, RankPanel, ReportData, RssPanel
-from .words import count, pretty, training_sentence
+from .words import (
+    NOTHING_COMPARED,
+    TOO_FEW_COMPARED,
+    Judged,
+    count,
+    first_sentence,
+    local_error,
+    pretty,
+    training_sentence,
+    trust,
+)
 
 NO_INTERVAL = "no interval can be given"
 
 LARGE_DB = 1.5
 """A channel whose RMSE is this much [dB] above the pooled one is named as where the prediction fails."""
-
-
-LEAST_DB = 0.05
-"""A smaller difference [dB] is none at the digits of the first sentence."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -36,12 +43,14 @@ class Headline:
 def verdict(data: ReportData) -> tuple[str, ...]:
     """Two sentences: how good against which baseline; where it fails, and whether to trust it."""
     scored = _scored(data.rss)
-    first = _rss_sentence(scored) if scored else _rank_sentence(data.rank)
+    found = judged(scored)
+    first = first_sentence(found) if found is not None else _rank_sentence(data.rank)
     if learned := _training(data):
-        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, _trust(data)) if part)
+        return learned, " ".join(part for part in (_baseline_sentence(data.rss), first, trust(data)) if part)
     if not first:
-        return ("Nothing could be compared: no sample has a measurement, a pose and a path at once.", _trust(data))
-    return first, " ".join(part for part in (_fails(scored), _trust(data)) if part)
+        most = max([panel.n for panel in data.rss], default=0)
+        return (NOTHING_COMPARED if not most else TOO_FEW_COMPARED.format(n=most), trust(data))
+    return first, " ".join(part for part in (_fails(scored), trust(data)) if part)
 
 
 def _training(data: ReportData) -> str:
@@ -61,7 +70,7 @@ def _baseline_sentence(panels: Sequence[RssPanel]) -> str:
 
 
 def _scored(panels: Sequence[RssPanel]) -> list[RssPanel]:
-    return [panel for panel in panels if panel.n and math.isfinite(panel.rmse_db)]
+    return [panel for panel in panels if panel.n >= FEWEST and math.isfinite(panel.rmse_db)]
 
 
 def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
@@ -70,8 +79,8 @@ def pooled_db(rmse_db: Sequence[float], n: Sequence[int]) -> float:
     return float(np.sqrt((weight * np.asarray(rmse_db) ** 2).sum() / weight.sum()))
 
 
-def best_baseline(panels: Sequence[RssPanel]) -> tuple[str, float] | None:
-    """Name and pooled RMSE [dB] of the baseline that misses these series least; None without one that all have."""
+def baseline_errors(panels: Sequence[RssPanel]) -> dict[str, float]:
+    """Pooled RMSE [dB] of each baseline that all of these series have."""
     names = [b.name for b in panels[0].baselines] if panels else []
     errors = {}
     for name in names:
@@ -79,52 +88,50 @@ def best_baseline(panels: Sequence[RssPanel]) -> tuple[str, float] | None:
         known = [b.rmse_db for b in own if b is not None and math.isfinite(b.rmse_db)]
         if len(known) == len(panels):
             errors[name] = pooled_db(known, [panel.n for panel in panels])
-    return min(errors.items(), key=lambda item: item[1]) if errors else None
+    return errors
+
+
+def best_baseline(panels: Sequence[RssPanel]) -> tuple[str, float] | None:
+    """Name and pooled RMSE [dB] of the baseline with the smallest error; None without one that all have."""
+    return min(baseline_errors(panels).items(), key=lambda item: item[1], default=None)
 
 
 def _baseline(panel: RssPanel, name: str) -> Baseline | None:
     return next((b for b in panel.baselines if b.name == name), None)
 
 
-def _rss_sentence(panels: Sequence[RssPanel]) -> str:
+def judged(panels: Sequence[RssPanel]) -> Judged | None:
+    """Ray tracing against the baseline that matters most: the best of those that it loses to, else the best of all."""
+    if not panels:
+        return None
     total = pooled_db([p.rmse_db for p in panels], [p.n for p in panels])
     best = best_baseline(panels)
     if best is None:
-        return f"Ray tracing misses the measured level by {total:.1f} dB RMSE; no baseline could be scored."
-    name, other = best
-    words = [b.paired.verdict for p in panels if (b := _baseline(p, name)) is not None and b.paired is not None]
-    better, worse = words.count("better"), words.count("worse")
-    if len(panels) == 1:
-        shown = {"better": "and the difference is shown", "worse": "and the difference is shown"}
-        tail = f", {shown.get(words[0], 'no difference is shown')}" if words else ""
-    else:
-        tail = f"; it is shown to be better on {better} and worse on {worse} of {len(panels)} channels" if words else ""
-    digits = _digits(total, other)
-    if total - other >= LEAST_DB:
-        return (
-            f"Ray tracing is WORSE than {pretty(name)}: it misses the measured level by {total:.{digits}f} dB RMSE, "
-            f"{pretty(name)} by {other:.{digits}f} dB{tail}."
-        )
-    gain = round(total, digits) - round(other, digits)
-    beside = f"{gain:+.{digits}f}" if gain else f"{0.0:.{digits}f}"
-    return (
-        f"Ray tracing misses the measured level by {total:.{digits}f} dB RMSE, {beside} dB against "
-        f"{pretty(name)} ({other:.{digits}f} dB){tail}.".replace("-", "−", 1)
-    )
-
-
-def _digits(total: float, other: float) -> int:
-    """Digits with which two errors and their difference, each rounded, still add up: one where that will do."""
-    return 1 if abs(round(total, 1) - round(other, 1) - (total - other)) < LEAST_DB else 2
+        return Judged(ray_db=total, channels=len(panels))
+    every = []
+    for name, error in baseline_errors(panels).items():
+        paired = [b.paired for p in panels if (b := _baseline(p, name)) is not None and b.paired is not None]
+        said = [pair.verdict for pair in paired if pair.verdict != "none given"]
+        every.append(Judged(ray_db=total, channels=len(panels), name=name, other_db=error, judged=len(said),
+                            better=said.count("better"), worse=said.count("worse")))  # fmt: skip
+    lost = [one for one in every if one.worse > one.better]
+    return min(lost or every, key=lambda one: one.other_db)
 
 
 def _rank_sentence(panels: Sequence[RankPanel]) -> str:
     for panel in panels:
         at = _best_k(panel)
         if at is not None:
+            commonest = panel.extra.get("commonest") or {}
+            beside = (
+                f"; always guessing {commonest['rank']} agrees in {100 * commonest['agreement']:.0f} %"
+                if commonest.get("rank") else ""
+            )  # fmt: skip
+            agree = f" Per position they agree in {100 * at.agreement:.0f} % of samples{beside}."
             return (
-                f"The distribution of the reported rank at {panel.tower} is missed by a total variation of "
-                f"{at.total_variation:.2f} at K = {at.k:.10g}, with kappa {at.kappa:.2f} pose by pose (0 is chance)."
+                f"Rank at {panel.tower} (K = {at.k:.10g}, best of {len(panel.simulated)} thresholds): predicted and "
+                f"reported shares differ by {100 * at.total_variation:.0f} percentage points in all."
+                + (agree if math.isfinite(at.agreement) else "")
             )
     return ""
 
@@ -134,44 +141,27 @@ def _best_k(panel: RankPanel) -> RankAtK | None:
     return min(scored, key=lambda at: at.total_variation) if scored else None
 
 
+LONG_S = 5.0
+"""A shorter stretch of error is a fade, not a fault of the model."""
+
+
 def _fails(panels: Sequence[RssPanel]) -> str:
     """Where the error is largest."""
     if not panels:
         return ""
     worst = max(panels, key=lambda p: p.rmse_db)
     if len(panels) > 1 and worst.rmse_db > pooled_db([p.rmse_db for p in panels], [p.n for p in panels]) + LARGE_DB:
-        return f"It fails most at {worst.name} ({worst.rmse_db:.1f} dB)."
-    spans = [(panel, span) for panel in panels for span in panel.worst]
+        return f"Largest error of a channel: {worst.name}, {worst.rmse_db:.1f} dB."
+    spans = [
+        (panel, span)
+        for panel in panels
+        for span in panel.worst
+        if (span.end - span.start) / np.timedelta64(1, "s") >= LONG_S
+    ]
     if not spans:
         return ""
     panel, span = max(spans, key=lambda item: abs(item[1].mean_error_db))
-    cause = f" ({span.cause})" if span.cause else ""
-    return f"The largest error of a stretch, {span.mean_error_db:+.1f} dB at {panel.name}{cause}.".replace("-", "−", 1)
-
-
-def _trust(data: ReportData) -> str:
-    """Whether the numbers can be believed, by the checks that were made."""
-    doubts = []
-    if any(panel.at_search_edge for panel in data.rss):
-        doubts.append("an offset lies at the edge of its search")
-    if any(not panel.n for panel in data.rss):
-        doubts.append("a channel could not be scored")
-    audit = None if data.engine is None else data.engine.audit
-    if data.engine is not None and audit is None:
-        doubts.append("the engine is not audited yet" if data.audit_command else "the engine was not audited")
-    if audit is not None and audit.missing_paths:
-        doubts.append(f"the audit misses {count(audit.missing_paths)} paths")
-    if audit is not None and audit.fields is not None and audit.fields.failures:
-        doubts.append(f"the audit of the field failed {count(len(audit.fields.failures))} times")
-    if any(panel.lag_verdict in ("ambiguous", "failed") for panel in data.rss):
-        doubts.append("the radio clock could not be confirmed")
-    if data.synthetic:
-        doubts.append("the logs are synthetic and measure nothing")
-    elif data.site.illustrative and data.site.buildings:
-        doubts.append("the site's buildings are illustrative")
-    if not doubts:
-        return "Every check of this report was passed."
-    return "Trust it with reserve: " + "; ".join(doubts) + "."
+    return local_error(panel, span)
 
 
 def headlines(data: ReportData) -> list[Headline]:
@@ -248,14 +238,14 @@ def _difference(panels: Sequence[RssPanel]) -> list[Headline]:
                 interval=f"95 %: {low:+.1f} to {high:+.1f} dB".replace("-", "−")
                 if known
                 else "no interval can be given",
-                beside="negative: ray tracing misses less",
+                beside="negative: smaller error of ray tracing",
             )
         ]
     return [
         Headline(
             label=f"Better than {pretty(best[0])}",
             value=f"{words.count('better')} of {len(words)}",
-            interval=f"worse: {words.count('worse')}, no difference shown: {undecided}",
+            interval=f"worse: {words.count('worse')}, not significant: {undecided}",
             beside="channels, by paired 95 % intervals",
         )
     ]

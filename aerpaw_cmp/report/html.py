@@ -50,11 +50,11 @@ def number(value: float | None, decimals: int = 1, unit: str = "") -> str:
 
 
 def interval(value: tuple[float, float] | None, decimals: int = 1) -> str:
-    """An interval as ``[low, high]``, or nothing; "[none given]" where there are too few independent samples."""
+    """An interval as ``[low, high]``, or nothing; "n/a" where there are too few independent samples."""
     if value is None:
         return ""
     if not all(map(math.isfinite, value)):
-        return "[none given]"
+        return "n/a"
     return f"[{number(value[0], decimals)}, {number(value[1], decimals)}]"
 
 

@@ -465,7 +465,7 @@ def channel_difference(data: ReportData, pair: ChannelPair) -> Figure:
 
 
 def ladder(rows: Sequence[LadderRow]) -> Figure:
-    """RMSE of each model on stretches left out, a marker per tower and channel."""
+    """RMSE of each model on held-out segments, a marker per tower and channel."""
     models = list(dict.fromkeys(row.model for row in rows))
     channels = list(dict.fromkeys((row.tower, row.channel) for row in rows))
     fig = figure((9.2, 0.36 * len(models) + 1.5))
@@ -484,7 +484,7 @@ def ladder(rows: Sequence[LadderRow]) -> Figure:
                    marker="os^Dvp"[number % 6], zorder=3, label=f"{tower} {channel}".strip())  # fmt: skip
     ax.set_yticks(range(len(models)), models)
     ax.invert_yaxis()
-    ax.set_xlabel("RMSE on stretches left out [dB]")
+    ax.set_xlabel("RMSE on held-out segments [dB]")
     ax.grid(axis="y", visible=False)
     legend_below(ax)
     return fig

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 from ..common.provenance import KEY
 from ..compare.ladder import LadderRow
 from ..compare.result import BASELINE_TITLE
-from .data import Interval, RankPanel, ReportData, RssPanel
+from .data import ErrorSpan, Interval, RankPanel, ReportData, RssPanel
 
 FEW_SAMPLES = 30
 """Below this a panel is called too short for a verdict."""
@@ -45,7 +46,7 @@ def _within(value: Interval | None, decimals: int = 1) -> str:
     if value is None:
         return ""
     if not all(map(math.isfinite, value)):
-        return " (too few independent samples for an interval)"
+        return " (too few samples for an interval)"
     return f" (95 % interval {value[0]:.{decimals}f} to {value[1]:.{decimals}f})"
 
 
@@ -65,6 +66,134 @@ def headline(data: ReportData) -> str:
     engine = "" if data.engine is None else f" by the {data.engine.engine} engine"
     kind = "A synthetic" if data.synthetic else "The"
     return f"{kind} flight {data.flight} was replayed{engine} at {data.site.name} and compared: {' and '.join(parts)}."
+
+
+# --- the first words -----------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Judged:
+    """Ray tracing against one baseline: pooled RMSE [dB], and on how many channels a paired interval decides.
+
+    ``judged`` channels have an interval; on ``better`` and ``worse`` of them it excludes zero.
+    """
+
+    ray_db: float
+    channels: int
+    name: str = ""
+    other_db: float = math.nan
+    judged: int = 0
+    better: int = 0
+    worse: int = 0
+
+
+SIGNIFICANCE: tuple[tuple[Callable[[Judged], bool], str], ...] = (
+    (lambda f: not f.name, "No baseline could be scored."),
+    (lambda f: not f.judged, "Too few samples for an interval of the difference."),
+    (lambda f: f.better > 0 and f.worse > 0,
+     "Ray tracing is significantly better on {better} and worse on {worse} of {channels} channels (95 %)."),
+    (lambda f: f.worse > 0 and f.channels == 1, "Ray tracing is significantly worse (95 %)."),
+    (lambda f: f.better > 0 and f.channels == 1, "Ray tracing is significantly better (95 %)."),
+    (lambda f: f.worse > 0, "Ray tracing is significantly worse on {worse} of {channels} channels (95 %)."),
+    (lambda f: f.better > 0, "Ray tracing is significantly better on {better} of {channels} channels (95 %)."),
+    (lambda f: f.channels == 1, "The difference is not significant (95 %)."),
+    (lambda f: f.channels == 2, "The difference is not significant on either channel (95 %)."),
+    (lambda f: f.channels > 2, "The difference is not significant on any of {channels} channels (95 %)."),
+)  # fmt: skip
+"""What may follow the two errors, and when: the first whose condition holds. No other sentence says better or worse."""
+
+NOTHING_COMPARED = "Nothing could be compared: no sample has a measurement, a pose and a path at once."
+TOO_FEW_COMPARED = "Nothing could be compared: no channel has 20 samples with measurement, pose and path (at most {n})."
+
+
+def first_sentence(facts: Judged) -> str:
+    """The two errors, and what the paired intervals allow to say.
+
+    Examples
+    --------
+    >>> first_sentence(Judged(ray_db=6.72, channels=2, name="free_space", other_db=6.0, judged=2))
+    'Ray tracing: RMSE 6.7 dB; free space: 6.0 dB. The difference is not significant on either channel (95 %).'
+    """
+    beside = f"; {pretty(facts.name)}: {facts.other_db:.1f} dB" if facts.name else ""
+    text = next(text for holds, text in SIGNIFICANCE if holds(facts))
+    said = text.format(better=facts.better, worse=facts.worse, channels=facts.channels)
+    return f"Ray tracing: RMSE {facts.ray_db:.1f} dB{beside}. {said}"
+
+
+def local_error(panel: RssPanel, span: ErrorSpan) -> str:
+    """Where a channel is missed most, and the likely causes, those of the measurement first."""
+    causes = []
+    if panel.lag_verdict in ("ambiguous", "failed"):
+        causes.append("a clock that could not be confirmed")
+    if panel.extra.get("detection"):
+        causes.append("a receiver that lost its lock")
+    causes.append(span.cause or "antenna pattern or a missing path")
+    side = "above" if span.mean_error_db > 0 else "below"
+    start, end = (str(t.astype("datetime64[s]"))[-8:] for t in (span.start, span.end))
+    return (
+        f"Largest local error: measured {abs(span.mean_error_db):.1f} dB {side} predicted, {panel.name}, "
+        f"{start}-{end} UTC. Likely cause: {', or '.join(causes)}."
+    )
+
+
+def _field_failures(data: ReportData) -> int:
+    audit = None if data.engine is None else data.engine.audit
+    return 0 if audit is None or audit.fields is None else len(audit.fields.failures)
+
+
+def _missing_paths(data: ReportData) -> int:
+    audit = None if data.engine is None else data.engine.audit
+    return 0 if audit is None else audit.missing_paths
+
+
+DOUBTS: tuple[tuple[Callable[[ReportData], bool], str], ...] = (
+    (lambda d: any(p.at_search_edge for p in d.rss), "an offset lies at the edge of its search"),
+    (lambda d: any(not p.n and not p.training for p in d.rss), "a channel could not be scored"),
+    (lambda d: any(moved_by_outliers(p) for p in d.rss), "{outliers}"),
+    (lambda d: d.engine is not None and d.engine.audit is None and bool(d.audit_command), "audit pending"),
+    (lambda d: d.engine is not None and d.engine.audit is None and not d.audit_command, "no audit"),
+    (lambda d: _missing_paths(d) > 0, "the audit misses {missing} paths"),
+    (lambda d: _field_failures(d) > 0, "the audit of the field failed {failed} times"),
+    (lambda d: any(p.lag_verdict in ("ambiguous", "failed") for p in d.rss), "the radio clock could not be confirmed"),
+    (lambda d: d.synthetic, "synthetic data"),
+    (
+        lambda d: not d.synthetic and d.site.illustrative and bool(d.site.buildings),
+        "illustrative buildings",
+    ),
+)
+"""What may be said against the numbers, and when."""
+
+
+def trust(data: ReportData) -> str:
+    """Whether the numbers can be believed, by the checks that were made."""
+    facts = {
+        "missing": count(_missing_paths(data)),
+        "failed": count(_field_failures(data)),
+        "outliers": _outliers_in_words(data),
+    }
+    doubts = [text.format_map(facts) for holds, text in DOUBTS if holds(data)]
+    return f"Caution: {'; '.join(doubts)}." if doubts else "Every check of this report passed."
+
+
+MOVED_DB = 0.3
+"""Outlying samples that move an RMSE by more than this [dB] are named in the first words."""
+
+
+def moved_by_outliers(panel: RssPanel) -> float:
+    """By how much outlying samples raise the RMSE of a channel [dB]; 0 below :data:`MOVED_DB`."""
+    without = panel.extra.get("rmse_without_outliers_db")
+    if without is None or not math.isfinite(panel.rmse_db) or panel.rmse_db - without <= MOVED_DB:
+        return 0.0
+    return float(panel.rmse_db - without)
+
+
+def _outliers_in_words(data: ReportData) -> str:
+    panel = max(data.rss, key=moved_by_outliers, default=None)
+    if panel is None or not moved_by_outliers(panel):
+        return ""
+    n, without = panel.extra["n_outliers"], panel.extra["rmse_without_outliers_db"]
+    change = f"its RMSE from {without:.1f} to {panel.rmse_db:.1f} dB"
+    return f"{count(n)} outlying sample{'s raise' if n > 1 else ' raises'} at {panel.name} {change}"
 
 
 def _listed(names: list[str]) -> str:
@@ -124,7 +253,7 @@ def rss_verdict(panel: RssPanel) -> str:
     if panel.n == 0 or not math.isfinite(panel.rmse_db):
         return f"{panel.name}: nothing to score; all {count(len(panel.time))} samples are out of coverage on one side."
     text = (
-        f"{panel.name}: ray tracing misses the measurement by {panel.rmse_db:.1f} dB RMSE{_within(panel.rmse_ci95_db)} "
+        f"{panel.name}: RMSE of ray tracing {panel.rmse_db:.1f} dB{_within(panel.rmse_ci95_db)} "
         f"after an offset of {signed(panel.offset_db)} dB"
     )
     scored = [b for b in panel.baselines if math.isfinite(b.rmse_db)]
@@ -132,11 +261,11 @@ def rss_verdict(panel: RssPanel) -> str:
         return text + "."
     best = min(scored, key=lambda b: b.rmse_db)
     if best.paired is None:
-        return f"{text}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB."
-    words = best.paired.in_words(pretty(best.name)).replace("worse than", "WORSE than")
+        return f"{text}; {pretty(best.name)}: {best.rmse_db:.1f} dB."
+    words = best.paired.in_words(pretty(best.name))
     words = words.replace("(-", "(\u2212").replace("[-", "[\u2212")
     further = _detection_words(panel) + _snr_words(panel)
-    return f"{text}: {words}; {pretty(best.name)} misses it by {best.rmse_db:.1f} dB.{further}"
+    return f"{text}: {words}; {pretty(best.name)}: {best.rmse_db:.1f} dB.{further}"
 
 
 def _detection_words(panel: RssPanel) -> str:
@@ -209,7 +338,7 @@ def warnings(data: ReportData) -> list[str]:
     audit = None if data.engine is None else data.engine.audit
     if data.engine is not None and audit is None:
         texts.append(
-            f"The replay engine is not audited yet: run {data.audit_command}."
+            f"Audit pending; run `{data.audit_command}`."
             if data.audit_command
             else "The replay engine was not audited against the other engine in this report."
         )

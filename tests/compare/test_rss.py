@@ -19,6 +19,7 @@ from aerpaw_cmp.compare.rss import (
     error_spans,
     link_geometry,
     local_mean_db,
+    outliers,
     path_averaged_fits,
     residual_tables,
     seconds,
@@ -366,3 +367,13 @@ def test_free_space_leaves_five_to_seven_decibels_on_real_flights(name):
             found.intervals.autocorrelation.n_effective < 0.05 * found.n
         )  # 0.26 s apart: neighbours repeat each other
         assert found.correlation > 0.5
+
+
+def test_outliers_are_far_outside_the_flights_own_levels():
+    """A fade of 30 dB is radio; 99 dB among levels about -70 is not. A hovering UAV has no spread to speak of."""
+    rng = np.random.default_rng(2)
+    level = rng.normal(-70.0, 6.0, 1000)
+    level[[3, 500]] = -100.0, 99.0
+    assert np.flatnonzero(outliers(level)).tolist() == [500]
+    assert not outliers(rng.normal(-50.0, 0.1, 100)).any()
+    assert not outliers([NAN, NAN]).any()

@@ -47,6 +47,7 @@ def test_the_draft_of_the_sample_logs_is_a_flight(logs: Path) -> None:
     assert Path(settings.logs[0].path).name.endswith("vehicleOut.txt")
     assert settings.timezone == ZONE
     assert (settings.rss.field, settings.link.rss.bandwidth_hz) == ("power", 20e6)  # and not 1 Hz of thermal noise
+    assert settings.rt.audit_links == 24  # the first report is audited, quickly
     assert any("bandwidth" in remark for remark in remarks if remark.startswith("check: "))
     asked = [remark for remark in remarks if "which tower?" in remark]
     assert len(asked) == 1  # the modem on the UAV cannot know

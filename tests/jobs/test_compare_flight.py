@@ -120,8 +120,8 @@ def free_space_db(at: Any) -> Any:
     return -40.0 - 10 * np.log10(east**2 + 55.0**2 + 30.0**2)
 
 
-def report_completes(path: Path, capsys: pytest.CaptureFixture[str]) -> dict[str, Any]:
-    assert main(["report", str(path), "-o", str(path.parent / "out"), "--json"]) == 0
+def report_completes(path: Path, capsys: pytest.CaptureFixture[str], code: int = 0) -> dict[str, Any]:
+    assert main(["report", str(path), "-o", str(path.parent / "out"), "--json"]) == code
     metrics: dict[str, Any] = json.loads(capsys.readouterr().out)
     return metrics
 
@@ -135,7 +135,7 @@ def test_all_out_of_coverage_has_no_numbers_but_counts(tmp_path: Path, capsys: p
     assert np.isnan(one.panel.rmse_db)
     assert np.isnan(one.panel.offset_db)
     assert any("no sample" in text for text in one.warnings)
-    found = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    found = report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]  # nothing was compared: no success
     assert found["rmse_db"] is None
     assert found["n"] == 0
     assert main(["report", str(path), "-o", str(tmp_path / "out"), "--strict"]) == 1
@@ -148,7 +148,22 @@ def test_one_sample_fits_itself_and_claims_no_interval(tmp_path: Path, capsys: p
     assert one.panel.rmse_db <= 0.05 + 1e-9
     assert np.isnan(one.panel.correlation)
     assert not np.isfinite(one.panel.rmse_ci95_db).any()
-    assert report_completes(path, capsys)["rss"]["LW1"]["USRP1"]["correlation"] is None
+    assert report_completes(path, capsys, code=1)["rss"]["LW1"]["USRP1"]["correlation"] is None
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "Nothing could be compared: no channel has 20 samples" in page
+    assert main(["report", str(path), "-o", str(tmp_path / "again")]) == 1
+    assert "1 samples have measurement, pose and path; expected 20" in capsys.readouterr().err
+
+
+def test_one_wild_sample_is_flagged_kept_and_said_first(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    at = np.arange(0, 60, 0.5)
+    level = free_space_db(at) + np.random.default_rng(3).normal(0, 2, len(at))
+    path = flight(tmp_path, rss={"USRP1": (at, np.where(at == 20.0, 99.0, level))})
+    found = report_completes(path, capsys)["rss"]["LW1"]["USRP1"]
+    assert (found["n_outliers"], found["n"]) == (1, len(at))  # flagged, not dropped
+    assert found["rmse_without_outliers_db"] < 4.0 < 10.0 < found["rmse_db"]
+    page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
+    assert "1 outlying sample raises at LW1 USRP1 its RMSE" in page[: page.index("<main>")]
 
 
 def test_a_constant_series_has_an_offset_and_no_correlation(tmp_path: Path) -> None:
@@ -593,7 +608,9 @@ def test_logged_attitude_acts_on_rank_logs_with_positions(tmp_path: Path) -> Non
 
 def test_an_attitude_that_cannot_act_is_the_first_warning(tmp_path: Path) -> None:
     data = gathered(rank_with_positions(tmp_path, rt="", origin="2025-06-02T14:00:00Z"))
-    assert data.warnings[0].startswith("rt.attitude: logged has no effect on rank of LW1: the telemetry covers none")
+    assert data.warnings[0].startswith(
+        "rt.attitude: logged has no effect on rank of LW1: no sample lies in the telemetry"
+    )
     data = gathered(rank_with_positions(tmp_path, rt=""))
     assert not any("rt.attitude" in text for text in data.warnings)
 

@@ -66,7 +66,7 @@ def test_free_space_is_found_said_and_written(tmp_path: Path, capsys: pytest.Cap
     assert [name for name, row in rows.items() if row["recommended"]] == ["free space"]
     assert rows["free space"]["rmse_heldout_db"] == pytest.approx(1.0, abs=0.1)
     as_set = rows["as set in flight.yaml"]
-    assert as_set["rmse_heldout_db"] == pytest.approx(rows["ground (coherent)"]["rmse_heldout_db"], abs=1e-6)
+    assert as_set["rmse_heldout_db"] == pytest.approx(rows["coherent ground reflection"]["rmse_heldout_db"], abs=1e-6)
     assert as_set["difference_to_best_db"] > 0.2
     page = (tmp_path / "out" / "report.html").read_text(encoding="utf-8")
     assert "free space 1.0 dB" in page[page.index('id="result"') :][:400]  # the first sentence of the verdict
@@ -159,7 +159,7 @@ def test_channels_that_share_a_replay_cost_it_once() -> None:
 
 def test_a_rung_with_diffraction_states_its_key() -> None:
     model = Model(ground="power sum", buildings=True, diffraction=True)
-    assert model.name == "ground (power sum) + buildings + diffraction"
+    assert model.name == "incoherent ground reflection + buildings + diffraction"
     assert recommended_settings({"rt": {"max_depth": 1}}, model)["rt"]["diffraction"] == "edges"
     plain = Model(ground="power sum", buildings=True)
     assert "diffraction" not in recommended_settings({"rt": {"max_depth": 1, "diffraction": "all"}}, plain)["rt"]

@@ -64,10 +64,10 @@ def test_the_page_says_that_it_is_not_audited_yet_and_strict_fails(
     assert metrics["rt"]["links"] > 100
     assert metrics["audit_command"].startswith("aerpaw-cmp audit ")
     assert "Not audited yet" in page
-    assert "the engine is not audited yet" in page
+    assert "audit pending" in page
     assert main(["report", str(made / "flight.yaml"), "-o", str(made / "strict"), "--figures", "none", "--strict"]) == 1
     said = capsys.readouterr()
-    assert "not audited yet" in said.err
+    assert "note: audit pending; run" in said.err
     assert f"next: aerpaw-cmp audit {made / 'strict'}" in said.out
     assert no_other_engine == [], "nothing of the audit runs before it is asked for"
 

@@ -233,14 +233,14 @@ class TestWords:
 
         rng = np.random.default_rng(1)
         small, large = rng.normal(0, 3.0, 500), rng.normal(0, 4.0, 500)
-        assert "WORSE than two-ray ground by 1.5 dB [1." in said(large, small)
+        assert "worse than two-ray ground by 1.5 dB [1." in said(large, small)
         assert "better than two-ray ground by 1.5 dB [1." in said(small, large)
         assert "no significant difference from two-ray ground" in said(small, rng.permutation(small))
         assert "too few samples" in said(small[:5], large[:5])
 
     def test_without_a_pair_nothing_is_judged(self, report_data):
         text = words.rss_verdict(report_data.rss[0])
-        assert "WORSE" not in text
+        assert "worse" not in text
         assert "better" not in text
 
     def test_edge_of_the_search(self, report_data):

@@ -168,7 +168,7 @@ class _Runner:
         )
 
     def thinned(self, step: int) -> Row:
-        self.progress(f"image engine, every {step}. pose")
+        self.progress(f"image engine, one of {step} positions")
         chosen = self.all[::step]
         with _Memory() as memory:
             result = replay(self.site, self.link, _take(self.poses, chosen), Search(max_depth=self.depth))

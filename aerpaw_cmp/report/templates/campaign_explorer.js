@@ -69,7 +69,7 @@
   let ranked = [];
   function drawRanking() {
     ranked = ranking();
-    at("ranking-caption").textContent = `Settings by their mean ${state.measure === "held" ? "held-out error: each flight scored with the offset of the other flights" : "error with an offset of each flight's own samples"}, ${words()}. To the first: mean difference on the same flights and links${ranked.length && ranked[0].recorded ? ", with a 95 % interval over flights; the first was chosen on these flights" : " (intervals: with all links or a single one)"}.`;
+    at("ranking-caption").textContent = `Settings by their mean ${state.measure === "held" ? "held-out error: each flight scored with the offset of the other flights" : "error with an offset of each flight's own samples"}, ${words()}. Difference from the best setting: mean difference on the same flights and links${ranked.length && ranked[0].recorded ? ", with a 95 % interval over flights; the first was chosen on these flights" : " (intervals: with all links or a single one)"}.`;
     at("ranking").tBodies[0].replaceChildren(...ranked.map((r, i) => {
       const tr = document.createElement("tr"), head = document.createElement("th"), choose = document.createElement("button");
       head.scope = "row"; choose.type = "button"; choose.className = "plain"; choose.textContent = data.settings[r.setting]; choose.title = data.changes[r.setting];

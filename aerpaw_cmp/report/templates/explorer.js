@@ -116,8 +116,8 @@
     rows.push(["Span", span]);
     if (s) {
       rows.push(["Samples", number(s.n, 0)]);
-      if (s.n) rows.push(["RMSE, offset of the span", number(s.rmse, 2, "dB")], ["Offset of the span", number(s.offset, 1, "dB")],
-        ["RMSE, offset of the flight", number(s.rmseFlight, 2, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
+      if (s.n) rows.push(["RMSE, offset refitted on the selection", number(s.rmse, 2, "dB")], ["Offset of the selection", number(s.offset, 1, "dB")],
+        ["RMSE with the flight's offset", number(s.rmseFlight, 2, "dB")], ["Mean residual", number(s.bias, 2, "dB")], ["Correlation", number(s.correlation, 2)]);
     }
     if (r) rows.push(["Rank reports", number(r.n, 0)], ["Agreement", number(100 * r.agreement, 0, "%")]);
     cells(at("span"), rows);
@@ -427,7 +427,7 @@
       counts.forEach((c, i) => { p.fillStyle = css("--measured"); p.fillRect(15 + i * wide, h - 34 - c / most * (h - 46), wide - 1, c / most * (h - 46)); });
       p.fillStyle = css("--ink"); p.textAlign = "center";
       for (const v of [-15, -10, -5, 0, 5, 10, 15]) p.fillText(number(v, 0), 15 + (v + 15) * wide, h - 20);
-      p.fillText("Residual [dB], ends hold what lies beyond", w / 2, h - 5);
+      p.fillText("Residual [dB] (outer bins include outliers)", w / 2, h - 5);
     } else if (r) {
       const found = rankStatistics(), names = ["none", "1", "2", "3", "4"], wide = (w - 40) / 5;
       const share = list => { const t = list.reduce((a, b) => a + b, 0) || 1; return list.map(v => v / t); };

@@ -60,11 +60,13 @@ def questions(file: IngestedFile, kept: Sequence[Stream], timezone: str | None) 
 
 
 def _start(kept: Sequence[Stream]) -> datetime | None:
-    times = [s.frame["time"].min() for s in kept if len(s.frame) and s.frame["time"].notna().any()]
-    if not times or not has_wall_clock(np.datetime64(min(times))):
+    """First time (UTC) of some streams; None without a wall clock."""
+    times = [time[~np.isnat(time)] for s in kept if len(time := s.frame["time"].to_numpy("datetime64[us]"))]
+    first = min((time.min() for time in times if len(time)), default=None)
+    if first is None or not has_wall_clock(first):
         return None
-    first: datetime = min(times).to_pydatetime().replace(tzinfo=zones.utc)
-    return first
+    start: datetime = first.item().replace(tzinfo=zones.utc)
+    return start
 
 
 def _name_starts(path: str) -> list[tuple[str, datetime, str, timedelta]]:

@@ -19,7 +19,7 @@ ZONE = "America/New_York"
 
 def _log(path: Path | str, start: str, *, low_m: float = 0.0, **attributes: str) -> IngestedFile:
     rows = 300
-    time = np.datetime64(start, "ns") + np.arange(rows) * np.timedelta64(1, "s")
+    time = np.datetime64(start, "ns") + np.arange(rows) * np.timedelta64(1, "s") + np.timedelta64(123, "ns")
     frame = pd.DataFrame({"time": time, "line": np.arange(rows) + 1, "flag": ""})
     height = np.concatenate([np.full(10, low_m), np.linspace(low_m, low_m + 40.0, rows - 10)])
     frame = frame.assign(**dict.fromkeys(COLUMNS["telemetry"], 0.0)).assign(altitude_m=height)

@@ -22,12 +22,6 @@ AMBIGUOUS = "ambiguous_local_time"
 NONEXISTENT = "nonexistent_local_time"
 TIME = rb"\d{4}[-/]\d\d[-/]\d\d[ T]\d\d:\d\d:\d\d(?:\.\d{1,9})?"
 """Wall clock as AERPAW tools write it (bytes pattern, no group)."""
-CERTAIN = (
-    rb"(?:(?:19[7-9]|2[01]\d|22[0-5])\d[-/](?:(?:0[13578]|1[02])[-/](?:0[1-9]|[12]\d|3[01])"
-    rb"|(?:0[469]|11)[-/](?:0[1-9]|[12]\d|30)|02[-/](?:0[1-9]|1\d|2[0-8]))"
-    rb"|20(?:[02468][048]|[13579][26])[-/]02[-/]29)[ T](?:[01]\d|2[0-3]):[0-5]\d:[0-5]\d(?:\.\d{1,9})?"
-)
-"""The same, of a date of the calendar and a time of the day for certain (bytes pattern, no group)."""
 ZONE = rb"(?:Z|[+-]\d\d:?\d\d)?"
 """Optional offset behind :data:`TIME`."""
 

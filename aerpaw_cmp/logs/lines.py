@@ -154,18 +154,6 @@ def match(lines: Lines, pattern: re.Pattern[bytes]) -> tuple[IntArray, list[tupl
     return np.searchsorted(lines.starts, np.array(positions, dtype=np.int64)), groups
 
 
-def match_rest(lines: Lines, pattern: re.Pattern[bytes], done: IntArray) -> tuple[IntArray, list[tuple[bytes, ...]]]:
-    """As :func:`match`, for the lines that a faster way has not read."""
-    left = np.ones(len(lines), dtype=bool)
-    left[done] = False
-    rest = np.flatnonzero(left)
-    if 2 * len(rest) > len(lines):
-        rows, groups = match(lines, pattern)
-        mine = np.flatnonzero(left[rows])
-        return rows[mine], [groups[i] for i in mine.tolist()]
-    return _each(lines, pattern, rest.tolist())
-
-
 def _each(lines: Lines, pattern: re.Pattern[bytes], numbers: Iterable[int]) -> tuple[IntArray, list[tuple[bytes, ...]]]:
     """Of some lines those that the pattern describes, one by one, and its groups."""
     found = [(i, pattern.match(lines.raw(i))) for i in numbers]

@@ -471,6 +471,7 @@ def of_ues(
     list of Stream or None
     """
     pick, rnti = np.arange(len(rows)) if pick is None else pick, values["rnti"]
+    rnti = np.where((rnti >= 0) & (rnti <= _MOST_RNTI) & (rnti == np.round(rnti)), rnti, np.nan)
     known = np.unique(rnti[np.isfinite(rnti)]).astype(int).tolist()
     if not _together([np.flatnonzero(rnti == one)[[0, -1]] for one in known]):
         one = {"rnti": known[0]} if len(known) == 1 else {"identity_from": "assumed"}
@@ -484,6 +485,10 @@ def of_ues(
         )
         for ue, mine, more in parts
     ]  # fmt: skip
+
+
+_MOST_RNTI = 0xFFFFFF
+"""RNTIs have sixteen bits; programs print up to six hex digits. A fraction is no identity."""
 
 
 def _together(spans: list[IntArray]) -> bool:

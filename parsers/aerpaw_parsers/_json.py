@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 from bisect import bisect_right
 from dataclasses import dataclass
 from typing import Any
@@ -18,8 +17,6 @@ SENTINELS = (2147483647, -2147483648, 9223372036854775807, 268435455, 65535)
 """What Android and modems write for 'unavailable'."""
 
 
-WHOLE = re.compile(rb"\s*\{.*\}\s*,?\s*$")
-"""A line that is an object of its own: between two of them a large file may be cut."""
 _MOST_LINES = 5000
 _MOST_TRIED = 64 << 20
 """Bytes of objects over several lines that were looked at in vain [bytes]: a limit on time."""

@@ -19,6 +19,7 @@ from aerpaw_cmp.common.units import AnyArray, BoolArray, FloatArray
 from aerpaw_cmp.logs import clocks as _time
 from aerpaw_cmp.logs import lines as _lines
 from aerpaw_cmp.logs import make_frames as _frames
+from aerpaw_cmp.logs import rows as _rows
 from aerpaw_cmp.logs.readers import Reader, ReadOptions
 from aerpaw_cmp.logs.records import COLUMNS, Kind, ReadResult, RejectedLine, Stream
 
@@ -125,24 +126,14 @@ def _times(cells: list[str], options: ReadOptions) -> tuple[_time.Instants, AnyA
     if not _counts(texts):
         written = np.array([cell if _TEXT.fullmatch(cell) else b"-" for cell in texts] or [b"-"], dtype=np.bytes_)
         return _time.texts_to_utc(written[: len(texts)], options, needed_by="generic_csv")
-    return _counted(np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts]), options)
+    seconds = np.array([float(cell) if _PLAIN.fullmatch(cell) else np.nan for cell in texts], dtype=np.float64)
+    clock = "epoch_s" if options.time_origin is None else "relative_s"
+    _, instants, valid = _rows.times(seconds, options, clock=clock, reader="generic_csv")
+    return instants, valid
 
 
 def _bare(cell: str) -> bytes:
     return cell.strip().strip('"').encode("ascii", "replace")
-
-
-def _counted(seconds: FloatArray, options: ReadOptions) -> tuple[_time.Instants, AnyArray]:
-    """Instants of times that are numbers; where they are none NaN."""
-    origin = _time.origin_ns(options, needed_by="generic_csv")
-    valid = np.isfinite(seconds) & (np.abs(seconds) < (9e8 if origin is not None else 9.2e9))
-    whole = np.floor(np.where(valid, seconds, 0))
-    ns = whole.astype(np.int64) * 10**9 + np.round((np.where(valid, seconds, 0) - whole) * 1e9).astype(np.int64)
-    ns += origin or 0
-    if origin is None and options.clock in ("local", "local_as_utc"):
-        return _time.local_to_utc(ns, options.timezone, needed_by="generic_csv"), valid
-    none = np.zeros(len(ns), dtype=bool)
-    return _time.Instants(ns.astype("datetime64[ns]"), none, none.copy()), valid
 
 
 def _counts(texts: Iterable[bytes]) -> bool:

@@ -62,6 +62,13 @@ def test_the_form_of_most_times_of_reports_is_that_of_all() -> None:
     assert read("srsran_json", data).accepted == 5
 
 
+@pytest.mark.parametrize("rnti", [b"70.5", b"-1", b"1e300", b'"x"'])
+def test_a_number_that_is_no_rnti_is_no_identity(rnti: bytes) -> None:
+    data = samples.AMARISOFT_JSON.replace(b'"rnti": 70', b'"rnti": ' + rnti, 1)
+    result = read("amarisoft_json", data)
+    assert sum(len(stream.frame) for stream in result.streams) == 2
+
+
 def test_reports_with_times_of_the_day_alone_pass_midnight() -> None:
     line = samples.SRSRAN_JSON.splitlines(keepends=True)[0]
     (epoch,) = re.findall(rb'"timestamp": ?([0-9.]+)', line)

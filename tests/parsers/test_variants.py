@@ -20,8 +20,6 @@ TEXTS = [
     if reader not in BINARY
 ]
 VARIANTS = {
-    "unix lines": lambda data: data.replace(b"\r\n", b"\n"),
-    "windows lines": lambda data: data.replace(b"\r\n", b"\n").replace(b"\n", b"\r\n"),
     "byte order mark": lambda data: b"\xef\xbb\xbf" + data,
     "utf-16": lambda data: data.decode().encode("utf-16"),
     "spaces at the end of lines": lambda data: re.sub(rb"\r?\n", b" \n", data),

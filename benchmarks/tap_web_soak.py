@@ -145,7 +145,7 @@ def fuzz(requests: int, folder: Path) -> dict[str, Any]:
                     connection.settimeout(0.5)
                     connection.sendall(damaged(chance))
                     connection.shutdown(socket.SHUT_WR)
-                    while b"\nretry: " not in data and (got := connection.recv(65_536)):
+                    while b"retry: 1000" not in data and (got := connection.recv(65_536)):
                         data += got
             except OSError:
                 answers["cut"] += 1

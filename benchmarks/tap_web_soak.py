@@ -28,7 +28,7 @@ from aerpaw_cmp.live.simulator import Faults, ModemSimSettings, ModemSimulator
 from aerpaw_cmp.report.live_page import live_page
 
 
-def kept(log: Path, modem: ModemSimulator) -> dict[str, int]:
+def log_against_modem(log: Path, modem: ModemSimulator) -> dict[str, int]:
     """Answers that the modem saw read against the log: lost, out of order; lines that are no record."""
     bad: list[BadLine] = []
     logged = [tuple(r["lines"]) for r in read_log(log, bad) if r["kind"] == "exchange" and r["query"] == "nr5g_csi"]
@@ -75,7 +75,7 @@ def soak(simulated_s: float, speed: float, folder: Path, *, web: bool) -> dict[s
             browser.send_signal(signal.SIGCONT)
             browser.terminate()
         seen = [json.loads(browser.communicate()[0]) for browser in browsers]
-        result = kept(log, modem)
+        result = log_against_modem(log, modem)
     return result | {
         "missed_polls": sum(summary["missed"].values()),
         "memory_grown_kib": round((sum(memory[-third:]) - sum(memory[:third])) / third),
@@ -108,12 +108,12 @@ def pace(seconds: float, folder: Path, *, web: bool) -> dict[str, Any]:
 
 def damaged(chance: random.Random) -> bytes:
     """A request that is damaged in one of many ways."""
-    whole = bytearray(b"GET /events?from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n")
+    request = bytearray(b"GET /events?from=00000000-1-2-3 HTTP/1.1\r\nHost: 127.0.0.1\r\nLast-Event-ID: 1\r\n\r\n")
     kind = chance.randrange(5)
     if kind == 0:
         return bytes(chance.randrange(256) for _ in range(chance.randrange(600))) + b"\r\n\r\n"
     if kind == 1:
-        return bytes(whole[: chance.randrange(len(whole))])
+        return bytes(request[: chance.randrange(len(request))])
     if kind == 2:
         long = chance.choice(
             [b"GET /" + b"a" * 70_000, b"GET / HTTP/1.1\r\n" + b"X: y\r\n" * chance.choice([50, 2000])]
@@ -123,8 +123,8 @@ def damaged(chance: random.Random) -> bytes:
         parts = [b"/", b"..", b"%2e%2e", b"%00", b"etc", b"passwd", b"?token=", b"&", b"[", b"\\", b"events", b"\xff"]
         return b"GET " + b"".join(chance.choice(parts) for _ in range(10)) + b" HTTP/1.1\r\nHost: 127.0.0.1\r\n\r\n"
     for _ in range(chance.randrange(1, 12)):
-        whole[chance.randrange(len(whole))] = chance.randrange(256)
-    return bytes(whole) + b"\r\n\r\n"
+        request[chance.randrange(len(request))] = chance.randrange(256)
+    return bytes(request) + b"\r\n\r\n"
 
 
 def fuzz(requests: int, folder: Path) -> dict[str, Any]:
@@ -156,7 +156,7 @@ def fuzz(requests: int, folder: Path) -> dict[str, Any]:
         alive = process.poll() is None
         process.send_signal(signal.SIGINT)
         process.communicate(timeout=120)
-        result = kept(log, modem)
+        result = log_against_modem(log, modem)
     return {"requests": requests, "answers_by_status": dict(answers), "other_content": others, "alive": alive,
             "fuzz_memory_grown_kib": grown, "fuzz_lost": result["lost"]}  # fmt: skip
 
@@ -178,8 +178,8 @@ def main() -> None:
         folder = Path(name)
         result: dict[str, Any] = {"simulated_s": simulated_s, "speed": arguments.speed}
         for arm, part in (("alone", max(60.0, simulated_s / 6)), ("web", simulated_s)):
-            found = soak(part, arguments.speed, folder, web=arm == "web")
-            result |= {f"{arm}_{key}": value for key, value in found.items()}
+            outcome = soak(part, arguments.speed, folder, web=arm == "web")
+            result |= {f"{arm}_{key}": value for key, value in outcome.items()}
         for arm in ("alone", "web"):
             result |= {f"10hz_{arm}_{key}": value for key, value in pace(pace_s, folder, web=arm == "web").items()}
         result |= fuzz(requests, folder)

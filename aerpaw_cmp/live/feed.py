@@ -183,7 +183,7 @@ class Feed:
             for number, item in items:
                 with contextlib.suppress(*_MALFORMED):
                     self._take(self._modems[number], item)
-            if self._look() or items or not self._version:
+            if self._update_alarms() or items or not self._version:
                 self._bump()
 
     def after(self, cursor: str, wait_s: float = 0.0) -> tuple[dict[str, Any] | None, str]:
@@ -345,7 +345,7 @@ class Feed:
         self._alarms.append(alarm)
         return alarm
 
-    def _look(self) -> bool:
+    def _update_alarms(self) -> bool:
         """Open and close alarms by the present state; True if one changed."""
         changed = False
         for modem in self._modems:
@@ -366,28 +366,28 @@ def _finite(value: Any) -> float | None:
 
 def _alarms_of(modem: _Modem, now: float) -> dict[str, str]:
     """Alarms that hold at this moment, by kind."""
-    found: dict[str, str] = {}
+    alarms: dict[str, str] = {}
     stale_s, lost_s = max(STALE_S, 3 * modem.period_s), max(GPS_LOST_S, 3 * modem.period_s)
     if modem.gap_text:
-        found["gap"] = modem.gap_text
+        alarms["gap"] = modem.gap_text
     elif modem.connected and now - modem.rank_s > stale_s:
-        found["stale"] = f"no rank for more than {stale_s:g} s: is data flowing, and CSI reporting on?"
+        alarms["stale"] = f"no rank for more than {stale_s:g} s: is data flowing, and CSI reporting on?"
     if modem.predicts and now - modem.gps_s > lost_s:
         if modem.fix is not None and 0 <= modem.fix < 3:
-            found["gps"] = "GPS lost: the telemetry states no 3-D fix"
+            alarms["gps"] = "GPS lost: the telemetry states no 3-D fix"
         elif modem.age_s is None:
-            found["gps"] = "no position: the telemetry log holds no line so far"
+            alarms["gps"] = "no position: the telemetry log holds no line so far"
         else:
-            found["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
+            alarms["gps"] = f"no position for more than {lost_s:g} s: the telemetry log does not reach the present"
     if modem.disk_fault:
-        found["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
+        alarms["disk"] = f"the log cannot be written: {modem.disk_fault}; records wait in memory"
     elif modem.disk_free_bytes is not None and modem.disk_free_bytes < DISK_LOW_BYTES:
-        found["disk"] = f"less than {DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
+        alarms["disk"] = f"less than {DISK_LOW_BYTES // 2**20} MiB left on the log's disk"
     if modem.step_s is not None and now - modem.step_s < STEP_SHOWN_S:
-        found["step"] = modem.step_text
+        alarms["step"] = modem.step_text
     if modem.delay_s is not None and (modem.delay_s < -CLOCK_OFF_S / 4 or modem.delay_s > CLOCK_OFF_S):
         ahead = "ahead of" if modem.delay_s < 0 else "behind"
-        found["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"
+        alarms["clock"] = f"the telemetry's clock is {abs(modem.delay_s):.1f} s {ahead} this computer's"
     elif modem.unsynchronised:
-        found["clock"] = "the clock is not synchronised (NTP or GPS): times may not fit the telemetry"
-    return found
+        alarms["clock"] = "the clock is not synchronised (NTP or GPS): times may not fit the telemetry"
+    return alarms

@@ -187,8 +187,8 @@ def holders(path: Path, *, others_only: bool = True) -> list[Holder]:
     except OSError:
         return []
     # the master of a pseudo-terminal has another device number, so only openers of the port count
-    found = _processes_with(lambda file: stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted)
-    return [holder for holder in found if not others_only or holder.pid != os.getpid()]
+    holding = _processes_with(lambda file: stat.S_ISCHR(file.st_mode) and file.st_rdev == wanted)
+    return [holder for holder in holding if not others_only or holder.pid != os.getpid()]
 
 
 def holders_of_sockets(inodes: Set[int]) -> list[Holder]:
@@ -198,12 +198,12 @@ def holders_of_sockets(inodes: Set[int]) -> list[Holder]:
 
 def _processes_with(wanted: Callable[[os.stat_result], bool]) -> list[Holder]:
     """Processes that have an open file of this kind, by their numbers."""
-    found = []
+    holding = []
     for process in _processes():
         with contextlib.suppress(OSError):
             if any(map(wanted, _open_files(process))):
-                found.append(_holder(process))
-    return sorted(found, key=lambda h: h.pid)
+                holding.append(_holder(process))
+    return sorted(holding, key=lambda h: h.pid)
 
 
 def _processes() -> Iterator[Path]:

@@ -104,7 +104,7 @@
   // --- words --------------------------------------------------------------------------------------------------------
 
   const clock = (ms, digits = 8) => Number.isFinite(ms) ? new Date(ms).toISOString().slice(11, 11 + digits) : "–";
-  const whole = v => Number.isFinite(v) ? String(Math.round(v)) : "–";
+  const integer = v => Number.isFinite(v) ? String(Math.round(v)) : "–";
   const span = (low, high, unit = "") => Number.isFinite(low) ? `${number(low, 0)} to ${number(high, 0)}${unit && " " + unit}` : "none yet";
   function lasted(seconds) { return seconds < 60 ? `${Math.max(1, Math.round(seconds))} s` : `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`; }
   function share([inside, given]) { return given ? `${number(100 * inside / given, 0)} % of ${given}` : "none yet"; }
@@ -131,7 +131,7 @@
       big.setAttribute("aria-label", now.rank ? `measured rank ${now.rank}` : "no rank");
       const rows = [["RSRP", number(now.rsrp_dbm ?? NaN, 0, "dBm")], ["SINR", number(now.sinr_db ?? NaN, 0, "dB")], ["Answers", `${number(now.rate_hz, 1)} Hz`], ["Gaps", String(now.gaps)], ["Records", String(now.records)]];
       if (now.disk_free_bytes !== null) rows.push(["Disk left", now.disk_free_bytes > 2 ** 30 ? number(now.disk_free_bytes / 2 ** 30, 1, "GiB") : number(now.disk_free_bytes / 2 ** 20, 0, "MiB")]);
-      if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : whole(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],
+      if (now.predicts) rows.unshift(["Predicted rank", k < 0 ? "–" : integer(c.predicted[k]) + (Number.isFinite(c.low[k]) ? ` (${c.low[k]}${c.low[k] < c.high[k] ? "–" + c.high[k] : ""})` : "")],
         ["Residual, RSRP", k < 0 ? "–" : number(c.rsrp[k] - c.level[k], 1, "dB")]);
       cells(facts, rows);
       if (now.predicts && k >= 0) { mark(facts.children[0].lastChild, c.rank[k], c.low[k], c.high[k]); mark(facts.children[1].lastChild, c.rsrp[k], c.levelLow[k], c.levelHigh[k]); }
@@ -181,10 +181,10 @@
     if (!modem) return;
     const c = modem.predictions.columns, m = modem.rows.columns, t = state.pose ?? last(m.t);
     if (!Number.isFinite(t)) { cells(at("pose"), [["Moment", "no answer so far"]]); return; }
-    const i = nearest(m.t, t), rows = [[state.pose === null ? "Latest answer" : "Marked moment", `${clock(m.t[i], 10)} UTC`], ["Rank", whole(m.rank[i])], ["RSRP", number(m.rsrp[i], 0, "dBm")], ["SINR", number(m.sinr[i], 0, "dB")]];
+    const i = nearest(m.t, t), rows = [[state.pose === null ? "Latest answer" : "Marked moment", `${clock(m.t[i], 10)} UTC`], ["Rank", integer(m.rank[i])], ["RSRP", number(m.rsrp[i], 0, "dBm")], ["SINR", number(m.sinr[i], 0, "dB")]];
     if (c.t.length) {
       const k = nearest(c.t, t);
-      rows.push(["Predicted rank", `${whole(c.predicted[k])}, 90 %: ${span(c.low[k], c.high[k])}`], ["Predicted RSRP", `${number(c.level[k], 0, "dBm")}, 90 %: ${span(c.levelLow[k], c.levelHigh[k])}`]);
+      rows.push(["Predicted rank", `${integer(c.predicted[k])}, 90 %: ${span(c.low[k], c.high[k])}`], ["Predicted RSRP", `${number(c.level[k], 0, "dBm")}, 90 %: ${span(c.levelLow[k], c.levelHigh[k])}`]);
       rows.push(["Residual", number(c.rsrp[k] - c.level[k], 1, "dB")], ["East, north, up", `${number(c.east[k], 0)}, ${number(c.north[k], 0)}, ${number(c.up[k], 0)} m`]);
     }
     cells(at("pose"), rows);

@@ -364,6 +364,11 @@ def _rss_row(task: Task, rules: RssSettings, result: RssResult, logs: tuple[str,
         lag_verdict="" if clock is None else clock.verdict,
         fitted=score.fitted_on_scored,
         baselines={name: model.rmse_db for name, model in result.baselines.items()},
+        verdicts={
+            name: result.further.compared_with[name].verdict
+            for name in result.baselines
+            if name in result.further.compared_with
+        },
         step_db=rules.step_db,
         span_db=rules.span_db,
         measured_db=measured_db,

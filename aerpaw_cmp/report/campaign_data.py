@@ -66,6 +66,8 @@ class RssRow:
     held_out_rmse_db: float = float("nan")
     logs: tuple[str, ...] = ()
     """SHA-256 of the logs that hold the samples."""
+    verdicts: Mapping[str, str] = field(default_factory=dict)
+    """By baseline, what the paired interval says about the ray tracing."""
 
     @property
     def key(self) -> tuple[str, str, str]:

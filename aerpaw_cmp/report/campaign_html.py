@@ -27,9 +27,10 @@ from .explorer import as_json
 from .export import write_file
 from .exports.samples import of_campaign
 from .exports.write import write_exports
+from .first_screen import most_telling, pooled_db
 from .html import by_section, environment, policy, script
 from .names import k_key
-from .words import pretty
+from .words import Judged, first_sentence, pretty
 
 FEW, MANY = 8, 200
 """Warnings that stand open, and that stand on the page at all."""
@@ -334,6 +335,42 @@ def worst_flights(data: CampaignData) -> list[tuple[str, float, str]]:
     return sorted(flights, key=lambda entry: -entry[1])
 
 
+def verdict(data: CampaignData) -> list[str]:
+    """Ray tracing against the baselines under the first setting, and what each mean error is for."""
+    rows = [row for row in data.rss if row.setting == next(iter(data.settings)) and np.isfinite(row.rmse_db) and row.n]
+    if not rows:
+        return []
+    total = pooled_db([row.rmse_db for row in rows], [row.n for row in rows])
+    every = []
+    for name in dict.fromkeys(name for row in rows for name in row.baselines):
+        errors = [row.baselines.get(name, np.nan) for row in rows]
+        if np.isfinite(errors).all():
+            said = [row.verdicts[name] for row in rows if row.verdicts.get(name, "none given") != "none given"]
+            every.append(
+                Judged(ray_db=total, channels=len(rows), name=name, other_db=pooled_db(errors, [row.n for row in rows]),
+                       judged=len(said), better=said.count("better"), worse=said.count("worse"))
+            )  # fmt: skip
+    out = [first_sentence(most_telling(every) if every else Judged(ray_db=total, channels=len(rows)))]
+    held = [row.held_out_rmse_db for row in rows if np.isfinite(row.held_out_rmse_db)]
+    own = float(np.mean([row.rmse_db for row in rows]))
+    if held:
+        out.append(
+            f"Mean RMSE over flights and links: {own:.2f} dB with each flight's own offset, {np.mean(held):.2f} dB "
+            "with the offset of the other flights. Expect the second on a new flight."
+        )
+    return out
+
+
+def beside_baselines(row: RssRow) -> str:
+    """Baselines that the ray tracing is significantly better and worse than, in one cell."""
+    parts = [
+        f"{word} than " + ", ".join(pretty(name) for name, said in row.verdicts.items() if said == word)
+        for word in ("worse", "better")
+        if word in row.verdicts.values()
+    ]
+    return "; ".join(parts) or ("not significant" if row.verdicts else "\u2013")
+
+
 def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequence[str]) -> str:
     """The whole page."""
     template = environment().get_template("campaign.html.jinja")
@@ -346,6 +383,8 @@ def campaign_page(data: CampaignData, pictures: Sequence[Picture], files: Sequen
         beside=repeatability_beside(data),
         halves=halves(data),
         headline=headline(data),
+        verdict=verdict(data),
+        beside_baselines=beside_baselines,
         warnings=warnings(data),
         baselines=list(dict.fromkeys(name for row in data.rss for name in row.baselines)),
         rss_flights=rss_flights(data),

@@ -114,6 +114,11 @@ def judged(panels: Sequence[RssPanel]) -> Judged | None:
         said = [pair.verdict for pair in paired if pair.verdict != "none given"]
         every.append(Judged(ray_db=total, channels=len(panels), name=name, other_db=error, judged=len(said),
                             better=said.count("better"), worse=said.count("worse")))  # fmt: skip
+    return most_telling(every)
+
+
+def most_telling(every: Sequence[Judged]) -> Judged:
+    """The comparison to be said first: the best baseline that ray tracing loses to, else the best one."""
     lost = [one for one in every if one.worse > one.better]
     return min(lost or every, key=lambda one: one.other_db)
 

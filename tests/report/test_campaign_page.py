@@ -164,3 +164,26 @@ def test_campaign_json_has_the_telling_pairs_and_a_file_has_all(data, tmp_path):
 
 
 RANKS_AGAIN = RankPairing(tower="LW1", first="a", second="b", n=9, agreement=0.5, kappa=0.5, kappa_ci95=(0.25, 0.75))
+
+
+def test_the_page_opens_with_a_verdict_against_the_baselines_and_explains_its_means(data):
+    """Free space wins in every row: the first words say it, every row says it, and both means say what they are for."""
+    first = next(iter(data.settings))
+    rows = tuple(
+        dataclasses.replace(
+            row, rmse_db=7.0, held_out_rmse_db=7.9, baselines={"free_space": 6.0, "constant": 9.0},
+            verdicts={"free_space": "worse", "constant": "better"},
+        )
+        for row in data.rss
+    )  # fmt: skip
+    shown = dataclasses.replace(data, rss=rows)
+    n = sum(row.setting == first for row in rows)
+    said, means = campaign_html.verdict(shown)
+    assert said == (
+        "Ray tracing: RMSE 7.0 dB; free space: 6.0 dB. "
+        f"Ray tracing is significantly worse on {n} of {n} channels (95 %)."
+    )
+    assert "7.00 dB with each flight's own offset, 7.90 dB with the offset of the other flights" in means
+    text = campaign_html.campaign_page(shown, [], [])
+    assert text.index("significantly worse") < text.index("<main>")
+    assert "<td>worse than free space; better than constant level</td>" in text
